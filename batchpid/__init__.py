@@ -1,0 +1,1 @@
+"""Joint-level PID control for many robots at once: arrays in, arrays out."""

@@ -1,0 +1,76 @@
+"""The errors that batchpid raises: one root, and children that carry their data.
+
+Every message says what is wrong, where (argument, joint, env), the value found, and the remedy.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class BatchPIDError(Exception):
+    """Root of every error that this project raises on purpose."""
+
+
+class InvalidArgumentError(BatchPIDError, ValueError):
+    """An argument has a wrong type, shape, dtype, range or a non-finite entry.
+
+    Raised before anything is changed. ``argument``, ``joint``, ``env``, ``value`` and ``remedy`` hold the
+    same facts as the message, for programs.
+    """
+
+    def __init__(
+        self,
+        argument: str,
+        problem: str,
+        *,
+        remedy: str,
+        joint: str | int | None = None,
+        env: int | None = None,
+        value: Any = None,
+    ) -> None:
+        self.argument, self.problem, self.remedy = argument, problem, remedy
+        self.joint, self.env, self.value = joint, env, value
+        where = "".join(
+            f", {kind} {place!r}" for kind, place in (("joint", joint), ("env", env)) if place is not None
+        )
+        got = "" if value is None else f" (got {value!r})"
+        super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by message and fields, so that the error crosses process borders whole."""
+        return (_rebuild, (type(self), self.args, self.__dict__))
+
+
+class RobotError(BatchPIDError, ValueError):
+    """A robot description cannot be used; the message names the file, the element and the remedy."""
+
+
+class RobotNotFoundError(RobotError, FileNotFoundError):
+    """Neither a bundled robot nor a file of that name exists."""
+
+
+class MissingDependencyError(BatchPIDError, ImportError):
+    """An optional package is needed for what was asked; the message says which extra installs it."""
+
+    def __init__(self, package: str, purpose: str, extra: str) -> None:
+        self.package, self.purpose, self.extra = package, purpose, extra
+        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (type(self), (self.package, self.purpose, self.extra))
+
+
+class WorkerError(BatchPIDError, RuntimeError):
+    """A worker process failed or died; the message names the worker, its envs and the cause."""
+
+
+class ClosedError(BatchPIDError, RuntimeError):
+    """The object was closed before this call."""
+
+
+def _rebuild(cls: type[Exception], args: tuple[Any, ...], fields: dict[str, Any]) -> Exception:
+    error = cls.__new__(cls)
+    error.args = args
+    error.__dict__.update(fields)
+    return error
