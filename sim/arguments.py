@@ -1,0 +1,89 @@
+"""Checks of what callers pass to the runner; each names the argument, the joint or env, the value and the remedy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.errors import InvalidArgumentError
+
+
+def integer(argument: str, value: Any, low: int, high: int) -> int:
+    """``value`` as an int within [low, high]."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise InvalidArgumentError(argument, "must be a whole number", value=value, remedy="pass an int")
+    if not low <= value <= high:
+        raise InvalidArgumentError(
+            argument, "out of range", value=int(value), remedy=f"use a number from {low} to {high}"
+        )
+    return int(value)
+
+
+def number(argument: str, value: Any, low: float, high: float, unit: str) -> float:
+    """``value`` as a finite float within [low, high]."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
+        raise InvalidArgumentError(argument, "must be a number", value=value, remedy=f"pass a float ({unit})")
+    if not math.isfinite(value) or not low <= value <= high:
+        raise InvalidArgumentError(
+            argument,
+            "out of range",
+            value=float(value),
+            remedy=f"use a number from {low:g} to {high:g} ({unit})",
+        )
+    return float(value)
+
+
+def choice(argument: str, value: Any, known: Collection[str]) -> str:
+    """``value`` if it is one of ``known``."""
+    if not isinstance(value, str) or value not in known:
+        raise InvalidArgumentError(
+            argument, "unknown option", value=value, remedy=f"use one of {', '.join(map(repr, known))}"
+        )
+    return value
+
+
+def flag(argument: str, value: Any) -> bool:
+    """``value`` as a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidArgumentError(argument, "must be True or False", value=value, remedy="pass a bool")
+    return bool(value)
+
+
+def array(
+    argument: str, value: ArrayLike, shape: tuple[int, ...], joint_names: Sequence[str]
+) -> NDArray[np.float64]:
+    """``value`` as finite float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
+
+    A scalar stands for all joints, (dof,) for all envs.
+    """
+    try:
+        result = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(
+            argument,
+            f"cannot be read as an array of numbers: {error}",
+            remedy=f"pass an array of shape {shape}",
+        ) from None
+    try:
+        result = np.broadcast_to(result, shape)
+    except ValueError:
+        raise InvalidArgumentError(
+            argument,
+            f"has shape {result.shape}, needs {shape} or ({shape[-1]},)",
+            remedy=f"the last axis counts the joints {', '.join(joint_names)}",
+        ) from None
+    if not np.isfinite(result).all():
+        *_, env, joint = (int(index) for index in np.argwhere(~np.isfinite(result))[0])
+        raise InvalidArgumentError(
+            argument,
+            "is not finite",
+            joint=joint_names[joint],
+            env=env,
+            value=float(result[~np.isfinite(result)][0]),
+            remedy="pass finite numbers",
+        )
+    return result

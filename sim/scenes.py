@@ -1,0 +1,247 @@
+"""A pack of scenes in one process, read and written as arrays. The only module that touches SAPIEN.
+
+A pack is M scenes, one robot each, that share one PhysX system. All stand at the origin; the shapes of each scene
+carry a collision group of their own, so that scenes never meet. Stepping a pack is bit-identical to stepping
+one system per scene, and a fifth to a third cheaper.
+
+The loop needs nine calls and no more (:class:`Pack`); another gateway to the engine has only these to provide.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import RobotError
+
+from .physics import DISSIPATION, Physics
+from .urdf import Joint
+
+with warnings.catch_warnings():
+    # Without a system Vulkan SAPIEN warns that it falls back to its own; nothing here renders.
+    warnings.filterwarnings("ignore", message=".*libvulkan.*")
+    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
+    import sapien
+    from sapien import physx
+    from sapien.wrapper.articulation_builder import ArticulationBuilder
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Everything that decides how a scene is built, picklable.
+
+    ``urdf`` is sanitised text (see :mod:`sim.urdf`); ``joints`` the degrees of freedom in SAPIEN's order.
+    """
+
+    urdf: str
+    srdf: str | None
+    joints: tuple[Joint, ...]
+    timestep: float
+    physics: Physics
+    dissipation: str = "urdf"
+    ground: bool = True
+    fixed_base: bool = True
+
+
+def parse(spec: SceneSpec) -> ArticulationBuilder:
+    """Parse the robot once; the builder makes any number of copies.
+
+    Raises
+    ------
+    RobotError
+        SAPIEN's loader refuses the description, or numbers its joints in another order than ours.
+    """
+    loader = _bare_scene(physx.PhysxCpuSystem()).create_urdf_loader()
+    loader.fix_root_link = spec.fixed_base
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.urdf"
+        path.write_text(spec.urdf)
+        if spec.srdf is not None:
+            path.with_suffix(".srdf").write_text(spec.srdf)
+        try:
+            builders, actors, _ = loader.parse(str(path), str(path.with_suffix(".srdf")))
+        except Exception as error:
+            raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
+    if len(builders) != 1 or actors:
+        raise RobotError(
+            "the URDF does not describe one articulated robot; it needs at least one moving joint"
+        )
+    return builders[0]
+
+
+class Pack:
+    """M scenes of one robot in one PhysX system. Arrays are (M, dof), in SAPIEN's joint order, SI units."""
+
+    def __init__(self, builder: ArticulationBuilder, spec: SceneSpec, size: int) -> None:
+        with _global_config(spec.physics):
+            self._system = physx.PhysxCpuSystem()
+            self._system.timestep = spec.timestep
+            # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
+            self._scenes = [_bare_scene(self._system) for _ in range(size)]
+            self._robots = [_build_robot(builder, scene, spec) for scene in self._scenes]
+            if spec.ground:
+                for scene in self._scenes:
+                    scene.add_ground(0.0, render=False)
+        for group, scene in enumerate(self._scenes, start=1):
+            _separate(scene, group)
+        self.size, self.dof = size, self._robots[0].dof
+        self._joints = [robot.active_joints for robot in self._robots]
+        self._damping = np.array([[joint.damping for joint in self._joints[0]]])
+        self._get_qpos = [robot.get_qpos for robot in self._robots]
+        self._get_qvel = [robot.get_qvel for robot in self._robots]
+        self._passive = [robot.compute_passive_force for robot in self._robots]
+        # set_qf from a kept row view costs half of what a fresh one does.
+        self._qf = np.zeros((size, self.dof), np.float32)
+        self._set_qf = [(robot.set_qf, row) for robot, row in zip(self._robots, self._qf, strict=True)]
+        self.step = self._system.step
+
+    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+        """Joint positions [rad or m], a new array."""
+        return np.concatenate([get() for get in self._get_qpos], dtype=dtype).reshape(self.size, self.dof)
+
+    def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
+        """Joint velocities [rad/s or m/s], a new array."""
+        return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self.size, self.dof)
+
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+        """Joint efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], a new array."""
+        forces = [compute(gravity, coriolis) for compute in self._passive]
+        return np.concatenate(forces, dtype=dtype).reshape(self.size, self.dof)
+
+    def write_qf(self, effort: NDArray[Any]) -> None:
+        """Apply joint efforts [N m or N]. They persist until written again."""
+        self._qf[...] = effort
+        for set_qf, row in self._set_qf:
+            set_qf(row)
+
+    @property
+    def qf(self) -> Float32:
+        """The efforts last written, as the engine received them (a view)."""
+        return self._qf
+
+    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof); their efforts become zero.
+
+        Also the way back from NaN, which is why the root is placed too.
+        """
+        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+            robot = self._robots[row]
+            robot.set_root_pose(sapien.Pose())
+            robot.set_root_linear_velocity([0.0, 0.0, 0.0])
+            robot.set_root_angular_velocity([0.0, 0.0, 0.0])
+            robot.set_qpos(position.astype(np.float32))
+            robot.set_qvel(velocity.astype(np.float32))
+            self._qf[row] = 0.0
+            robot.set_qf(self._qf[row])
+
+    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+        """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).
+
+        The URDF's joint damping, which SAPIEN also realises as drive damping, is added to ``damping``.
+        """
+        shape = (self.size, self.dof)
+        damping = damping + self._damping
+        limits = np.minimum(np.broadcast_to(force_limit, shape), np.finfo(np.float32).max)
+        table = (np.broadcast_to(stiffness, shape), np.broadcast_to(damping, shape), limits)
+        for joints, *rows in zip(self._joints, *table, strict=True):
+            for joint, stiff, damp, limit in zip(joints, *rows, strict=True):
+                joint.set_drive_properties(float(stiff), float(damp), float(limit), "force")
+
+    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
+        for joints, row in zip(self._joints, position.tolist(), strict=True):
+            for joint, target in zip(joints, row, strict=True):
+                joint.set_drive_target(target)
+        if velocity is not None:
+            for joints, row in zip(self._joints, velocity.tolist(), strict=True):
+                for joint, target in zip(joints, row, strict=True):
+                    joint.set_drive_velocity_target(target)
+
+    def close(self) -> None:
+        """Free the scenes. The pack cannot be used afterwards."""
+        self._set_qf, self._get_qpos, self._get_qvel, self._passive = [], [], [], []
+        self._joints, self._robots = [], []
+        self._scenes = []
+
+
+def _bare_scene(system: Any) -> Any:
+    # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
+    return sapien.Scene([system])
+
+
+@contextmanager
+def _global_config(physics: Physics) -> Iterator[None]:
+    """SAPIEN's process-wide settings, ours while a pack is built, then the caller's again.
+
+    Every setting is given, so that a result depends on nothing that the caller's process did before.
+    """
+    scene, body = physx.get_scene_config(), physx.get_body_config()
+    shape, material = physx.get_shape_config(), physx.get_default_material()
+    physx.set_scene_config(
+        gravity=np.array(GRAVITY, np.float32),
+        bounce_threshold=2.0,
+        enable_pcm=True,
+        enable_tgs=physics.solver == "TGS",
+        enable_ccd=False,
+        enable_enhanced_determinism=False,
+        enable_friction_every_iteration=True,
+        cpu_workers=0,
+    )
+    physx.set_body_config(
+        solver_position_iterations=physics.position_iterations,
+        solver_velocity_iterations=physics.velocity_iterations,
+        sleep_threshold=0.0,
+    )
+    physx.set_shape_config(contact_offset=0.01, rest_offset=0.0)
+    physx.set_default_material(0.3, 0.3, 0.1)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
+        physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
+
+
+def _build_robot(builder: ArticulationBuilder, scene: Any, spec: SceneSpec) -> Any:
+    builder.set_scene(scene)
+    robot = builder.build()
+    names = [joint.name for joint in robot.active_joints]
+    if names != [joint.name for joint in spec.joints]:
+        raise RobotError(f"SAPIEN numbers the joints {names}, not {[joint.name for joint in spec.joints]}")
+    robot.set_sleep_threshold(0.0)
+    dissipation = DISSIPATION[spec.dissipation]
+    for link in robot.links:
+        link.set_linear_damping(dissipation.link_damping)
+        link.set_angular_damping(dissipation.link_damping)
+    for joint, ours in zip(robot.active_joints, spec.joints, strict=True):
+        # SAPIEN parses <dynamics friction> and never applies it.
+        friction = dissipation.joint_friction
+        joint.set_friction(ours.friction if friction is None else friction)
+    return robot
+
+
+def _separate(scene: Any, group: int) -> None:
+    """Give every shape of ``scene`` the collision group ``group``: shapes of different groups never touch.
+
+    PhysX's filter, as SAPIEN sets it up, compares the upper 16 bits of the fourth word.
+    """
+    for entity in scene.entities:
+        for component in entity.components:
+            if isinstance(component, physx.PhysxRigidBaseComponent):
+                for shape in component.collision_shapes:
+                    words = list(shape.get_collision_groups())
+                    words[3] = (words[3] & 0xFFFF) | (group << 16)
+                    shape.set_collision_groups(words)

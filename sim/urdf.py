@@ -1,0 +1,298 @@
+"""Reading a URDF for headless simulation: parsed safely, visuals dropped, meshes found, joints listed.
+
+SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render
+device, and goes on silently when a collision mesh is missing. Here the text is sanitised once; what the
+simulator is given holds no visual, no mimic that it would get wrong without a word, and absolute mesh paths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from lxml import etree
+
+from batchpid.errors import RobotError, RobotNotFoundError
+
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+"""URDF joint types that SAPIEN turns into degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """``q = multiplier * q_of_joint + offset``, as the URDF says it."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint of the URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
+
+    Limits that the URDF leaves out are infinite.
+    """
+
+    name: str
+    type: str
+    parent_link: str
+    child_link: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort_limit: float = math.inf
+    velocity_limit: float = math.inf
+    damping: float = 0.0
+    friction: float = 0.0
+    mimic: Mimic | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the joint is a degree of freedom."""
+        return self.type in MOVING_TYPES
+
+    @property
+    def continuous(self) -> bool:
+        """Whether positions wrap at a full turn (URDF type ``continuous``)."""
+        return self.type == "continuous"
+
+    @property
+    def unit(self) -> str:
+        """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
+        return "m" if self.type == "prismatic" else "rad"
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link: its mass [kg] (None without ``<inertial>``) and how many collision shapes it has."""
+
+    name: str
+    mass: float | None
+    collisions: int
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A URDF, ready for the headless simulator.
+
+    ``joints`` are in the order in which SAPIEN numbers them: depth first from the root, children in the order of
+    the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that it lacks.
+    """
+
+    name: str
+    text: str
+    joints: tuple[Joint, ...]
+    links: tuple[Link, ...]
+    missing_meshes: tuple[str, ...] = ()
+
+
+def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes: str = "error") -> Urdf:
+    """Read and sanitise the URDF file at ``path``.
+
+    Parameters
+    ----------
+    package_dirs
+        Where ``package://NAME/...`` is looked up, before the folders above the file.
+    missing_meshes
+        ``"error"``, or ``"skip"`` to simulate without the shapes whose mesh file cannot be found.
+
+    Raises
+    ------
+    RobotNotFoundError
+        There is no such file.
+    RobotError
+        Malformed XML, an entity or DTD, a structure that SAPIEN cannot build, a missing mesh.
+    """
+    root = _parse_xml(path)
+    if root.tag != "robot":
+        raise RobotError(
+            f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?"
+        )
+    for element in list(root.iter("visual")):
+        element.getparent().remove(element)
+    missing = _resolve_meshes(root, path, package_dirs)
+    if missing and missing_meshes == "error":
+        raise RobotError(
+            f"{path}: collision mesh not found: {', '.join(missing)}; "
+            "pass package_dirs=[...] with the folder that holds the package, or missing_meshes='skip' to "
+            "simulate without these shapes"
+        )
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    links = [_read_link(element, path) for element in root.findall("link")]
+    ordered = tuple(_depth_first(links, joints, path))
+    return Urdf(
+        name=root.get("name", path.stem),
+        text=etree.tostring(root, encoding="unicode"),
+        joints=ordered,
+        links=tuple(links),
+        missing_meshes=tuple(missing),
+    )
+
+
+def _parse_xml(path: Path) -> etree._Element:
+    if not path.is_file():
+        raise RobotNotFoundError(f"no URDF file at {path}; check the path")
+    # A description may come from a stranger: no entities, no DTD, no network, no oversized trees.
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True)
+    try:
+        tree = etree.parse(str(path), parser)
+    except etree.XMLSyntaxError as error:
+        raise RobotError(
+            f"{path}: not well-formed XML: {error.msg}; correct the file at that line"
+        ) from error
+    except OSError as error:
+        raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
+    if tree.docinfo.internalDTD is not None:
+        raise RobotError(
+            f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines"
+        )
+    return tree.getroot()
+
+
+def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
+    """Make mesh paths absolute; drop the shapes whose file is missing and return their names."""
+    missing = []
+    for collision in list(root.iter("collision")):
+        mesh = collision.find("geometry/mesh")
+        if mesh is None:
+            continue
+        name = mesh.get("filename", "")
+        found = _find_mesh(name, path, package_dirs)
+        if found is None:
+            missing.append(name)
+            collision.getparent().remove(collision)
+        else:
+            mesh.set("filename", str(found))
+    return missing
+
+
+def _find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
+    relative = name.removeprefix("package://").removeprefix("file://")
+    folders = [path.parent, *package_dirs]
+    if name.startswith("package://"):
+        folders = [*package_dirs, *path.absolute().parents]
+    for folder in folders:
+        candidate = (folder / relative).absolute()
+        if relative and candidate.is_file():
+            return candidate
+    return None
+
+
+def _number(element: etree._Element, key: str, default: float, where: str) -> float:
+    text = element.get(key)
+    if text is None:
+        return default
+    try:
+        return float(text)
+    except ValueError:
+        raise RobotError(
+            f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF"
+        ) from None
+
+
+def _read_joint(element: etree._Element, path: Path) -> Joint:
+    name = element.get("name", "")
+    where = f"{path}: joint {name!r}"
+    kind = element.get("type", "")
+    if kind not in (*MOVING_TYPES, "fixed"):
+        raise RobotError(
+            f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; "
+            "use revolute, continuous, prismatic or fixed"
+        )
+    parent, child = element.find("parent"), element.find("child")
+    if parent is None or child is None or not parent.get("link") or not child.get("link"):
+        raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
+    limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
+    limits: dict[str, float] = {}
+    if limit is not None:
+        limits["effort_limit"] = _number(limit, "effort", math.inf, where)
+        limits["velocity_limit"] = _number(limit, "velocity", math.inf, where)
+        if kind in ("revolute", "prismatic"):
+            limits["lower"] = _number(limit, "lower", 0.0, where)
+            limits["upper"] = _number(limit, "upper", 0.0, where)
+    elif kind in ("revolute", "prismatic"):
+        raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
+    if any(math.isnan(value) for value in limits.values()):
+        raise RobotError(f"{where}: a limit is NaN ({limits}); give numbers")
+    if limits.get("lower", -math.inf) > limits.get("upper", math.inf):
+        raise RobotError(
+            f"{where}: lower limit {limits['lower']:g} is above upper limit {limits['upper']:g}; swap them"
+        )
+    if limits.get("effort_limit", 0.0) < 0 or limits.get("velocity_limit", 0.0) < 0:
+        raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
+    passive: dict[str, float] = {}
+    if dynamics is not None:
+        passive = {key: _number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
+        if any(not 0 <= value < math.inf for value in passive.values()):
+            raise RobotError(
+                f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF"
+            )
+    return Joint(
+        name=name,
+        type=kind,
+        parent_link=parent.get("link"),
+        child_link=child.get("link"),
+        mimic=None
+        if mimic is None
+        else Mimic(
+            mimic.get("joint", ""),
+            _number(mimic, "multiplier", 1.0, where),
+            _number(mimic, "offset", 0.0, where),
+        ),
+        **limits,
+        **passive,
+    )
+
+
+def _read_link(element: etree._Element, path: Path) -> Link:
+    name = element.get("name", "")
+    mass = element.find("inertial/mass")
+    value = None if mass is None else _number(mass, "value", 0.0, f"{path}: link {name!r}")
+    if value is not None and not 0 <= value < math.inf:
+        raise RobotError(f"{path}: link {name!r}: mass {value} must be finite and >= 0; correct the URDF")
+    inertia = element.find("inertial/inertia")
+    if inertia is not None:
+        diagonal = [_number(inertia, key, 0.0, f"{path}: link {name!r}") for key in ("ixx", "iyy", "izz")]
+        if any(not 0 <= moment < math.inf for moment in diagonal):
+            raise RobotError(
+                f"{path}: link {name!r}: moments of inertia {diagonal} must be >= 0; correct the URDF"
+            )
+    return Link(name, value, len(element.findall("collision")))
+
+
+def _depth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:
+    """Joints from the root down, children in file order; raises unless links and joints form one tree."""
+    for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise RobotError(
+                f"{path}: {kind} name used twice: {', '.join(sorted(twice))}; names must be unique"
+            )
+    known = {link.name for link in links}
+    for joint in joints:
+        for link in (joint.parent_link, joint.child_link):
+            if link not in known:
+                raise RobotError(
+                    f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link"
+                )
+    children = [joint.child_link for joint in joints]
+    if twice := {name for name in children if children.count(name) > 1}:
+        raise RobotError(f"{path}: link with two parents: {', '.join(sorted(twice))}; a robot must be a tree")
+    roots = [link.name for link in links if link.name not in set(children)]
+    if len(roots) != 1:
+        raise RobotError(
+            f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree"
+        )
+    seen = 0
+    stack = [joint for joint in reversed(joints) if joint.parent_link == roots[0]]
+    while stack:
+        joint = stack.pop()
+        seen += 1
+        yield joint
+        stack += [child for child in reversed(joints) if child.parent_link == joint.child_link]
+    if seen != len(joints):
+        raise RobotError(
+            f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree"
+        )
