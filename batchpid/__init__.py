@@ -2,12 +2,15 @@
 
 from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.law import PIDState, Terms, advance, discretise, init, reset, step, track
+from batchpid.coefficients import Coefficients, discretise
+from batchpid.law import advance, init, reset, step, track
 from batchpid.params import PIDParams, make_params
+from batchpid.state import PIDState, Terms
 
 __all__ = [
     "BatchPID",
     "BatchPIDError",
+    "Coefficients",
     "InvalidArgumentError",
     "MissingDependencyError",
     "PIDParams",

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from batchpid import law
+from batchpid.coefficients import discretise
+from batchpid.state import PIDState
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.params import PIDParams
 
@@ -91,7 +93,7 @@ class BatchPID:
         self._engine.prepare(params, (self.num_envs, params.joints))
 
     @property
-    def state(self) -> law.PIDState | None:
+    def state(self) -> PIDState | None:
         """The law's state; None before the first measurement."""
         return self._state
 
@@ -138,7 +140,7 @@ class _NumPy:
         self.params = PIDParams(
             *(np.array(np.broadcast_to(p, shape)) if isinstance(p, np.ndarray) else p for p in params)
         )
-        self.coefficients = law.discretise(self.params, self.dt)
+        self.coefficients = discretise(self.params, self.dt)
 
     def array(self, value: Any) -> Any:
         return np.asarray(value, dtype=self.params.dtype)
@@ -158,7 +160,7 @@ class _JAX:
         self.dt, self.jax = dt, jax
 
         def step(params: PIDParams, state: Any, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any) -> Any:
-            k = law.discretise(params, dt)
+            k = discretise(params, dt)
             return law.advance(k, state, r, y, y_rate, r_rate, ff)
 
         self._step = jax.jit(step, donate_argnums=1)

@@ -43,6 +43,7 @@ class HoldEffort(NamedTuple):
     """Marker: a joint with a non-finite input gets its last effort again."""
 
 
+MARKERS = (Everywhere, IntegrateFirst, DerivativeKick, WeightFromStart, ZeroEffort, HoldEffort)
 CHOICES: dict[str, dict[str, Any]] = {
     "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
