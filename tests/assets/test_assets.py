@@ -1,0 +1,275 @@
+"""The bundled robots: the figures of the real ones, the tutorial's settings, and shapes that stay apart."""
+
+from __future__ import annotations
+
+import importlib.resources
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from lxml import etree
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # sapien warns on import where no system Vulkan library exists
+    import sapien
+
+ROBOTS = ("panda", "jaco2")
+TIMESTEP = 1 / 2000
+PI = np.pi
+
+# Effort and velocity limits, total mass and joint damping, as the sources named in assets/README.md state them.
+EFFORT = {
+    "panda": [87] * 4 + [12] * 3 + [100] * 2,
+    "jaco2": [40, 80, 40, 40, 20, 20, 20] + [2] * 6,
+}
+VELOCITY = {
+    "panda": [2.175] * 4 + [2.61] * 3 + [0.2] * 2,
+    "jaco2": [PI / 5] * 4 + [4 * PI / 15] * 3 + [1] * 6,
+}
+LOWER = {
+    "panda": [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973, 0, 0],
+    "jaco2": [-2 * PI, PI * 47 / 180, -2 * PI, PI * 30 / 180, -2 * PI, PI * 65 / 180, -2 * PI] + [0] * 6,
+}
+UPPER = {
+    "panda": [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973, 0.04, 0.04],
+    "jaco2": [2 * PI, PI * 313 / 180, 2 * PI, PI * 330 / 180, 2 * PI, PI * 295 / 180, 2 * PI]
+    + [1.41] * 3
+    + [2] * 3,
+}
+DAMPING = {"panda": [0.003] * 7 + [0.3] * 2, "jaco2": [0] * 13}
+MASS = {"panda": 17.451901, "jaco2": 5.55724}
+
+START = {"panda": [0, 0, 0, -0.07, 0, 0, 0, 0, 0], "jaco2": [0, 3.14, 0, 3.14, 0, 3.14, 0] + [0] * 6}
+TARGET = {
+    "panda": [1, 1, 1, -1, 1, 1, 1, 0.04, 0.04],
+    "jaco2": [4.71, 2.84, 0.0, 0.75, 4.62, 4.48, 4.88] + [0] * 6,
+}
+GAINS = {
+    "panda": [(40, 5, 2)] * 7 + [(0.1, 0, 0.02)] * 2,
+    "jaco2": [(40, 5, 2)] * 3 + [(20, 5, 2)] + [(5, 0.8, 2)] * 2 + [(5, 0.8, 0.4)] + [(0.1, 0, 0.02)] * 6,
+}
+
+
+def xml(name: str) -> etree._Element:
+    return etree.fromstring((importlib.resources.files("assets") / f"{name}.urdf").read_bytes())
+
+
+def settings(name: str) -> dict:
+    return yaml.safe_load((importlib.resources.files("assets") / f"{name}.yaml").read_text())
+
+
+class World:
+    """One robot in one scene, built without its visuals; keeps the scene alive."""
+
+    def __init__(self, root: etree._Element, folder: Path) -> None:
+        for visual in list(root.iter("visual")):
+            visual.getparent().remove(visual)
+        path = folder / "robot.urdf"
+        path.write_bytes(etree.tostring(root))
+        self.scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+        self.scene.timestep = TIMESTEP
+        self.scene.add_ground(0, render=False)
+        self.robot = self.scene.create_urdf_loader().load(str(path))
+        self.joints = self.robot.get_active_joints()
+
+    def passive(self, qpos: list[float], qvel: list[float]) -> np.ndarray:
+        self.robot.set_qpos(np.array(qpos, np.float32))
+        self.robot.set_qvel(np.array(qvel, np.float32))
+        return self.robot.compute_passive_force()
+
+    def touching(self, qpos: np.ndarray) -> set[tuple[str, ...]]:
+        """Pairs of bodies whose shapes overlap at ``qpos``."""
+        self.robot.set_qpos(np.asarray(qpos, np.float32))
+        self.robot.set_qvel(np.zeros(self.robot.dof, np.float32))
+        self.scene.step()
+        return {
+            tuple(sorted(body.entity.name for body in contact.bodies))
+            for contact in self.scene.get_contacts()
+            if any(point.separation < 0 for point in contact.points)
+        }
+
+
+@pytest.fixture(params=ROBOTS)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def world(name: str, tmp_path: Path) -> Iterator[World]:
+    return World(xml(name), tmp_path)
+
+
+def test_shapes_are_primitives_and_materials_exist(name: str) -> None:
+    root = xml(name)
+    shapes = [shape for geometry in root.iter("geometry") for shape in geometry]
+    assert {shape.tag for shape in shapes} <= {"box", "cylinder", "sphere"}
+    sizes = [float(x) for shape in shapes for key in shape.attrib for x in shape.get(key).split()]
+    assert min(sizes) > 0
+    defined = {material.get("name") for material in root.findall("material")}
+    assert {material.get("name") for material in root.iterfind("link/visual/material")} == defined
+
+
+def test_every_link_can_be_seen_touched_and_weighed(name: str) -> None:
+    for link in xml(name).findall("link"):
+        assert link.find("visual/material") is not None
+        assert link.find("collision") is not None
+        entry = {key: float(value) for key, value in link.find("inertial/inertia").attrib.items()}
+        matrix = [
+            [entry["ixx"], entry["ixy"], entry["ixz"]],
+            [entry["ixy"], entry["iyy"], entry["iyz"]],
+            [entry["ixz"], entry["iyz"], entry["izz"]],
+        ]
+        small, middle, large = np.linalg.eigvalsh(matrix)
+        assert small > 0
+        assert small + middle >= large, "no solid has these moments"
+
+
+def test_limits_and_dynamics_are_the_robots_own(name: str) -> None:
+    joints = [joint for joint in xml(name).findall("joint") if joint.get("type") != "fixed"]
+    limits = {
+        key: [float(joint.find("limit").get(key)) for joint in joints]
+        for key in ("lower", "upper", "effort", "velocity")
+    }
+    np.testing.assert_allclose(limits["lower"], LOWER[name], atol=1e-9)
+    np.testing.assert_allclose(limits["upper"], UPPER[name], atol=1e-9)
+    np.testing.assert_allclose(limits["velocity"], VELOCITY[name], atol=1e-9)
+    assert limits["effort"] == EFFORT[name]
+    assert [float(joint.find("dynamics").get("damping")) for joint in joints] == DAMPING[name]
+    assert {joint.find("dynamics").get("friction") for joint in joints} == {"0"}
+    assert xml(name).find("joint/mimic") is None
+
+
+def test_sapien_sees_every_joint_in_file_order(name: str, world: World) -> None:
+    listed = [joint.get("name") for joint in xml(name).findall("joint") if joint.get("type") != "fixed"]
+    assert [joint.name for joint in world.joints] == listed == list(settings(name)["joints"])
+    assert world.robot.dof == len(LOWER[name])
+    np.testing.assert_allclose(
+        [joint.limits[0] for joint in world.joints], np.transpose([LOWER[name], UPPER[name]]), atol=1e-6
+    )
+    np.testing.assert_allclose([joint.damping for joint in world.joints], DAMPING[name], rtol=1e-6)
+
+
+def test_sapien_orders_joints_breadth_first(tmp_path: Path) -> None:
+    # The rule that assets/README.md states, on an uneven tree with a fixed joint, listed out of order.
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    links = "".join(f'<link name="{link}">{inertial}</link>' for link in "gfedcba")
+    kinds = {
+        "ef": "prismatic",
+        "ab": "revolute",
+        "ac": "revolute",
+        "ce": "revolute",
+        "bd": "fixed",
+        "dg": "revolute",
+    }
+    joints = "".join(
+        f'<joint name="{pair}" type="{kind}"><parent link="{pair[0]}"/><child link="{pair[1]}"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        for pair, kind in kinds.items()
+    )
+    world = World(etree.fromstring(f'<robot name="tree">{links}{joints}</robot>'), tmp_path)
+    assert [joint.name for joint in world.robot.get_joints()][1:] == ["ab", "ac", "bd", "ce", "dg", "ef"]
+    assert [joint.name for joint in world.joints] == ["ab", "ac", "ce", "dg", "ef"]
+
+
+def test_mass_is_the_robots_own_and_no_link_is_massless(name: str, world: World) -> None:
+    masses = [link.mass for link in world.robot.links]
+    assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)
+    assert min(masses) == pytest.approx(0.01 if name == "jaco2" else 0.015)
+
+
+def test_panda_passive_force_equals_the_sources(tmp_path: Path) -> None:
+    # Expected: SAPIEN 3.0.3 on the source description itself, mimic and meshes taken out.
+    passive = World(xml("panda"), tmp_path).passive(
+        [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03], [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.05, -0.02]
+    )
+    expected = [
+        1.782364,
+        -14.247656,
+        -5.767752,
+        19.389013,
+        1.209106,
+        2.049891,
+        -0.035392,
+        0.028486,
+        -0.038695,
+    ]
+    np.testing.assert_allclose(passive, expected, atol=5e-5)
+
+
+def test_jaco2_passive_force_equals_the_sources_without_what_was_added(tmp_path: Path) -> None:
+    # Expected: SAPIEN 3.0.3 on the source description itself, which has neither finger 2 nor moving tips.
+    root = xml("jaco2")
+    for element in root.findall("link") + root.findall("joint"):
+        label = element.get("name")
+        if label.endswith(("finger_2", "tip_2")):
+            root.remove(element)
+        elif element.tag == "joint" and "tip" in label:
+            element.set("type", "fixed")
+    passive = World(root, tmp_path).passive(
+        [0.3, 2.6, 0.5, 1.9, -0.7, 2.4, 0.9, 0.4, 0.8], [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.6, -0.4]
+    )
+    expected = [0.67722, 2.546988, -2.425809, 4.644617, 0.909402, 0.181891, 0.00139, 0.007114, -0.004496]
+    np.testing.assert_allclose(passive, expected, atol=5e-5)
+
+
+def test_jaco2_fingers_2_and_3_are_mirror_images(tmp_path: Path) -> None:
+    world = World(xml("jaco2"), tmp_path)
+    qpos = np.array(START["jaco2"], np.float32)
+    qpos[7:] = [0.3, 0.6, 0.6, 0.2, 0.9, 0.9]  # fingers 2 and 3 alike, finger 1 not
+    world.robot.set_qpos(qpos)
+    links = {link.name: link.entity_pose for link in world.robot.links}
+    palm = links["j2s7s300_link_7"].inv()
+    for part in ("finger", "finger_tip"):
+        second = (palm * links[f"j2s7s300_link_{part}_2"]).to_transformation_matrix()
+        third = (palm * links[f"j2s7s300_link_{part}_3"]).to_transformation_matrix()
+        # Mirroring a right-handed frame in x = 0 needs one axis turned round: z, the bending axis.
+        mirrored = np.diag([-1, 1, 1, 1]) @ third @ np.diag([1, 1, -1, 1])
+        np.testing.assert_allclose(second, mirrored, atol=1e-6)
+
+
+@pytest.mark.parametrize("finger", [1, 2, 3])
+def test_jaco2_fingers_close_with_positive_angles(finger: int, tmp_path: Path) -> None:
+    world = World(xml("jaco2"), tmp_path)
+
+    def reach(angle: float) -> float:
+        """Distance of the finger tip's frame from the palm's axis."""
+        qpos = np.array(START["jaco2"], np.float32)
+        qpos[6 + finger] = angle
+        world.robot.set_qpos(qpos)
+        links = {link.name: link.entity_pose for link in world.robot.links}
+        tip = links["j2s7s300_link_7"].inv() * links[f"j2s7s300_link_finger_tip_{finger}"]
+        return float(np.linalg.norm(tip.p[:2]))
+
+    assert reach(0.0) > reach(0.5) > reach(1.0)
+
+
+def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -> None:
+    start, target = np.array(START[name]), np.array(TARGET[name])
+    touching = {pair for a in np.linspace(0, 1, 21) for pair in world.touching(start + a * (target - start))}
+    assert touching == set()
+
+
+def test_a_folded_arm_does_touch_itself(tmp_path: Path) -> None:
+    # Guards the test above: the shapes do collide where a real arm would.
+    touching = World(xml("panda"), tmp_path).touching([0, 1.7, 0, -3.0, 0, 0.5, 0, 0, 0])
+    assert any("ground" not in pair for pair in touching)
+
+
+def test_settings_are_the_tutorials_and_within_limits(name: str) -> None:
+    data = settings(name)
+    rows = list(data["joints"].values())
+    assert data["robot"] == name
+    assert data["rate_hz"] == 2000
+    assert data["drive"] == {"stiffness": 20, "damping": 5}
+    assert [row["start"] for row in rows] == START[name]
+    assert [row["target"] for row in rows] == TARGET[name]
+    assert [(row["kp"], row["ki"], row["kd"]) for row in rows] == GAINS[name]
+    for key in ("start", "target"):
+        values = np.array([row[key] for row in rows])
+        assert (values >= np.array(LOWER[name]) - 1e-12).all()
+        assert (values <= np.array(UPPER[name]) + 1e-12).all()
