@@ -77,8 +77,8 @@ class Link:
 class Urdf:
     """A URDF, ready for the headless simulator.
 
-    ``joints`` are in the order in which SAPIEN numbers them: depth first from the root, children in the order of
-    the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that it lacks.
+    ``joints`` are in the order in which SAPIEN numbers them: breadth first from the root, fixed joints counted,
+    joints of one parent in the order of the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that it lacks.
     """
 
     name: str
@@ -121,7 +121,7 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
         )
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
-    ordered = tuple(_depth_first(links, joints, path))
+    ordered = tuple(_breadth_first(links, joints, path))
     return Urdf(
         name=root.get("name", path.stem),
         text=etree.tostring(root, encoding="unicode"),
@@ -262,8 +262,8 @@ def _read_link(element: etree._Element, path: Path) -> Link:
     return Link(name, value, len(element.findall("collision")))
 
 
-def _depth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:
-    """Joints from the root down, children in file order; raises unless links and joints form one tree."""
+def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:
+    """Joints level by level from the root, siblings in file order; raises unless they form one tree."""
     for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
@@ -286,12 +286,12 @@ def _depth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator
             f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree"
         )
     seen = 0
-    stack = [joint for joint in reversed(joints) if joint.parent_link == roots[0]]
-    while stack:
-        joint = stack.pop()
-        seen += 1
-        yield joint
-        stack += [child for child in reversed(joints) if child.parent_link == joint.child_link]
+    level = [roots[0]]
+    while level:
+        found = [joint for link in level for joint in joints if joint.parent_link == link]
+        seen += len(found)
+        yield from found
+        level = [joint.child_link for joint in found]
     if seen != len(joints):
         raise RobotError(
             f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree"
