@@ -78,7 +78,8 @@ class Urdf:
     """A URDF, ready for the headless simulator.
 
     ``joints`` are in the order in which SAPIEN numbers them: breadth first from the root, fixed joints counted,
-    joints of one parent in the order of the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that it lacks.
+    joints of one parent in the order of the file. ``text`` is what the simulator parses; ``missing_meshes``
+    names the collision meshes that it lacks.
     """
 
     name: str
