@@ -10,9 +10,9 @@ import numpy as np
 
 from batchpid import law
 from batchpid.coefficients import discretise
-from batchpid.state import PIDState
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.params import PIDParams
+from batchpid.state import PIDState
 
 BACKENDS = ("numpy", "jax")
 
@@ -61,7 +61,9 @@ class BatchPID:
                 "num_envs", "is not a whole number >= 1", value=num_envs, remedy="give the number of envs"
             )
         if not isinstance(dt, int | float | np.floating) or not 0 < dt < math.inf:
-            raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
+            raise InvalidArgumentError(
+                "dt", "is not positive and finite", value=dt, remedy="give seconds > 0"
+            )
         self.num_envs, self.dt, self.backend = int(num_envs), float(dt), backend
         self.joint_names = joint_names
         self._engine = _NumPy(self.dt) if backend == "numpy" else _JAX(self.dt)
@@ -83,11 +85,16 @@ class BatchPID:
     def params(self, params: PIDParams) -> None:
         if not isinstance(params, PIDParams):
             raise InvalidArgumentError(
-                "params", "are no PIDParams", value=type(params).__name__, remedy="build them with make_params"
+                "params",
+                "are no PIDParams",
+                value=type(params).__name__,
+                remedy="build them with make_params",
             )
         if params.num_envs not in (1, self.num_envs):
             raise InvalidArgumentError(
-                "params", f"are for {params.num_envs} envs, not {self.num_envs}", remedy="slice or rebuild them"
+                "params",
+                f"are for {params.num_envs} envs, not {self.num_envs}",
+                remedy="slice or rebuild them",
             )
         self._params = params
         self._engine.prepare(params, (self.num_envs, params.joints))
@@ -110,7 +117,9 @@ class BatchPID:
         y = engine.array(measurement)
         if self._state is None:
             self._state = law.init(engine.params, y)
-        self._state, effort = engine.step(self._state, engine.array(setpoint), y, measurement_rate, setpoint_rate, feedforward)
+        self._state, effort = engine.step(
+            self._state, engine.array(setpoint), y, measurement_rate, setpoint_rate, feedforward
+        )
         return effort
 
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
@@ -127,7 +136,9 @@ class BatchPID:
         array = self._engine.array
         y = array(measurement)
         state = law.init(self._engine.params, y) if self._state is None else self._state
-        self._state = law.track(self._engine.params, state, array(setpoint), y, array(effort), dt=self.dt, **inputs)
+        self._state = law.track(
+            self._engine.params, state, array(setpoint), y, array(effort), dt=self.dt, **inputs
+        )
 
 
 class _NumPy:

@@ -26,7 +26,8 @@ from typing import Any
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.elementwise import clip, flush, namespace, wrap
 from batchpid.errors import InvalidArgumentError
-from batchpid.params import Everywhere, HoldEffort, PIDParams
+from batchpid.markers import Everywhere, HoldEffort
+from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
 
@@ -97,7 +98,14 @@ def step(
         If dt is a Python number that is not positive and finite.
     """
     return advance(
-        discretise(params, dt), state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward, aux
+        discretise(params, dt),
+        state,
+        setpoint,
+        measurement,
+        measurement_rate,
+        setpoint_rate,
+        feedforward,
+        aux,
     )
 
 
@@ -120,7 +128,9 @@ def advance(
         for optional in (r_rate, y_rate, ff):
             total = total if optional is None else total + optional
         finite = xp.isfinite(total)
-        r, y, r_rate, y_rate, ff = (None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff))
+        r, y, r_rate, y_rate, ff = (
+            None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
+        )
 
     error = _error(k, r, y, xp)
     origin = _origin(k, state, y, xp)
@@ -173,7 +183,9 @@ def advance(
         origin=origin,
     )
     if finite is not None:
-        new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
+        new = PIDState(
+            *(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True))
+        )
         effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
     if not aux:
         return new, effort
@@ -188,7 +200,9 @@ def advance(
     return new, effort, Terms(*shown, effort, finite & (effort != u), finite)
 
 
-def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
+def reset(
+    params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False
+) -> PIDState:
     """Start the envs of ``mask`` (envs,) bool anew from ``measurement`` (envs, joints); the others are untouched.
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load.
@@ -198,7 +212,9 @@ def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, ke
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
     chosen = xp.asarray(mask)[:, None]
-    return PIDState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))
+    return PIDState(
+        *(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True))
+    )
 
 
 def track(
@@ -225,9 +241,13 @@ def track(
         If the params have no integral (ki is None), or integrate first and dt is missing.
     """
     if params.ki is None:
-        raise InvalidArgumentError("ki", "is off, so nothing can carry the effort over", remedy="give ki, 0 allowed")
+        raise InvalidArgumentError(
+            "ki", "is off, so nothing can carry the effort over", remedy="give ki, 0 allowed"
+        )
     if params.integration is not None and dt is None:
-        raise InvalidArgumentError("dt", "is needed where the params integrate first", remedy="give dt in seconds")
+        raise InvalidArgumentError(
+            "dt", "is needed where the params integrate first", remedy="give dt in seconds"
+        )
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)

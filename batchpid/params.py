@@ -15,42 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.errors import InvalidArgumentError
-
-ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
-
-
-class Everywhere(NamedTuple):
-    """Marker: an option that may be chosen per joint and env holds on all of them, so no mask is needed."""
-
-
-class IntegrateFirst(NamedTuple):
-    """Marker: the integral takes in the present error before the effort is computed."""
-
-
-class DerivativeKick(NamedTuple):
-    """Marker: the error before the first sample counts as 0, so the first derivative is a kick (peers do it)."""
-
-
-class WeightFromStart(NamedTuple):
-    """Marker: setpoint weighting measures positions from the first measurement instead of from 0."""
-
-
-class ZeroEffort(NamedTuple):
-    """Marker: a joint with a non-finite input gets effort 0."""
-
-
-class HoldEffort(NamedTuple):
-    """Marker: a joint with a non-finite input gets its last effort again."""
-
-
-MARKERS = (Everywhere, IntegrateFirst, DerivativeKick, WeightFromStart, ZeroEffort, HoldEffort)
-CHOICES: dict[str, dict[str, Any]] = {
-    "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
-    "first_derivative": {"zero": None, "kick": DerivativeKick()},
-    "weight_origin": {"zero": None, "start": WeightFromStart()},
-    "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
-}
-"""Options chosen by name, and the marker that each name puts into the params (the first is the default)."""
+from batchpid.markers import (
+    CHOICES,
+    DerivativeKick,
+    Everywhere,
+    HoldEffort,
+    IntegrateFirst,
+    WeightFromStart,
+    ZeroEffort,
+)
+from batchpid.options import LeafBuilder
 
 
 class PIDParams(NamedTuple):
@@ -117,6 +91,68 @@ class PIDParams(NamedTuple):
     def for_envs(self, envs: slice | Any) -> PIDParams:
         """Return the params of some envs (a slice or an index array); shared rows stay shared."""
         return PIDParams(*(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self))
+
+    def options(self) -> dict[str, Any]:
+        """Return the options that are on, as arguments of :func:`make_params` that build these params again.
+
+        "clamp" shows as the integral limits it stands for.
+        """
+        options: dict[str, Any] = {}
+        for name, leaf in zip(self._fields, self, strict=True):
+            if name in CHOICES:
+                (options[name],) = (n for n, marker in CHOICES[name].items() if type(marker) is type(leaf))
+            elif _is_array(leaf) and name != "conditional":
+                options[name] = np.array(leaf)
+        if self.continuous is not None:
+            options["continuous"] = options["continuous"] > 0
+        strategy = np.full((1, self.joints), "none", dtype=object)
+        if self.tracking_time is not None:
+            strategy = np.where(np.isfinite(options["tracking_time"]), "back_calculation", strategy)
+        if self.conditional is not None:
+            everywhere = isinstance(self.conditional, Everywhere)
+            chosen = np.array(True) if everywhere else np.asarray(self.conditional) > 0
+            strategy = np.where(chosen, "conditional", strategy)
+        return {**options, "anti_windup": strategy, "dtype": np.dtype(self.dtype)}
+
+    def replace(self, **options: Any) -> PIDParams:
+        """Return params with some options of :func:`make_params` changed, checked as there."""
+        known = self.options()
+        for end in ("effort", "integral"):
+            if f"{end}_limit" in options:
+                known.pop(f"{end}_min", None)
+                known.pop(f"{end}_max", None)
+        if "anti_windup" in options:
+            known.pop("tracking_time", None)
+        return make_params(self.joints, **{**known, **options})
+
+    def check(self, num_envs: int) -> None:
+        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+        expected = f"(1, {self.joints}) or ({num_envs}, {self.joints})"
+        for name, leaf in zip(self._fields, self, strict=True):
+            if not _is_array(leaf):
+                continue
+            array = np.asarray(leaf)
+            if array.shape not in ((1, self.joints), (num_envs, self.joints)):
+                raise InvalidArgumentError(
+                    f"params.{name}",
+                    f"has shape {array.shape}, not {expected}",
+                    remedy="slice or rebuild the params",
+                )
+            if array.dtype != self.dtype:
+                raise InvalidArgumentError(
+                    f"params.{name}", f"is {array.dtype}, but kp is {self.dtype}", remedy="use one dtype"
+                )
+            bad = np.isnan(array) if name in _SIGNED else ~(array >= 0)
+            if bad.any():
+                env, joint = (int(n) for n in np.argwhere(bad)[0])
+                raise InvalidArgumentError(
+                    f"params.{name}",
+                    "is NaN" if name in _SIGNED else "is negative or NaN",
+                    joint=joint,
+                    env=env if array.shape[0] > 1 else None,
+                    value=float(array[env, joint]),
+                    remedy="correct that entry",
+                )
 
 
 def make_params(
@@ -198,7 +234,7 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    build = _Builder(joints, joint_names, dtype)
+    build = LeafBuilder(joints, joint_names, dtype)
     if kp is None:
         raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
     inf = math.inf
@@ -206,22 +242,21 @@ def make_params(
     lowest, highest = build.limits("effort", effort_limit, effort_min, effort_max)
     integral_lowest, integral_highest = build.limits("integral", integral_limit, integral_min, integral_max)
     clamp, conditional, back = build.strategies(anti_windup)
-    if clamp is not None:
-        if integral_lowest is None and integral_highest is None:
-            integral_lowest, integral_highest = lowest, highest
-            if lowest is None and highest is None:
-                raise InvalidArgumentError(
-                    "anti_windup",
-                    "'clamp' has no limit to clamp the integral to",
-                    remedy="give integral_limit or effort_limit",
-                )
-            integral_lowest = None if lowest is None else np.where(clamp, lowest, -inf)
-            integral_highest = None if highest is None else np.where(clamp, highest, inf)
+    if clamp is not None and integral_lowest is None and integral_highest is None:
+        if lowest is None and highest is None:
+            raise InvalidArgumentError(
+                "anti_windup",
+                "'clamp' has no limit to clamp the integral to",
+                remedy="give integral_limit or effort_limit",
+            )
+        integral_lowest = None if lowest is None else np.where(clamp, lowest, -inf)
+        integral_highest = None if highest is None else np.where(clamp, highest, inf)
     tracking = None
     if back is not None:
         tracking = build.array("tracking_time", tracking_time, 0.0, inf)
         tracking = _rule_of_thumb(p, i, d) if tracking is None else tracking
         tracking = np.where(back, tracking, inf)
+        tracking = None if np.isinf(tracking).all() else tracking
     elif tracking_time is not None:
         raise InvalidArgumentError(
             "tracking_time",
@@ -262,6 +297,9 @@ def make_params(
     )
 
 
+_SIGNED = ("effort_min", "effort_max", "integral_min", "integral_max")
+
+
 def _is_array(leaf: Any) -> bool:
     """Whether this entry of a params tuple is a leaf (neither off nor a marker)."""
     return leaf is not None and not isinstance(leaf, tuple)
@@ -275,144 +313,3 @@ def _rule_of_thumb(kp: Any, ki: Any, kd: Any) -> Any:
     kp, ki, kd = np.broadcast_arrays(kp, ki, kd)
     safe = np.where(ki > 0, ki, 1.0)
     return np.where(ki > 0, np.where(kd > 0, np.sqrt(kd / safe), kp / safe), math.inf)
-
-
-class _Builder:
-    """Turns what the caller gave into canonical arrays, and complaints into errors that name the culprit."""
-
-    def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: Any) -> None:
-        if isinstance(joints, bool) or not isinstance(joints, int | np.integer) or joints < 1:
-            raise InvalidArgumentError(
-                "joints", "is not a whole number >= 1", value=joints, remedy="give the number of joints"
-            )
-        if joint_names is not None and len(joint_names) != joints:
-            raise InvalidArgumentError(
-                "joint_names", f"names {len(joint_names)} joints, not {joints}", remedy="name every joint once"
-            )
-        self.joints, self.names = int(joints), joint_names
-        self.dtype = np.dtype(dtype)
-        if self.dtype not in (np.float32, np.float64):
-            raise InvalidArgumentError(
-                "dtype", "is neither float32 nor float64", value=str(dtype), remedy="choose one of them"
-            )
-        self.num_envs = 1
-
-    def array(self, name: str, value: Any, low: float, high: float = math.nan, above: bool = False) -> Any:
-        """Return ``value`` as (1 | envs, joints) with every entry in [low, high]; ``high`` NaN: finite only."""
-        if value is None:
-            return None
-        try:
-            array = np.asarray(value)
-            if array.dtype.kind not in "iuf":
-                raise TypeError
-            array = array.astype(self.dtype)
-        except (TypeError, ValueError):
-            raise InvalidArgumentError(
-                name, "is not made of real numbers", value=value, remedy="give numbers"
-            ) from None
-        array = self._canonical(name, array)
-        within = np.isfinite(array) if math.isnan(high) else array <= high
-        within &= (array > low) if above else (array >= low)
-        if not within.all():
-            env, joint = (int(n) for n in np.argwhere(~within)[0])
-            bounds = f"{'>' if above else '>='} {low:g}" if math.isfinite(low) else "a number"
-            raise InvalidArgumentError(
-                name,
-                f"must be {'finite and ' if math.isnan(high) else ''}{bounds}",
-                joint=self.names[joint] if self.names is not None else joint,
-                env=env if array.shape[0] > 1 else None,
-                value=float(array[env, joint]),
-                remedy="correct that entry",
-            )
-        return array
-
-    def option(self, name: str, value: Any, *, neutral: float, above: bool = False) -> Any:
-        """Return an option's leaf: None where it is ``neutral`` on every joint of every env."""
-        array = self.array(name, value, 0.0, math.inf if math.isinf(neutral) else math.nan, above)
-        return None if array is None or (array == neutral).all() else self.freeze(array)
-
-    def limits(self, name: str, symmetric: Any, low: Any, high: Any) -> tuple[Any, Any]:
-        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere."""
-        if symmetric is not None:
-            if low is not None or high is not None:
-                raise InvalidArgumentError(
-                    f"{name}_limit",
-                    f"is given together with {name}_min or {name}_max",
-                    remedy="give the symmetric limit, or the two ends",
-                )
-            upper = self.array(f"{name}_limit", symmetric, 0.0, math.inf)
-            lower = -upper
-        else:
-            lower = self.array(f"{name}_min", low, -math.inf, math.inf)
-            upper = self.array(f"{name}_max", high, -math.inf, math.inf)
-        if lower is not None and upper is not None and not (lower <= upper).all():
-            env, joint = (int(n) for n in np.argwhere(~(lower <= upper))[0])
-            raise InvalidArgumentError(
-                f"{name}_min",
-                f"exceeds {name}_max",
-                joint=self.names[joint] if self.names is not None else joint,
-                env=env if max(lower.shape[0], upper.shape[0]) > 1 else None,
-                remedy="swap or correct them",
-            )
-        lower = None if lower is None or np.isneginf(lower).all() else lower
-        upper = None if upper is None or np.isposinf(upper).all() else upper
-        return lower, upper
-
-    def mask(self, name: str, value: Any) -> Any:
-        """Return a mask of 1.0 and 0.0, None where it is False everywhere."""
-        if value is None:
-            return None
-        array = np.asarray(value)
-        if array.dtype.kind != "b":
-            raise InvalidArgumentError(name, "is not made of bools", value=value, remedy="give True or False")
-        array = self._canonical(name, array)
-        return array.astype(self.dtype) if array.any() else None
-
-    def strategies(self, value: Any) -> tuple[Any, Any, Any]:
-        """Return the masks of clamp, conditional and back-calculation, each None where no joint has it."""
-        array = self._canonical("anti_windup", np.asarray(value, dtype=object))
-        for env, joint in np.ndindex(array.shape):
-            if not isinstance(array[env, joint], str) or array[env, joint] not in ANTI_WINDUP:
-                raise InvalidArgumentError(
-                    "anti_windup",
-                    "is no known strategy",
-                    joint=self.names[joint] if self.names is not None else joint,
-                    env=env if array.shape[0] > 1 else None,
-                    value=array[env, joint],
-                    remedy=f"choose from {', '.join(ANTI_WINDUP)}",
-                )
-        masks = (array == strategy for strategy in ANTI_WINDUP[1:])
-        clamp, conditional, back = (mask if mask.any() else None for mask in masks)
-        return clamp, conditional, back
-
-    def choice(self, name: str, chosen: Any) -> Any:
-        """Return the marker of a named choice."""
-        if not isinstance(chosen, str) or chosen not in CHOICES[name]:
-            raise InvalidArgumentError(
-                name, "is no known choice", value=chosen, remedy=f"choose from {', '.join(CHOICES[name])}"
-            )
-        return CHOICES[name][chosen]
-
-    def freeze(self, array: Any) -> Any:
-        """Return the leaf in the params' dtype and read-only: params are values, to be replaced and not edited."""
-        if array is None:
-            return None
-        leaf = np.array(array, dtype=self.dtype)
-        leaf.setflags(write=False)
-        return leaf
-
-    def _canonical(self, name: str, array: Any) -> Any:
-        """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
-        if array.ndim <= 1 and array.size and array.shape in ((), (1,), (self.joints,)):
-            return np.broadcast_to(array, (1, self.joints)).copy()
-        if array.ndim == 2 and array.shape[1] in (1, self.joints) and array.shape[0] >= 1:
-            envs = array.shape[0]
-            if envs == 1 or self.num_envs in (1, envs):
-                self.num_envs = max(self.num_envs, envs)
-                return np.broadcast_to(array, (envs, self.joints)).copy()
-            expected = f"({self.num_envs}, {self.joints}), as another option has it"
-        else:
-            expected = f"(), ({self.joints},) or (envs, {self.joints})"
-        raise InvalidArgumentError(
-            name, f"has shape {array.shape}, not {expected}", remedy="give one value, or one per joint, or one per env and joint"
-        )
