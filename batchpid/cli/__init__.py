@@ -1,0 +1,99 @@
+"""The command line: a table of commands, each a frozen dataclass whose flags tyro builds.
+
+A command is loaded only when it is named, and does its heavy imports inside ``run``, so that ``--help`` answers at
+once. To add one, write a module with a frozen dataclass that has ``run(self) -> int | None``, and add a line below.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.metadata
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+COMMANDS = {
+    # name: (module:class, summary)
+    "demo": (
+        "batchpid.cli.demo:Demo",
+        "64 arms close on the tutorial's setpoint; ends with a table and a picture",
+    ),
+}
+
+
+class Command(Protocol):
+    """What a command is: its fields are the flags, and ``run`` returns the exit status (None: 0)."""
+
+    def run(self) -> int | None:
+        """Do it."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 2 for bad input, 130 after Ctrl-C, 141 for a closed pipe."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help", "help"):
+        print(_overview())
+        return 0 if arguments else 2
+    if name == "--version":
+        print(importlib.metadata.version("batchpid"))
+        return 0
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"choose one of {', '.join(COMMANDS)}"
+        return _complain(f"no command {name!r}; {hint}")
+    return _run(name, arguments[1:])
+
+
+def _run(name: str, arguments: list[str]) -> int:
+    import tyro
+
+    from batchpid.errors import BatchPIDError
+
+    command: Command = tyro.cli(_load(name), prog=f"batchpid {name}", args=arguments)
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            status = command.run()
+            sys.stdout.flush()
+        except BatchPIDError as error:
+            return _complain(str(error))
+        except KeyboardInterrupt:
+            return _complain("interrupted", 128 + signal.SIGINT)
+        except BrokenPipeError:
+            # The reader left (``| head``). Python flushes stdout once more at exit: let that go nowhere.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 128 + signal.SIGPIPE
+    return status or 0
+
+
+def _load(name: str) -> Any:
+    module, _, attribute = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: batchpid COMMAND [flags]     (batchpid COMMAND --help lists the flags)",
+            "",
+            "Joint-level PID control for many robots at once, in SAPIEN.",
+            "",
+            *lines,
+        ]
+    )
+
+
+def _complain(message: str, status: int = 2) -> int:
+    print(f"batchpid: {message}", file=sys.stderr)
+    return status
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    print(f"batchpid: warning: {message}", file=sys.stderr)
