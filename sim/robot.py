@@ -15,6 +15,7 @@ import assets
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 
+from .check import Finding, check
 from .physics import DISSIPATION
 from .urdf import Joint, Link, read_urdf
 
@@ -200,6 +201,36 @@ class Robot:
                 remedy="pass kp=, ki=, kd= (scalar or per joint)",
             )
         return bp.make_params(joints=self.dof, **(known | options))
+
+    def check(
+        self,
+        *,
+        params: bp.PIDParams | None = None,
+        qpos: ArrayLike | None = None,
+        setpoint: ArrayLike | None = None,
+        timestep: float = 1 / 2000,
+        control: str = "pid",
+    ) -> list[Finding]:
+        """Preflight: what is odd about this robot, and about running it this way.
+
+        Parameters
+        ----------
+        params
+            The PID's, to check them too; default those of :meth:`params` where the robot carries gains.
+        qpos, setpoint
+            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or m].
+        timestep
+            Of control and simulation [s].
+        control
+            As :class:`sim.Runner` takes it.
+
+        Returns
+        -------
+        Findings, most severe first; empty where nothing is odd.
+        """
+        if params is None and self.settings is not None and control == "pid":
+            params = self.params()
+        return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
 
     def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
         """Entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""

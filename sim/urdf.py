@@ -8,7 +8,7 @@ simulator is given holds no visual, no mimic that it would get wrong without a w
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,14 +63,23 @@ class Joint:
         """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
         return "m" if self.type == "prismatic" else "rad"
 
+    @property
+    def effort_unit(self) -> str:
+        """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
+        return "N" if self.type == "prismatic" else "N m"
+
 
 @dataclass(frozen=True)
 class Link:
-    """One link: its mass [kg] (None without ``<inertial>``) and how many collision shapes it has."""
+    """One link: its mass [kg] (None without ``<inertial>``) and how many collision shapes it has.
+
+    ``inertial`` is whether SAPIEN takes mass and inertia from the URDF: both are there, and not zero.
+    """
 
     name: str
     mass: float | None
     collisions: int
+    inertial: bool
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,7 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
         )
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
+    _keep_working_mimics(root, joints, path)
     ordered = tuple(_breadth_first(links, joints, path))
     return Urdf(
         name=root.get("name", path.stem),
@@ -247,6 +257,34 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     )
 
 
+def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
+    """Whether SAPIEN realises the mimic of ``joint``, which it does by a tendon.
+
+    It has to be ``q = +-q_other``; the other joint a sibling, or the one above with a link above it. Anything
+    else SAPIEN gets wrong, or drops, without a word.
+    """
+    mimic = joint.mimic
+    if mimic is None or abs(mimic.multiplier) != 1 or mimic.offset != 0:
+        return False
+    other = next(other for other in joints if other.name == mimic.joint)
+    if not other.moves or other is joint:
+        return False
+    return joint.parent_link in (other.child_link, other.parent_link)
+
+
+def _keep_working_mimics(root: etree._Element, joints: Sequence[Joint], path: Path) -> None:
+    """Remove the mimics that the simulator would get wrong: those joints move by themselves, and a check says so."""
+    for element, joint in zip(root.findall("joint"), joints, strict=True):
+        if joint.mimic is None:
+            continue
+        if joint.mimic.joint not in {other.name for other in joints}:
+            raise RobotError(
+                f"{path}: joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}; correct the name"
+            )
+        if not mimic_works(joint, joints):
+            element.remove(element.find("mimic"))
+
+
 def _read_link(element: etree._Element, path: Path) -> Link:
     name = element.get("name", "")
     mass = element.find("inertial/mass")
@@ -254,13 +292,15 @@ def _read_link(element: etree._Element, path: Path) -> Link:
     if value is not None and not 0 <= value < math.inf:
         raise RobotError(f"{path}: link {name!r}: mass {value} must be finite and >= 0; correct the URDF")
     inertia = element.find("inertial/inertia")
+    inertial = False
     if inertia is not None:
         diagonal = [_number(inertia, key, 0.0, f"{path}: link {name!r}") for key in ("ixx", "iyy", "izz")]
         if any(not 0 <= moment < math.inf for moment in diagonal):
             raise RobotError(
                 f"{path}: link {name!r}: moments of inertia {diagonal} must be >= 0; correct the URDF"
             )
-    return Link(name, value, len(element.findall("collision")))
+        inertial = bool(value) and any(float(moment) != 0 for moment in inertia.attrib.values())
+    return Link(name, value, len(element.findall("collision")), inertial)
 
 
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:
