@@ -1,0 +1,253 @@
+r"""How good a step response is: the control literature's figures of merit, batched over (envs, joints).
+
+With setpoint r, start y0, move A = r - y0 and error e = r - y, per env and joint::
+
+    rise time            from the first 10 % of the move to the first 90 %
+    overshoot            max((y - r) sign A) / |A|, at least 0
+    settling time        after which |e| <= max(band |A|, absolute band) for good
+    steady-state error   max |e| over the last part of the record
+    IAE, ITAE            int |e| dt, int t |e| dt
+    effort peak          max |u|
+    effort variation     sum |u_k - u_{k-1}|: how much the actuator is moved to and fro
+    saturation share     of the samples
+
+Rise time, overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems (Princeton, 2nd ed.),
+section 6.3; ITAE after D. Graham and R. C. Lathrop, "The synthesis of optimum transient response", Trans. AIEE 72
+(1953); total variation of the effort after S. Skogestad, "Simple analytic rules for model reduction and PID
+controller tuning", J. Process Control 13 (2003).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.errors import InvalidArgumentError
+
+Float64 = NDArray[np.float64]
+
+
+class StepMetrics(NamedTuple):
+    """Figures of merit of a step response, each (envs, joints); lower is better.
+
+    What is not reached, and every figure of a joint that was not finite throughout, is inf. What is not defined (rise
+    time and overshoot of a joint that hardly moves, effort figures without efforts) is NaN.
+    """
+
+    rise_time: Float64
+    """From 10 % to 90 % of the move [s]."""
+    overshoot: Float64
+    """Largest excursion beyond the setpoint, as a fraction of the move."""
+    settling_time: Float64
+    """Time after which the error stays within the band [s]."""
+    steady_state_error: Float64
+    """Largest absolute error over the last part of the record [rad or m]."""
+    peak_deviation: Float64
+    """Largest distance beyond the setpoint, defined without a move too [rad or m]."""
+    iae: Float64
+    """Integral of the absolute error [rad s or m s]."""
+    itae: Float64
+    """Integral of time times the absolute error [rad s^2 or m s^2]."""
+    effort_peak: Float64
+    """Largest absolute effort [N m or N]."""
+    effort_variation: Float64
+    """Total variation of the effort [N m or N]: chatter shows here."""
+    saturation_share: Float64
+    """Share of samples in saturation."""
+
+    def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
+        """Each figure reduced over envs to (joints,): ``statistic`` is given a joint's defined figures, returns one.
+
+        Undefined figures (NaN) are left out; a joint that has none else stays NaN.
+        """
+
+        def reduce(figure: Float64) -> Float64:
+            columns = (column[~np.isnan(column)] for column in figure.T)
+            return np.array([statistic(column) if column.size else np.nan for column in columns])
+
+        return StepMetrics(*map(reduce, self))
+
+    def worst(self) -> StepMetrics:
+        """Worst case over envs, (joints,)."""
+        return self.over_envs(np.max)
+
+    def median(self) -> StepMetrics:
+        """Median over envs, (joints,); inf when half of them or more are inf."""
+        return self.over_envs(lambda column: np.quantile(column, 0.5, method="higher"))
+
+
+def step_metrics(
+    time: ArrayLike,
+    setpoint: ArrayLike,
+    measurement: ArrayLike,
+    *,
+    start: ArrayLike | None = None,
+    effort: ArrayLike | None = None,
+    saturated: ArrayLike | None = None,
+    band: float = 0.02,
+    absolute_band: ArrayLike = 1e-3,
+    tail: float = 0.1,
+    continuous: ArrayLike | None = None,
+) -> StepMetrics:
+    """Judge step responses.
+
+    Parameters
+    ----------
+    time
+        (ticks,) increasing [s]; the step is at 0, or at ``time[0]`` without ``start``.
+    setpoint
+        (joints,), (envs, joints) or (ticks, envs, joints) [rad or m]; the last row is where the move ends, the
+        errors of IAE and ITAE are to each row's own.
+    measurement
+        (ticks, envs, joints) [rad or m].
+    start
+        (envs, joints) or (joints,): where the move began; default the first row of ``measurement``.
+    effort, saturated
+        (ticks, envs, joints): applied efforts [N m or N], and whether they were limited.
+    band
+        Half width of the settling band, as a fraction of the move.
+    absolute_band
+        Its least half width [rad or m], a number or (joints,). Rise time and overshoot are undefined for moves smaller
+        than absolute_band / band, where they would compare noise with next to nothing.
+    tail
+        Last share of the record, over which the steady-state error is taken.
+    continuous
+        (joints,) bool: positions that are angles modulo 2 pi; the move is the short way round.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Shapes that do not fit, a time that does not increase, a band or tail out of range.
+    """
+    y = _table("measurement", measurement)
+    t = np.asarray(time, np.float64)
+    if t.shape != y.shape[:1] or t.size < 2 or not (np.diff(t) > 0).all():
+        raise InvalidArgumentError(
+            "time",
+            f"must increase, with one entry for each of the {y.shape[0]} rows of measurement, at least 2",
+            value=t.shape,
+            remedy="pass the rollout's time",
+        )
+    for name, value in (("band", band), ("tail", tail)):
+        if not 0 < value <= 1:
+            raise InvalidArgumentError(name, "must be a fraction", value=value, remedy="use e.g. 0.02")
+    r = _like("setpoint", setpoint, y.shape)
+    if start is not None:
+        first = _like("start", start, y.shape[1:])
+        t, y, r = np.append(0.0, t), np.concatenate([first[None], y]), np.concatenate([r[:1], r])
+        if t[1] <= 0:
+            raise InvalidArgumentError(
+                "time", "must be above 0 where start is given", value=t[1], remedy="drop row 0"
+            )
+    t = t - t[0]
+    finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
+    y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
+    if continuous is not None:
+        y, r = _unwrap(y, r, np.asarray(continuous, bool))
+
+    move = r[-1] - y[0]
+    size, direction = np.abs(move), np.where(move < 0, -1.0, 1.0)
+    error = r - y
+    final_error = r[-1] - y
+    tolerance = np.maximum(band * size, absolute_band)
+    moves = size >= np.broadcast_to(absolute_band, size.shape) / band
+    beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
+    beyond = np.maximum(beyond, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        progress = 1.0 - final_error / move
+        overshoot = np.where(moves, beyond / size, np.nan)
+    high, low = _first_crossing(t, progress, 0.9), _first_crossing(t, progress, 0.1)
+    rise = high - np.where(np.isfinite(high), low, 0.0)
+    tail_rows = max(1, round(tail * len(t)))
+
+    def judged(figure: Float64) -> Float64:
+        return np.where(finite, figure, np.inf)
+
+    nothing = np.full(size.shape, np.nan)
+    u = None if effort is None else _table("effort", effort, (len(y) - (start is not None), *y.shape[1:]))
+    return StepMetrics(
+        rise_time=judged(np.where(moves, rise, np.nan)),
+        overshoot=judged(overshoot),
+        settling_time=judged(_settling_time(t, final_error, tolerance)),
+        steady_state_error=judged(np.abs(error[-tail_rows:]).max(0)),
+        peak_deviation=judged(beyond),
+        iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
+        itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
+        effort_peak=nothing if u is None else _or_inf(np.abs(u).max(0)),
+        effort_variation=nothing if u is None else _or_inf(_variation(u)),
+        saturation_share=nothing if saturated is None else np.mean(np.asarray(saturated, bool), axis=0),
+    )
+
+
+def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
+    """Time at which ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a line; else inf."""
+    reached = progress >= level
+    k = np.maximum(np.argmax(reached, 0), 1)
+    before, after = _row(progress, k - 1), _row(progress, k)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip((level - before) / (after - before), 0.0, 1.0)
+    return np.where(reached.any(0), t[k - 1] + share * (t[k] - t[k - 1]), np.inf)
+
+
+def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
+    """Time of the last passage of ``error`` into the band, between samples by a line; inf if it ends outside."""
+    outside = np.abs(error) > tolerance
+    last = len(t) - 1 - np.argmax(outside[::-1], 0)
+    k = np.minimum(last, len(t) - 2)
+    before, after = _row(error, k), _row(error, k + 1)
+    edge = np.copysign(tolerance, before)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip((edge - before) / (after - before), 0.0, 1.0)
+    settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
+    return np.where(outside.any(0), settled, 0.0)
+
+
+def _variation(u: Float64) -> Float64:
+    with np.errstate(invalid="ignore"):
+        return np.abs(np.diff(u, axis=0)).sum(0)
+
+
+def _or_inf(figure: Float64) -> Float64:
+    return np.where(np.isfinite(figure), figure, np.inf)
+
+
+def _row(table: Float64, k: NDArray[Any]) -> Float64:
+    """``table[k]`` for an index k per env and joint."""
+    return np.take_along_axis(table, k[None], 0)[0]
+
+
+def _unwrap(y: Float64, r: Float64, continuous: NDArray[np.bool_]) -> tuple[Float64, Float64]:
+    """Turn angles into unbroken courses, and the setpoint into the one nearest to the start."""
+    turn = 2 * np.pi
+    course = np.unwrap(y, axis=0)
+    target = np.unwrap(r, axis=0)
+    target = target - turn * np.rint((target[-1] - course[0]) / turn)
+    return np.where(continuous, course, y), np.where(continuous, target, r)
+
+
+def _table(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Float64:
+    array = np.asarray(value, np.float64)
+    if array.ndim != 3 or (shape is not None and array.shape != shape):
+        raise InvalidArgumentError(
+            name,
+            f"must have shape {'(ticks, envs, joints)' if shape is None else shape}",
+            value=array.shape,
+            remedy="pass a rollout's arrays",
+        )
+    return array
+
+
+def _like(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
+    array = np.asarray(value, np.float64)
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise InvalidArgumentError(
+            name,
+            f"does not broadcast to {shape}",
+            value=array.shape,
+            remedy="give one value per joint, or per env and joint",
+        ) from None
