@@ -1,10 +1,13 @@
 """Joint-level PID control for many robots at once: arrays in, arrays out."""
 
+from batchpid import presets
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.controller import BatchPID
+from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.law import advance, init, reset, step, track
 from batchpid.params import PIDParams, make_params
+from batchpid.serialization import load_params, save_params
 from batchpid.state import PIDState, Terms
 
 __all__ = [
@@ -18,9 +21,13 @@ __all__ = [
     "Terms",
     "advance",
     "discretise",
+    "drive_target",
     "init",
+    "load_params",
     "make_params",
+    "presets",
     "reset",
+    "save_params",
     "step",
     "track",
 ]

@@ -1,4 +1,4 @@
-"""BatchPID: the stateful shell over the law, on NumPy or JAX. It owns the state, checks shapes and starts the law."""
+"""BatchPID: the stateful shell over the law, on NumPy or JAX. It owns the state and checks what comes in."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from batchpid import law
 from batchpid.coefficients import discretise
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.params import PIDParams
-from batchpid.state import PIDState
+from batchpid.state import PIDState, Terms
 
 BACKENDS = ("numpy", "jax")
 
@@ -32,6 +32,8 @@ class BatchPID:
         Time between calls [s].
     backend
         "numpy", or "jax": compiled once, with the state's buffers donated from call to call.
+    terms
+        Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
         Used in error messages.
 
@@ -40,7 +42,7 @@ class BatchPID:
     InvalidArgumentError
         Wrong backend, num_envs, dt or params.
     MissingDependencyError
-        backend "jax" without JAX.
+        Backend "jax" without JAX.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class BatchPID:
         dt: float,
         backend: str = "numpy",
         *,
+        terms: bool = False,
         joint_names: Sequence[str] | None = None,
     ) -> None:
         if backend not in BACKENDS:
@@ -60,49 +63,81 @@ class BatchPID:
             raise InvalidArgumentError(
                 "num_envs", "is not a whole number >= 1", value=num_envs, remedy="give the number of envs"
             )
-        if not isinstance(dt, int | float | np.floating) or not 0 < dt < math.inf:
+        if isinstance(dt, bool) or not isinstance(dt, int | float | np.floating) or not 0 < dt < math.inf:
             raise InvalidArgumentError(
                 "dt", "is not positive and finite", value=dt, remedy="give seconds > 0"
             )
-        self.num_envs, self.dt, self.backend = int(num_envs), float(dt), backend
-        self.joint_names = joint_names
-        self._engine = _NumPy(self.dt) if backend == "numpy" else _JAX(self.dt)
-        self._state: Any = None
-        self._params: Any = None
+        if not isinstance(params, PIDParams):
+            raise _no_params(params)
+        self._dt, self._backend, self._names = float(dt), backend, joint_names
+        self._shape = (int(num_envs), params.joints)
+        self._engine = _NumPy(self._dt, terms) if backend == "numpy" else _JAX(self._dt, terms)
+        self._keeps_terms = terms
+        self._state: PIDState | None = None
+        self._stale = False  # whether the state may lack leaves that the params now need
+        self._terms: Terms | None = None
+        self._params: PIDParams | None = None
         self.params = params
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs."""
+        return self._shape[0]
 
     @property
     def joints(self) -> int:
         """Number of joints."""
-        return int(self._params.joints)
+        return self._shape[1]
+
+    @property
+    def dt(self) -> float:
+        """Time between calls [s]."""
+        return self._dt
+
+    @property
+    def backend(self) -> str:
+        """Name of the array library: "numpy" or "jax"."""
+        return self._backend
 
     @property
     def params(self) -> PIDParams:
-        """The parameters; assign others at any time, the integral carries on without a bump."""
+        """The parameters. Assign others at any time: they are checked, and the state carries on.
+
+        A change of ki, limits or times makes no bump, since the integral is an effort. A change of kp or kd does,
+        unless :meth:`track` follows it with the last effort.
+        """
+        assert self._params is not None
         return self._params
 
     @params.setter
     def params(self, params: PIDParams) -> None:
         if not isinstance(params, PIDParams):
+            raise _no_params(params)
+        if params.joints != self.joints:
+            raise InvalidArgumentError(
+                "params", f"hold {params.joints} joints, not {self.joints}", remedy="give one gain per joint"
+            )
+        params.check(self.num_envs, self._names)
+        if self._params is not None and params.dtype != self._params.dtype:
             raise InvalidArgumentError(
                 "params",
-                "are no PIDParams",
-                value=type(params).__name__,
-                remedy="build them with make_params",
+                f"are {params.dtype}, the controller's {self._params.dtype}",
+                remedy="build them with that dtype, or a new BatchPID",
             )
-        if params.num_envs not in (1, self.num_envs):
-            raise InvalidArgumentError(
-                "params",
-                f"are for {params.num_envs} envs, not {self.num_envs}",
-                remedy="slice or rebuild them",
-            )
-        self._params = params
-        self._engine.prepare(params, (self.num_envs, params.joints))
+        self._engine.prepare(params, self._shape)
+        self._params, self._stale = params, self._state is not None
 
     @property
     def state(self) -> PIDState | None:
-        """The law's state; None before the first measurement."""
+        """The law's state; None before the first measurement. With JAX it is valid until the next call."""
         return self._state
+
+    @property
+    def terms(self) -> Terms | None:
+        """What the law did in the last call; None before the first."""
+        if not self._keeps_terms:
+            raise InvalidArgumentError("terms", "are not kept", remedy="build the BatchPID with terms=True")
+        return self._terms
 
     def __call__(
         self,
@@ -112,75 +147,167 @@ class BatchPID:
         setpoint_rate: Any = None,
         feedforward: Any = None,
     ) -> Any:
-        """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`."""
-        engine = self._engine
-        y = engine.array(measurement)
-        if self._state is None:
-            self._state = law.init(engine.params, y)
-        self._state, effort = engine.step(
-            self._state, engine.array(setpoint), y, measurement_rate, setpoint_rate, feedforward
-        )
+        """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
+
+        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If a shape is wrong. The state is then as before.
+        """
+        r, y = self._array("setpoint", setpoint), self._measurement(measurement)
+        y_rate = None if measurement_rate is None else self._array("measurement_rate", measurement_rate)
+        r_rate = None if setpoint_rate is None else self._array("setpoint_rate", setpoint_rate)
+        ff = None if feedforward is None else self._array("feedforward", feedforward)
+        self._state, effort, self._terms = self._engine.step(self._started(y), r, y, y_rate, r_rate, ff)
         return effort
 
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
-        """Start the envs of ``mask`` (all of them for None) anew from ``measurement`` (envs, joints)."""
-        y = self._engine.array(measurement)
-        if self._state is None:
-            self._state = law.init(self._engine.params, y)
-            return
-        mask = np.ones(self.num_envs, dtype=bool) if mask is None else mask
-        self._state = law.reset(self._engine.params, self._state, y, mask, keep_integral=keep_integral)
+        """Start the envs of ``mask`` (envs,) bool, or all, anew from ``measurement`` (envs, joints)."""
+        y = self._measurement(measurement)
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        if mask.dtype != bool or mask.shape != (self.num_envs,):
+            raise InvalidArgumentError(
+                "mask",
+                f"is {mask.dtype} of shape {mask.shape}, not bool of shape ({self.num_envs},)",
+                remedy="give one bool per env",
+            )
+        self._state = self._engine.reset(self._started(y), y, mask, keep_integral)
 
-    def track(self, setpoint: Any, measurement: Any, effort: Any, **inputs: Any) -> None:
-        """Make the next call on these inputs return ``effort``: bumpless transfer, as :func:`batchpid.track`."""
-        array = self._engine.array
-        y = array(measurement)
-        state = law.init(self._engine.params, y) if self._state is None else self._state
-        self._state = law.track(
-            self._engine.params, state, array(setpoint), y, array(effort), dt=self.dt, **inputs
+    def track(
+        self,
+        setpoint: Any,
+        measurement: Any,
+        effort: Any,
+        measurement_rate: Any = None,
+        setpoint_rate: Any = None,
+        feedforward: Any = None,
+    ) -> None:
+        """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
+        if self.params.ki is None:
+            raise law.no_integral()
+        r, y = self._array("setpoint", setpoint), self._measurement(measurement)
+        u = self._array("effort", effort)
+        y_rate = None if measurement_rate is None else self._array("measurement_rate", measurement_rate)
+        r_rate = None if setpoint_rate is None else self._array("setpoint_rate", setpoint_rate)
+        ff = None if feedforward is None else self._array("feedforward", feedforward)
+        self._state = self._engine.track(self._started(y), r, y, u, y_rate, r_rate, ff)
+
+    def _started(self, y: Any) -> PIDState:
+        """Return the state, begun at the first measurement, and with every leaf that the params need."""
+        if self._state is None:
+            return self._engine.init(y)
+        if self._stale:
+            fresh, self._stale = self._engine.init(y), False
+            kept = zip(fresh, self._state, strict=True)
+            self._state = PIDState(*(new if new is None or old is None else old for new, old in kept))
+        return self._state
+
+    def _measurement(self, value: Any) -> Any:
+        array = self._engine.array(value)
+        if array.shape != self._shape:
+            raise InvalidArgumentError(
+                "measurement", f"has shape {array.shape}, not {self._shape}", remedy="give (num_envs, joints)"
+            )
+        return array
+
+    def _array(self, name: str, value: Any) -> Any:
+        array = self._engine.array(value)
+        if array.shape == self._shape:
+            return array
+        envs, joints = self._shape
+        if array.ndim <= 2 and all(
+            n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
+        ):
+            return array.reshape((1,) * (2 - array.ndim) + array.shape)
+        raise InvalidArgumentError(
+            name,
+            f"has shape {array.shape}, which does not broadcast to {self._shape}",
+            remedy="give a value for all, per joint, or per env and joint",
         )
+
+
+def _no_params(value: Any) -> InvalidArgumentError:
+    return InvalidArgumentError(
+        "params", "are no PIDParams", value=type(value).__name__, remedy="build them with make_params"
+    )
 
 
 class _NumPy:
     """Runs the law on NumPy, with the coefficients at hand and spread over all envs."""
 
-    def __init__(self, dt: float) -> None:
-        self.dt = dt
+    def __init__(self, dt: float, terms: bool) -> None:
+        self.dt, self.terms = dt, terms
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
-        self.params = PIDParams(
-            *(np.array(np.broadcast_to(p, shape)) if isinstance(p, np.ndarray) else p for p in params)
-        )
-        self.coefficients = discretise(self.params, self.dt)
+        self.params, self.dtype = params, params.dtype
+        self.coefficients = discretise(params, self.dt, shape[0])
 
     def array(self, value: Any) -> Any:
-        return np.asarray(value, dtype=self.params.dtype)
+        return np.asarray(value, dtype=self.dtype)
 
-    def step(self, state: Any, *inputs: Any) -> Any:
-        return law.advance(self.coefficients, state, *inputs)
+    def init(self, y: Any) -> PIDState:
+        return law.init(self.params, y)
+
+    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
+        if self.terms:
+            return law.advance(self.coefficients, state, *inputs, aux=True)
+        return *law.advance(self.coefficients, state, *inputs), None
+
+    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
+        return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
+
+    def track(self, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any) -> PIDState:
+        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
+        return law.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
 
 
 class _JAX:
-    """Runs the law compiled by JAX: once per structure of params and inputs."""
+    """Runs the law compiled by JAX: once per structure of params and inputs, the state's buffers donated."""
 
-    def __init__(self, dt: float) -> None:
+    def __init__(self, dt: float, terms: bool) -> None:
         try:
             import jax
         except ImportError:
             raise MissingDependencyError("jax", "backend='jax'", "jax") from None
-        self.dt, self.jax = dt, jax
+        self.jax = jax
 
-        def step(params: PIDParams, state: Any, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any) -> Any:
-            k = discretise(params, dt)
-            return law.advance(k, state, r, y, y_rate, r_rate, ff)
+        def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
+            new, effort, *shown = law.advance(discretise(params, dt), state, *inputs, aux=terms)
+            return new, effort, shown[0] if shown else None
 
+        def reset(params: PIDParams, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
+            return law.reset(params, state, y, mask, keep_integral=keep_integral)
+
+        def track(
+            params: PIDParams, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any
+        ) -> PIDState:
+            rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
+            return law.track(params, state, r, y, u, dt=dt, feedforward=ff, **rates)
+
+        self._init = jax.jit(law.init)
         self._step = jax.jit(step, donate_argnums=1)
+        self._reset = jax.jit(reset, static_argnums=4)
+        self._track = jax.jit(track)
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         self.params = self.jax.tree.map(self.jax.numpy.asarray, params)
+        self.dtype = self.params.dtype
 
     def array(self, value: Any) -> Any:
-        return self.jax.numpy.asarray(value, dtype=self.params.dtype)
+        if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
+            return value
+        return np.asarray(value, dtype=self.dtype)
 
-    def step(self, state: Any, *inputs: Any) -> Any:
+    def init(self, y: Any) -> PIDState:
+        return self._init(self.params, y)
+
+    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
         return self._step(self.params, state, *inputs)
+
+    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
+        return self._reset(self.params, state, y, mask, keep_integral)
+
+    def track(self, state: PIDState, *inputs: Any) -> PIDState:
+        return self._track(self.params, state, *inputs)

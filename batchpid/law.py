@@ -241,9 +241,7 @@ def track(
         If the params have no integral (ki is None), or integrate first and dt is missing.
     """
     if params.ki is None:
-        raise InvalidArgumentError(
-            "ki", "is off, so nothing can carry the effort over", remedy="give ki, 0 allowed"
-        )
+        raise no_integral()
     if params.integration is not None and dt is None:
         raise InvalidArgumentError(
             "dt", "is needed where the params integrate first", remedy="give dt in seconds"
@@ -268,6 +266,13 @@ def track(
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
         effort=None if state.effort is None else zero + effort,
         origin=origin,
+    )
+
+
+def no_integral() -> InvalidArgumentError:
+    """Return the error of tracking without an integral."""
+    return InvalidArgumentError(
+        "params.ki", "is off, so nothing can carry the effort over", remedy="give ki; 0 is allowed"
     )
 
 

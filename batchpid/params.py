@@ -125,7 +125,7 @@ class PIDParams(NamedTuple):
             known.pop("tracking_time", None)
         return make_params(self.joints, **{**known, **options})
 
-    def check(self, num_envs: int) -> None:
+    def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
         """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
         expected = f"(1, {self.joints}) or ({num_envs}, {self.joints})"
         for name, leaf in zip(self._fields, self, strict=True):
@@ -148,7 +148,7 @@ class PIDParams(NamedTuple):
                 raise InvalidArgumentError(
                     f"params.{name}",
                     "is NaN" if name in _SIGNED else "is negative or NaN",
-                    joint=joint,
+                    joint=joint if joint_names is None else joint_names[joint],
                     env=env if array.shape[0] > 1 else None,
                     value=float(array[env, joint]),
                     remedy="correct that entry",
