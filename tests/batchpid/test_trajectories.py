@@ -1,0 +1,182 @@
+"""The laws of point-to-point moves: they begin and end at rest where they should, and keep their limits."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
+
+DT = 0.004
+LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
+poses = st.lists(st.lists(st.floats(-3, 3), min_size=3, max_size=3), min_size=1, max_size=4).map(np.array)
+MOVES = {
+    "minimum_jerk": lambda a, b: minimum_jerk(a, b, DT, **LIMITS),
+    "minimum_jerk_timed": lambda a, b: minimum_jerk(a, b, DT, duration=0.77),
+    "trapezoidal": lambda a, b: trapezoidal(a, b, DT, **LIMITS),
+    "trapezoidal_each": lambda a, b: trapezoidal(a, b, DT, **LIMITS, synchronise=False),
+}
+
+
+each_move = pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
+
+
+def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position])
+
+
+@each_move
+@settings(deadline=None)
+@given(start=poses, target=st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
+def test_a_move_ends_at_its_target_at_rest_and_stays_between(move, start, target):
+    t = move(start, target)
+    assert t.position.shape == (t.ticks, *start.shape)
+    np.testing.assert_allclose(t.position[-1], np.broadcast_to(target, start.shape), rtol=0, atol=1e-12)
+    assert not t.velocity[-1].any()
+    assert not t.acceleration[-1].any()
+    low, high = np.minimum(start, target) - 1e-12, np.maximum(start, target) + 1e-12
+    assert ((t.position >= low) & (t.position <= high)).all()
+    np.testing.assert_allclose(t.time, DT * np.arange(1, t.ticks + 1))
+
+
+@each_move
+@settings(deadline=None)
+@given(start=poses, target=st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
+def test_positions_are_the_integral_of_velocities(move, start, target):
+    t = move(start, target)
+    position = with_start(t, start)
+    velocity = np.concatenate([np.zeros_like(t.velocity[:1]), t.velocity])
+    trapezium = DT * (velocity[1:] + velocity[:-1]) / 2
+    np.testing.assert_allclose(np.diff(position, axis=0), trapezium, rtol=0, atol=DT**2 * 20)
+
+
+@settings(deadline=None)
+@given(start=poses, target=poses)
+@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal", "trapezoidal_each"])
+def test_limits_are_kept_at_every_tick(name, start, target):
+    t = MOVES[name](start, target[0])
+    assert (np.abs(t.velocity) <= np.array(LIMITS["max_velocity"]) * (1 + 1e-9)).all()
+    assert (np.abs(t.acceleration) <= np.array(LIMITS["max_acceleration"]) * (1 + 1e-9)).all()
+
+
+@settings(deadline=None)
+@given(start=poses, target=poses)
+@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal"])
+def test_synchronised_joints_move_on_a_straight_line(name, start, target):
+    t = MOVES[name](start, target[0])
+    way = target[0] - start
+    done = np.divide(t.position - start, way, out=np.full_like(t.position, np.nan), where=np.abs(way) > 1e-3)
+    spread = np.nanmax(np.nan_to_num(done, nan=-1), -1) - np.nanmin(np.where(np.isnan(done), 2, done), -1)
+    assert (spread < 1e-9).all()
+
+
+@settings(deadline=None)
+@given(distance=st.floats(0.01, 5), v=st.floats(0.1, 5), a=st.floats(0.1, 20))
+def test_a_trapezoid_takes_the_time_that_the_textbook_gives(distance, v, a):
+    t = trapezoidal([0.0], [distance], 1e-3, max_velocity=v, max_acceleration=a)
+    expected = distance / v + v / a if distance * a > v * v else 2 * np.sqrt(distance / a)
+    assert t.time[-1] - 1e-3 < expected * (1 + 1e-9)
+    assert t.time[-1] > expected * (1 - 1e-9)
+
+
+def test_minimum_jerk_is_symmetric_and_peaks_at_fifteen_eighths():
+    t = minimum_jerk([0.0], [1.0], 0.001, duration=1.0)
+    np.testing.assert_allclose(t.position[498, 0] + t.position[500, 0], 1.0, atol=1e-12)
+    np.testing.assert_allclose(t.velocity.max(), 15 / 8)
+    np.testing.assert_allclose(t.acceleration.max(), 10 / np.sqrt(3), rtol=1e-5)
+
+
+def test_envs_are_independent_of_their_company():
+    rng = np.random.default_rng(0)
+    start, target = rng.normal(size=(2, 5, 3))
+    both = trapezoidal(start, target, DT, **LIMITS)
+    alone = trapezoidal(start[3], target[3], DT, **LIMITS)
+    np.testing.assert_array_equal(both.position[: alone.ticks, 3], alone.position)
+    np.testing.assert_array_equal(
+        both.position[alone.ticks :, 3], np.broadcast_to(target[3], (both.ticks - alone.ticks, 3))
+    )
+
+
+@each_move
+def test_no_way_to_go_is_one_tick_of_rest(move):
+    t = move(np.ones((2, 3)), np.ones(3))
+    if t.ticks > 1:  # a duration was asked for
+        assert np.isclose(t.time[-1], 0.77, atol=DT)
+    assert (t.position == 1).all()
+    assert not t.velocity.any()
+
+
+def test_moves_follow_one_another_and_hold():
+    there = minimum_jerk([0.0, 0.0], [1.0, 2.0], DT, duration=0.1)
+    back = minimum_jerk([1.0, 2.0], [0.0, 0.0], DT, duration=0.1)
+    t = there.hold(0.02).then(back)
+    assert t.ticks == 25 + 5 + 25
+    np.testing.assert_allclose(t.time, DT * np.arange(1, 56))
+    assert (t.position[25:30] == [1.0, 2.0]).all()
+    with pytest.raises(InvalidArgumentError, match="another tick"):
+        there.then(minimum_jerk([0.0, 0.0], [1.0, 2.0], 0.01, duration=0.1))
+    with pytest.raises(InvalidArgumentError, match="same shape"):
+        there.then(minimum_jerk([0.0], [1.0], DT, duration=0.1))
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: minimum_jerk([0, 0], [1, 1], DT), "duration"),
+        (lambda: minimum_jerk([0, 0], [1, 1], DT, duration=1.0, max_velocity=1.0), "duration"),
+        (lambda: minimum_jerk([0, 0], [1, 1], DT, max_velocity=[1.0, np.inf]), "max_velocity"),
+        (lambda: minimum_jerk([0, np.nan], [1, 1], DT, duration=1.0), "start, joint 1"),
+        (lambda: minimum_jerk([0, 0], [1, 1, 1], DT, duration=1.0), "target"),
+        (lambda: minimum_jerk(0.0, 1.0, DT, duration=1.0), "target"),
+        (lambda: minimum_jerk([0, 0], [1, 1], 0.0, duration=1.0), "dt"),
+        (
+            lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, -1], max_acceleration=1),
+            "max_velocity, joint 1",
+        ),
+        (
+            lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=1, max_acceleration=np.inf),
+            "max_acceleration",
+        ),
+        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, 1, 1], max_acceleration=1), "max_velocity"),
+        (lambda: trapezoidal(["a"], [1], DT, max_velocity=1, max_acceleration=1), "start"),
+    ],
+)
+def test_bad_input_is_named(call, named):
+    with pytest.raises(InvalidArgumentError, match=named):
+        call()
+
+
+JERK_LIMITS = {"max_velocity": [1.0, 2.0], "max_acceleration": [3.0, 8.0], "max_jerk": 40.0}
+
+
+class TestJerkLimited:
+    @pytest.fixture(autouse=True)
+    def _needs_ruckig(self):
+        pytest.importorskip("ruckig")
+
+    def test_limits_and_ends(self):
+        rng = np.random.default_rng(1)
+        start, target = rng.uniform(-2, 2, (2, 6, 2))
+        t = jerk_limited(start, target, DT, **JERK_LIMITS)
+        np.testing.assert_allclose(t.position[-1], target)
+        assert not t.velocity[-1].any()
+        assert (np.abs(t.velocity) <= np.array([1.0, 2.0]) + 1e-9).all()
+        assert (np.abs(t.acceleration) <= np.array([3.0, 8.0]) + 1e-9).all()
+        jerk = np.diff(t.acceleration, axis=0, prepend=0) / DT
+        assert (np.abs(jerk) <= 40 + 1e-6).all()
+
+    def test_it_is_no_faster_than_the_trapezoid_that_ignores_jerk(self):
+        loose = {name: limit for name, limit in JERK_LIMITS.items() if name != "max_jerk"}
+        target = np.array([1.0, -2.0])
+        smooth = jerk_limited(np.zeros(2), target, DT, **JERK_LIMITS)
+        assert smooth.position.shape == (smooth.ticks, 2)
+        assert smooth.time[-1] >= trapezoidal(np.zeros(2), target, DT, **loose).time[-1]
+
+    def test_it_can_begin_in_motion(self):
+        t = jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[0.5, 0.0], **JERK_LIMITS)
+        np.testing.assert_allclose(t.position[0], [0.5 * DT, 0.0], atol=1e-5)
+
+    def test_an_impossible_start_is_an_error(self):
+        with pytest.raises(InvalidArgumentError, match="start, env 0"):
+            jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[1e300, 0.0], **JERK_LIMITS)
