@@ -16,7 +16,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 
 from .check import Finding, check
-from .physics import DISSIPATION
+from .physics import DISSIPATION, PHYSICS
 from .urdf import Joint, Link, read_urdf
 
 Float64 = NDArray[np.float64]
@@ -231,6 +231,20 @@ class Robot:
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
+
+    def mass_matrix(self, qpos: ArrayLike) -> Float64:
+        """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof) or (dof,), on a fixed base."""
+        from .scenes import SceneSpec, mass_matrix  # loads SAPIEN
+
+        spec = SceneSpec(
+            urdf=self.urdf,
+            srdf=self.srdf,
+            joints=self.joints,
+            timestep=1e-3,
+            physics=PHYSICS["fast"],
+            ground=False,
+        )
+        return mass_matrix(spec)(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
         """Entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""

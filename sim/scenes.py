@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,26 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
             "the URDF does not describe one articulated robot; it needs at least one moving joint"
         )
     return builders[0]
+
+
+@lru_cache(maxsize=8)
+def mass_matrix(spec: SceneSpec) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
+    """Return the function qpos (n, dof) -> joint-space mass matrices (n, dof, dof) [kg m^2 or kg] of the robot alone.
+
+    Its base counts as fixed. It is Pinocchio's composite rigid body algorithm, on the model that SAPIEN derives.
+    """
+    with _global_config(spec.physics):
+        scene = _bare_scene(physx.PhysxCpuSystem())
+        robot = _build_robot(parse(spec), scene, spec)
+    model, dof = robot.create_pinocchio_model(), robot.dof
+
+    def evaluate(qpos: NDArray[Any]) -> NDArray[np.float64]:
+        matrices = np.empty((len(qpos), dof, dof))
+        for matrix, row in zip(matrices, np.asarray(qpos, np.float64), strict=True):
+            matrix[...] = model.compute_generalized_mass_matrix(row)
+        return matrices
+
+    return evaluate
 
 
 class Pack:
