@@ -28,7 +28,8 @@ class Settings:
     """What a bundled robot carries: its tutorial's poses and gains, in joint order.
 
     ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID; ``drive_stiffness`` and
-    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate.
+    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate; ``notes``: where they
+    differ from the tutorial's, in words.
     """
 
     start: Float64
@@ -39,6 +40,7 @@ class Settings:
     drive_stiffness: float
     drive_damping: float
     rate_hz: float
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,4 +290,5 @@ def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
         drive_stiffness=float(data["drive"]["stiffness"]),
         drive_damping=float(data["drive"]["damping"]),
         rate_hz=float(data["rate_hz"]),
+        notes=tuple(data.get("notes", ())),
     )

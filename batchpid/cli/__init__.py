@@ -18,10 +18,12 @@ from typing import Any, Protocol
 
 COMMANDS = {
     # name: (module:class, summary)
-    "demo": (
-        "batchpid.cli.demo:Demo",
-        "64 arms close on the tutorial's setpoint; ends with a table and a picture",
+    "demo": ("batchpid.cli.demo:Demo", "64 arms close on the tutorial's setpoint: a table and a picture"),
+    "rollout": (
+        "batchpid.cli.rollout:Rollout",
+        "N of any robot follow a setpoint; what happened goes to a file",
     ),
+    "inspect": ("batchpid.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
 }
 
 
@@ -68,6 +70,8 @@ def _run(name: str, arguments: list[str]) -> int:
             # The reader left (``| head``). Python flushes stdout once more at exit: let that go nowhere.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 128 + signal.SIGPIPE
+        except OSError as error:
+            return _complain(str(error))
     return status or 0
 
 

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+SUBSTEPS = 10
+"""Sim steps between two samples of the picture."""
+SPREAD = 0.3
+"""How far from the tutorial's pose the others may start [rad]."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """64 arms in 64 headless scenes close on the tutorial's setpoint under one batch PID."""
+    """Robots close on the tutorial's setpoint, each in a headless scene, all under one batch PID.
+
+    PID and passive force are computed at every one of the 2000 sim steps of a second. Env 0 starts where SAPIEN's
+    tutorial does, the others at seeded poses around it. Ends with the speed, a table of the joints, and a picture.
+    """
 
     robot: str = "panda"
     """A bundled robot: panda or jaco2."""
@@ -17,33 +28,51 @@ class Demo:
     """Processes that step them; 0: this one."""
     seconds: float = 2.0
     """Simulated time [s]."""
+    gains: Literal["tutorial"] = "tutorial"
+    """Which gains: SAPIEN's tutorial's."""
     seed: int = 0
     """Of the start poses."""
+    out: Path = Path("out/demo.png")
+    """The picture: .png or .svg."""
 
-    def run(self) -> int:
-        """Run it; returns the exit status."""
-        import time
-
-        import numpy as np
-
-        from batchpid.cli.progress import bar
+    def run(self) -> None:
+        """Run it."""
+        from batchpid import plots
+        from batchpid.cli import report
+        from batchpid.cli.follow import follow, start_poses
+        from batchpid.errors import InvalidArgumentError
         from sim import Robot, Runner
 
+        out = plots.check_path(self.out)
         robot = Robot.load(self.robot)
-        assert robot.settings is not None
-        random = np.random.default_rng(self.seed)
-        qpos = robot.start + random.uniform(-0.3, 0.3, (self.num_envs, robot.dof))
-        qpos[0] = robot.start
-        qpos = np.clip(qpos, robot.lower, robot.upper)
-        with Runner(robot, self.num_envs, workers=self.workers, substeps=10) as runner:
-            runner.reset(qpos=qpos)
-            ticks = round(self.seconds / (runner.timestep * runner.substeps))
-            setpoints = np.broadcast_to(robot.settings.target, (ticks, robot.dof))
-            began = time.perf_counter()
-            rollout = runner.rollout(setpoints, progress=bar("demo"))
-            wall = time.perf_counter() - began
-        print(f"{ticks * 10 * self.num_envs / wall:.0f} env-steps/s")
-        error = np.abs(rollout.qpos[-1] - robot.settings.target)
-        for name, column in zip(robot.joint_names, error.T, strict=True):
-            print(f"{name}: final error median {np.median(column):.3g}, worst {column.max():.3g}")
-        return 0
+        settings = robot.settings
+        if settings is None:
+            raise InvalidArgumentError(
+                "robot",
+                "carries no tutorial settings to demonstrate",
+                value=self.robot,
+                remedy=f"use one of {', '.join(Robot.bundled())}, or batchpid rollout --robot {self.robot}",
+            )
+        start = start_poses(robot, self.num_envs, SPREAD, self.seed)
+        with Runner(
+            robot, self.num_envs, workers=self.workers, timestep=1 / settings.rate_hz, substeps=SUBSTEPS
+        ) as runner:
+            print(
+                f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
+                f"PID and passive force at {settings.rate_hz:g} Hz, the tutorial's gains"
+            )
+            run = follow(runner, settings.target, start, self.seconds, "simulating")
+        metrics = report.judge(robot, run.rollout, run.start)
+        print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall), "\n")
+        print(report.joint_table(robot, metrics), "\n")
+        for verdict in report.verdicts(robot, run.rollout, metrics):
+            print(verdict)
+        for note in settings.notes:
+            print(f"Note: {note}")
+        figure = plots.step_responses(
+            plots.Traces.of(run.rollout, robot),
+            mark=0,
+            title=f"{self.num_envs} {robot.name}s under one batch PID at {settings.rate_hz:g} Hz: "
+            f"the tutorial's gains, env 0 from the tutorial's pose",
+        )
+        print(f"\npicture: {plots.save(figure, out)}")

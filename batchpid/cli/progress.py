@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -16,7 +17,12 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     """
     from tqdm import tqdm
 
+    # A log keeps every state of the bar: a few will do there.
+    pace = 0.1 if sys.stderr.isatty() else 5.0
+
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
-        return tqdm(items, desc=label, delay=DELAY, leave=False, dynamic_ncols=True, **options)
+        return tqdm(
+            items, desc=label, delay=DELAY, mininterval=pace, leave=False, dynamic_ncols=True, **options
+        )
 
     return wrap

@@ -1,0 +1,79 @@
+"""``batchpid inspect``: what a robot is made of, and what is odd about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from sim import Robot
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """The joints of a robot in the order of qpos, then what is odd about it."""
+
+    robot: tyro.conf.Positional[str]
+    """A bundled robot, or the path of a URDF."""
+    all: bool = False
+    """List the fixed joints too."""
+    missing_meshes: Literal["error", "skip"] = "error"
+    """What to do about collision meshes that are not found."""
+    strict: bool = False
+    """Exit with status 1 if a finding is worse than a note."""
+
+    def run(self) -> int:
+        """Run it; returns the exit status."""
+        from sim import Robot
+
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
+        print(_joints(robot, self.all), "\n")
+        findings = robot.check(setpoint=None if robot.settings is None else robot.settings.target)
+        if not findings:
+            print("Nothing odd about it.")
+        for finding in findings:
+            print(finding)
+        return int(self.strict and any(finding.severity != "note" for finding in findings))
+
+
+def _joints(robot: Robot, fixed_too: bool) -> str:
+    from batchpid.cli.report import table
+
+    place = {joint.name: str(index) for index, joint in enumerate(robot.joints)}
+    listed = [*robot.joints, *(joint for joint in robot.all_joints if fixed_too and not joint.moves)]
+    rows = []
+    for joint in listed:
+        moves = joint.moves
+        rows.append(
+            [
+                place.get(joint.name, "-"),
+                joint.name,
+                joint.type,
+                f"{_bound(joint.lower)} to {_bound(joint.upper)} {joint.unit}" if moves else "-",
+                f"{_bound(joint.effort_limit)} {joint.effort_unit}" if moves else "-",
+                f"{_bound(joint.velocity_limit)} {joint.unit}/s" if moves else "-",
+                f"{joint.damping:g}" if moves else "-",
+                f"{joint.friction:g}" if moves else "-",
+                f"{joint.parent_link} > {joint.child_link}",
+            ]
+        )
+    headers = [
+        "",
+        "joint",
+        "type",
+        "limits",
+        "effort",
+        "velocity",
+        "damping",
+        "friction",
+        "parent > child link",
+    ]
+    return table(rows, headers, "lllrrrrrl")
+
+
+def _bound(value: float) -> str:
+    return f"{value:.5g}" if math.isfinite(value) else "none"

@@ -1,0 +1,127 @@
+"""``batchpid rollout``: N of any robot hold a setpoint; what happened goes to a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from batchpid.cli.follow import Followed
+    from sim import Robot
+
+FORMATS = (".npz",)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """N robots follow a setpoint from seeded poses; ends with speed and a table, and writes what happened to a file.
+
+    The file holds time, setpoint, qpos, qvel, effort, saturated and ok, each with ticks first, then envs, then
+    joints, and the robot's joint names, units and limits beside them.
+    """
+
+    robot: str = "panda"
+    """A bundled robot, or the path of a URDF."""
+    num_envs: int = 64
+    """How many robots."""
+    workers: int | None = None
+    """Processes that step them; 0: this one. Default: one for each available core."""
+    control: Literal["pid", "drive"] = "pid"
+    """The batch PID, or PhysX's internal drive."""
+    seconds: float = 2.0
+    """Simulated time [s]."""
+    compensate: Literal["gravity+coriolis", "gravity", "none"] = "gravity+coriolis"
+    """Passive force added at every sim step."""
+    physics: Literal["accurate", "fast"] = "accurate"
+    """Solver settings."""
+    dissipation: Literal["urdf", "sapien"] = "urdf"
+    """Joint friction and damping as the URDF says, or what SAPIEN gives every joint and link unasked."""
+    timestep: float = 1 / 2000
+    """Of simulation and control [s]."""
+    substeps: int = 20
+    """Sim steps from one sample to the next."""
+    seed: int = 0
+    """Of the start poses."""
+    spread: float = 0.3
+    """Envs but the first start up to this far from the robot's start pose [rad or m]."""
+    setpoint: tuple[float, ...] | None = None
+    """One position per joint [rad or m]. Default: the robot's own, else its start pose."""
+    params: Path | None = None
+    """Gains, limits and times: a .yaml or .json file of batchpid.save_params. Default: the robot's own."""
+    out: Path | None = None
+    """File to write: .npz."""
+    picture: Path | None = None
+    """Step responses to draw: .png or .svg."""
+
+    def run(self) -> None:
+        """Run it."""
+        from batchpid import load_params, plots
+        from batchpid.cli import report
+        from batchpid.cli.follow import follow, start_poses
+        from sim import Robot, Runner
+        from sim.arguments import array
+
+        if self.out is not None:
+            _check_out(self.out)
+        if self.picture is not None:
+            plots.check_path(self.picture)
+        robot = Robot.load(self.robot, dissipation=self.dissipation)
+        start = start_poses(robot, self.num_envs, self.spread, self.seed)
+        settings = robot.settings
+        goal: Any = self.setpoint
+        if goal is None:
+            goal = robot.start if settings is None else settings.target
+        setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
+        params = None if self.params is None else load_params(self.params, robot.joint_names)[0]
+        with Runner(
+            robot,
+            self.num_envs,
+            params=params,
+            workers=self.workers,
+            timestep=self.timestep,
+            substeps=self.substeps,
+            control=self.control,
+            compensate=self.compensate,
+            physics=self.physics,
+        ) as runner:
+            run = follow(runner, setpoint, start, self.seconds, "simulating")
+        metrics = report.judge(robot, run.rollout, run.start)
+        print(report.speed(self.num_envs, run.steps, self.timestep, run.wall), "\n")
+        print(report.joint_table(robot, metrics), "\n")
+        for verdict in report.verdicts(robot, run.rollout, metrics):
+            print(verdict)
+        if self.out is not None:
+            _write(self.out, robot, run)
+            print(f"written: {self.out}")
+        if self.picture is not None:
+            traces = plots.Traces.of(run.rollout, robot)
+            print(
+                f"picture: {plots.save(plots.step_responses(traces, mark=0, title=robot.name), self.picture)}"
+            )
+
+
+def _check_out(path: Path) -> None:
+    from batchpid.errors import InvalidArgumentError
+
+    if path.suffix not in FORMATS:
+        raise InvalidArgumentError(
+            "out", "unknown file format", value=str(path), remedy=f"end it in {' or '.join(FORMATS)}"
+        )
+
+
+def _write(path: Path, robot: Robot, run: Followed) -> None:
+    import numpy as np
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        **run.rollout._asdict(),
+        start=run.start,
+        robot=np.array(robot.name),
+        joint_names=np.array(robot.joint_names),
+        units=np.array([joint.unit for joint in robot.joints]),
+        lower=robot.lower,
+        upper=robot.upper,
+        effort_limit=robot.effort_limit,
+    )
