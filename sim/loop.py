@@ -38,6 +38,7 @@ class LoopSpec:
     compensate: str = "gravity+coriolis"
     measurement_rate: bool = False
     pack_size: int = 8
+    first_env: int = 0
 
 
 class Arrays(NamedTuple):
@@ -81,7 +82,8 @@ class Loop:
         starts = range(0, spec.num_envs, spec.pack_size)
         slices = [slice(start, min(start + spec.pack_size, spec.num_envs)) for start in starts]
         self._cells = [
-            _Cell(Pack(builder, spec.scene, envs.stop - envs.start), envs, spec) for envs in slices
+            _Cell(Pack(builder, spec.scene, envs.stop - envs.start, spec.first_env + envs.start), envs, spec)
+            for envs in slices
         ]
         self.set_params(spec.params)
 
@@ -109,6 +111,10 @@ class Loop:
             )
             cell.observe(rows)
         return time.perf_counter() - began
+
+    def poses(self) -> list[NDArray[np.float32]]:
+        """Poses of the entities that each env's content wants watched, (watched, 7) each."""
+        return [rows for cell in self._cells for rows in cell.pack.read_poses()]
 
     def close(self) -> None:
         """Free the scenes."""

@@ -91,6 +91,10 @@ class Runner:
         Give the law qvel as the measurement's rate instead of letting it difference qpos.
     ground
         Whether every scene has a ground plane at height 0.
+    build
+        ``build(scene, env)`` adds the caller's own actors to the ``sapien.Scene`` of each env. Visuals and lights that
+        it asks for are left out, so tutorial code runs as it is. It may return the entities that :meth:`poses` tells
+        of. A reset puts what it added back to where it left it.
     pack_size
         Scenes that share a PhysX system; a matter of speed alone.
     timeout
@@ -116,6 +120,7 @@ class Runner:
         physics: str | Physics = "accurate",
         measurement_rate: bool = False,
         ground: bool = True,
+        build: Callable[[Any, int], Any] | None = None,
         pack_size: int = 8,
         timeout: float = 60.0,
     ) -> None:
@@ -138,6 +143,10 @@ class Runner:
         if not isinstance(physics, Physics):
             physics = PHYSICS[choice("physics", physics, PHYSICS)]
         pack_size = integer("pack_size", pack_size, 1, 65535)
+        if build is not None and not callable(build):
+            raise InvalidArgumentError(
+                "build", "must be a function", value=build, remedy="define build(scene, env)"
+            )
         self.timeout = number("timeout", timeout, 1e-3, 1e9, "seconds")
         self._params = self._check_params(self._default_params() if params is None else params)
         scene = SceneSpec(
@@ -149,6 +158,7 @@ class Runner:
             dissipation=robot.dissipation,
             ground=flag("ground", ground),
             fixed_base=robot.fixed_base,
+            build=build,
         )
         self._warned: set[tuple[str, int]] = set()
         self._ticks = 0
@@ -166,6 +176,7 @@ class Runner:
                     compensate=self.compensate,
                     measurement_rate=flag("measurement_rate", measurement_rate),
                     pack_size=pack_size,
+                    first_env=envs.start,
                 )
                 self._workers.append(kind(spec, index, envs.start))
             if count:
@@ -300,6 +311,27 @@ class Runner:
         """State of every env now, as fresh arrays."""
         self._check_open()
         return Observation(*(self._gather(name) for name in Observation._fields))
+
+    def poses(self) -> Float32:
+        """Poses now of the entities that ``build`` returned, (envs, entities, 7): x, y, z [m], quaternion w, x, y, z.
+
+        Raises
+        ------
+        InvalidArgumentError
+            There is no ``build``, or it returned more entities for one env than for another.
+        """
+        self._check_open()
+        for worker in self._workers:
+            worker.send("poses")
+        rows = [row for part in self._receive() for row in part]
+        counts = [len(row) for row in rows]
+        if not rows or len(set(counts)) > 1:
+            raise InvalidArgumentError(
+                "build",
+                f"returned {sorted(set(counts))} entities, by env" if rows else "was not given",
+                remedy="let build(scene, env) return as many entities for every env",
+            )
+        return np.stack(rows)
 
     @property
     def params(self) -> bp.PIDParams:

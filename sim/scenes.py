@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
 
+from .content import Build, Content, HeadlessScene
 from .physics import DISSIPATION, Physics
 from .urdf import Joint
 
@@ -54,6 +55,7 @@ class SceneSpec:
     dissipation: str = "urdf"
     ground: bool = True
     fixed_base: bool = True
+    build: Build | None = None
 
 
 def parse(spec: SceneSpec) -> ArticulationBuilder:
@@ -105,16 +107,26 @@ def mass_matrix(spec: SceneSpec) -> Callable[[NDArray[Any]], NDArray[np.float64]
 class Pack:
     """M scenes of one robot in one PhysX system. Arrays are (M, dof), in SAPIEN's joint order, SI units."""
 
-    def __init__(self, builder: ArticulationBuilder, spec: SceneSpec, size: int) -> None:
+    def __init__(self, builder: ArticulationBuilder, spec: SceneSpec, size: int, first_env: int = 0) -> None:
         with _global_config(spec.physics):
-            self._system = physx.PhysxCpuSystem()
-            self._system.timestep = spec.timestep
+            # PhysX solves the contacts of free bodies in an order that depends on what else its system holds, so
+            # scenes with content of their own do not share one: that would cost the last bits.
+            count = 1 if spec.build is None else size
+            self._systems = [physx.PhysxCpuSystem() for _ in range(count)]
+            for system in self._systems:
+                system.timestep = spec.timestep
             # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
-            self._scenes = [_bare_scene(self._system) for _ in range(size)]
+            self._scenes = [_bare_scene(self._systems[index % count]) for index in range(size)]
             self._robots = [_build_robot(builder, scene, spec) for scene in self._scenes]
             if spec.ground:
                 for scene in self._scenes:
                     scene.add_ground(0.0, render=False)
+            build = spec.build
+            self._contents = (
+                []
+                if build is None
+                else [Content(build, scene, env) for env, scene in enumerate(self._scenes, start=first_env)]
+            )
         for group, scene in enumerate(self._scenes, start=1):
             _separate(scene, group)
         self.size, self.dof = size, self._robots[0].dof
@@ -126,7 +138,11 @@ class Pack:
         # set_qf from a kept row view costs half of what a fresh one does.
         self._qf = np.zeros((size, self.dof), np.float32)
         self._set_qf = [(robot.set_qf, row) for robot, row in zip(self._robots, self._qf, strict=True)]
-        self.step = self._system.step
+        self.step = self._systems[0].step if len(self._systems) == 1 else self._step_each
+
+    def _step_each(self) -> None:
+        for system in self._systems:
+            system.step()
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions [rad or m], a new array."""
@@ -166,6 +182,12 @@ class Pack:
             robot.set_qvel(velocity.astype(np.float32))
             self._qf[row] = 0.0
             robot.set_qf(self._qf[row])
+            if self._contents:
+                self._contents[row].reset()
+
+    def read_poses(self) -> list[Float32]:
+        """Poses of each scene's watched entities, (watched, 7) each."""
+        return [content.poses() for content in self._contents]
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).
@@ -193,13 +215,13 @@ class Pack:
     def close(self) -> None:
         """Free the scenes. The pack cannot be used afterwards."""
         self._set_qf, self._get_qpos, self._get_qvel, self._passive = [], [], [], []
-        self._joints, self._robots = [], []
+        self._joints, self._robots, self._contents = [], [], []
         self._scenes = []
 
 
 def _bare_scene(system: Any) -> Any:
     # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
-    return sapien.Scene([system])
+    return HeadlessScene([system])
 
 
 @contextmanager

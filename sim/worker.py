@@ -21,7 +21,9 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-from batchpid.errors import BatchPIDError, WorkerError
+import cloudpickle
+
+from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 
 from .loop import Arrays, Loop, LoopSpec
 from .shared import SharedArrays
@@ -65,6 +67,7 @@ class ProcessWorker:
 
     def __init__(self, spec: LoopSpec, index: int, first_env: int) -> None:
         self.index, self.envs = index, range(first_env, first_env + spec.num_envs)
+        message = _pickle(spec)
         self._shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)))
         self.arrays = Arrays(**self._shared.arrays)
         ours, theirs = socket.socketpair()
@@ -83,7 +86,7 @@ class ProcessWorker:
                 env=os.environ | dict.fromkeys(_ONE_THREAD, "1"),
             )
         self._connection = Connection(ours.detach())
-        self._connection.send(spec)
+        self._connection.send_bytes(message)
 
     @property
     def pid(self) -> int:
@@ -195,6 +198,18 @@ def _serve(connection: Connection, spec: LoopSpec, fd: int) -> None:
             raise
         except Exception as error:
             connection.send((None, _portable(error)))
+
+
+def _pickle(spec: LoopSpec) -> bytes:
+    """The spec as bytes; cloudpickle takes along the user's function where the worker cannot import it by name."""
+    try:
+        return cloudpickle.dumps(spec)
+    except Exception as error:
+        raise InvalidArgumentError(
+            "build",
+            f"cannot be sent to a worker process: {error}",
+            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
+        ) from error
 
 
 def _portable(error: Exception) -> BatchPIDError | str:
