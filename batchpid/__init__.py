@@ -8,6 +8,7 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.law import advance, init, reset, step, track
 from batchpid.params import PIDParams, make_params
 from batchpid.serialization import load_params, save_params
+from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
 
 __all__ = [
@@ -28,6 +29,8 @@ __all__ = [
     "presets",
     "reset",
     "save_params",
+    "spectral_radius",
+    "stability_bound",
     "step",
     "track",
 ]

@@ -1,0 +1,141 @@
+r"""When a sampled PID loop on a chain of rigid bodies is stable: in closed form, and exactly.
+
+The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with the mass matrix M,
+implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all diagonal but M)::
+
+    (M + dt B) (v+ - v) = dt (u - B v),   q+ = q + dt v+,   u = -Kp q - Kd d,   d = (tau d' + q - q') / (tau + dt)
+
+Put q_k = x z^k and multiply by x^H: for tau = 0, m (z - 1)^2 + b (z - 1) z + p z + c (z - 1) = 0, where m, b, c and
+p are the positive numbers x^H M x, dt x^H B x, dt x^H Kd x and dt^2 x^H Kp x. Jury's criterion asks for
+2 c + p < 4 m + 2 b: the root that leaves the unit circle does so at z = -1, where neighbouring samples alternate. There
+the filter passes dt / (dt + 2 tau) of the rate. Over all x that is, by the largest eigenvalue of a symmetric matrix::
+
+    ratio = 1/2 lambda_max( (M + dt/2 B)^-1 (dt/(dt + 2 tau) dt Kd + 1/2 dt^2 Kp) ) < 1
+
+and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I without filter it says
+kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
+stretched upright), joints that turn against each other move much less than the diagonal of M says.
+
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` has everything.
+E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.errors import InvalidArgumentError
+
+Float64 = NDArray[np.float64]
+
+
+class StabilityBound(NamedTuple):
+    """How much of the sampled loop's stability range is used."""
+
+    ratio: Float64
+    """(...): below 1 the loop is stable, above 1 it diverges, alternating from step to step."""
+    participation: Float64
+    """(..., joints): the share of each joint in the mode that goes first; sums to 1."""
+
+
+def stability_bound(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+) -> StabilityBound:
+    """Return how near PD gains are to the sampled loop's stability limit.
+
+    Parameters
+    ----------
+    mass_matrix
+        (..., joints, joints), symmetric and positive definite [kg m^2 or kg].
+    kp, kd
+        (joints,) or broadcastable to (..., joints): gains >= 0 [N m/rad or N/m, and times s].
+    dt
+        Control and simulation step [s].
+    filter_time
+        Of the derivative's first-order low-pass [s], as kp.
+    damping
+        The joints' own viscous damping, which the simulator integrates implicitly [N m s/rad or N s/m], as kp.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A shape that does not fit, or a mass matrix that is not positive definite.
+    """
+    m, p, c, tau, b = _columns(mass_matrix, kp, kd, filter_time, damping)
+    passed = dt / (dt + 2 * tau)
+    weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
+    inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
+    values, vectors = np.linalg.eigh(weight[..., :, None] * inverse * weight[..., None, :])
+    return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
+
+
+def spectral_radius(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    ki: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+) -> Float64:
+    """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is stable.
+
+    The exact one-step matrix of the law, output first, and the plant, on the state (q, q - q', I, d). Arguments
+    as :func:`stability_bound`, with ``ki`` [N m/(rad s) or N/(m s)] as kp. Where ki is 0 its pole at 1 is left out.
+    """
+    m, p, c, tau, b = _columns(mass_matrix, kp, kd, filter_time, damping)
+    shape = m.shape[:-1]
+    i = np.broadcast_to(np.asarray(ki, np.float64), shape)
+    one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
+
+    def diagonal(values: Float64) -> Float64:
+        return values[..., None] * one
+
+    keep, take = tau / (tau + dt), dt / (tau + dt)
+    # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
+    rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
+    effort = [
+        diagonal(-p),
+        c[..., None] * rate[1],
+        diagonal(np.where(i > 0, 1.0, 0.0)),
+        c[..., None] * rate[3],
+    ]
+    implicit = np.linalg.inv(m + diagonal(dt * b))
+    step = [dt**2 * (implicit @ column) for column in effort]
+    step[1] = step[1] + implicit @ m
+    integral = [diagonal(-i * dt), zero, diagonal(np.where(i > 0, 1.0, 0.0)), zero]
+    position = [s + e for s, e in zip(step, [one, zero, zero, zero], strict=True)]
+    matrix = np.block([position, step, integral, rate])
+    return np.abs(np.linalg.eigvals(matrix)).max(-1)
+
+
+def _columns(mass_matrix: ArrayLike, *columns: ArrayLike) -> tuple[Any, ...]:
+    m = np.asarray(mass_matrix, np.float64)
+    if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
+        raise InvalidArgumentError(
+            "mass_matrix", "is not square", value=m.shape, remedy="pass (joints, joints), or a stack of such"
+        )
+    if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
+        raise InvalidArgumentError(
+            "mass_matrix",
+            "is not positive definite",
+            remedy="check the masses and inertias of the robot's links",
+        )
+    try:
+        return (m, *(np.broadcast_to(np.asarray(column, np.float64), m.shape[:-1]) for column in columns))
+    except ValueError as error:
+        raise InvalidArgumentError(
+            "kp, kd, filter_time, damping",
+            f"do not broadcast to {m.shape[:-1]}: {error}",
+            remedy="give one value, or one per joint",
+        ) from None

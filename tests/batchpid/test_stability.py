@@ -1,0 +1,93 @@
+"""The closed-form bound against the exact one-step matrix, and both against the law itself on a chain of masses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.stability import spectral_radius, stability_bound
+
+DT = 1 / 2000
+
+
+def random_mass(rng, joints):
+    """A positive definite matrix whose joints differ by decades and are strongly coupled."""
+    a = rng.normal(size=(joints, joints)) + 1.5
+    scale = 10.0 ** rng.uniform(-3, 0, joints)
+    return scale[:, None] * (a @ a.T + 0.02 * np.eye(joints)) * scale
+
+
+def test_one_joint_without_filter_is_the_textbook_bound():
+    inertia, kp, kd = 0.3, 4.0e5, 500.0
+    bound = stability_bound([[inertia]], kp, kd, DT)
+    assert bound.ratio == pytest.approx((kd * DT / inertia + kp * DT**2 / (2 * inertia)) / 2)
+    assert bound.participation == pytest.approx([1.0])
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    seed=st.integers(0, 2**31),
+    joints=st.integers(1, 6),
+    filter_time=st.sampled_from([0.0, 1e-4, 5e-3]),
+    damping=st.sampled_from([0.0, 0.5]),
+    stiff=st.floats(0.01, 1),
+)
+def test_ratio_is_where_the_exact_loop_turns_unstable(seed, joints, filter_time, damping, stiff):
+    rng = np.random.default_rng(seed)
+    mass = random_mass(rng, joints)
+    kd = np.diag(mass) * rng.uniform(0.2, 2, joints) / DT
+    kp = stiff * kd * rng.uniform(0.1, 1, joints) * 10
+    ratio = stability_bound(mass, kp, kd, DT, filter_time=filter_time, damping=damping).ratio
+    options = {"filter_time": filter_time, "damping": damping}
+    below, above = 0.98 / ratio, 1.02 / ratio
+    assert spectral_radius(mass, below * kp, 0.0, below * kd, DT, **options) < 1
+    assert spectral_radius(mass, above * kp, 0.0, above * kd, DT, **options) > 1
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    seed=st.integers(0, 2**31), factor=st.sampled_from([0.8, 1.5]), filter_time=st.sampled_from([0.0, 2e-3])
+)
+def test_the_law_itself_holds_and_diverges_where_the_bound_says(seed, factor, filter_time):
+    rng = np.random.default_rng(seed)
+    joints = 4
+    mass = random_mass(rng, joints)
+    kd = np.diag(mass) * rng.uniform(0.2, 2, joints) / DT
+    kp = 20.0 * kd
+    scale = factor / stability_bound(mass, kp, kd, DT, filter_time=filter_time).ratio
+    params = bp.make_params(joints, kp * scale, None, kd * scale, derivative_filter_time=filter_time)
+    inverse = np.linalg.inv(mass)
+    q = 1e-6 * rng.normal(size=(1, joints))
+    v = np.zeros_like(q)
+    state = bp.init(params, q)
+    for _ in range(6000):
+        state, effort = bp.step(params, state, np.zeros_like(q), q, DT)
+        v = v + DT * effort @ inverse
+        q = q + DT * v
+        if np.abs(q).max() > 1e3:
+            break
+    size = np.abs(q).max()
+    assert size < 1e-4 if factor < 1 else size > 1e3
+
+
+def test_the_integral_is_in_the_exact_loop():
+    # Continuous time: kp kd / I > ki.
+    inertia, kp, kd = 1.0, 100.0, 20.0
+    assert spectral_radius([[inertia]], kp, 0.9 * kp * kd, kd, DT) < 1
+    assert spectral_radius([[inertia]], kp, 1.1 * kp * kd, kd, DT) > 1
+
+
+def test_stacks_and_bad_arguments():
+    mass = np.stack([np.eye(2), 2 * np.eye(2)])
+    bound = stability_bound(mass, [1.0, 1.0], [100.0, 1.0], DT)
+    assert bound.ratio[0] == pytest.approx(2 * bound.ratio[1])
+    np.testing.assert_allclose(bound.participation, [[1, 0], [1, 0]])
+    for mass in (np.eye(3)[:2], -np.eye(2), np.full((2, 2), np.nan)):
+        with pytest.raises(InvalidArgumentError, match="mass_matrix"):
+            stability_bound(mass, 1.0, 1.0, DT)
+    with pytest.raises(InvalidArgumentError, match="broadcast"):
+        stability_bound(np.eye(2), [1.0, 2.0, 3.0], 1.0, DT)
