@@ -1,0 +1,69 @@
+"""Drive N robots to the tutorial's pose: with PhysX's internal drive, with the batch PID, or not at all.
+
+    python examples/drive_robot.py --use-external-pid
+    python examples/drive_robot.py --use-internal-drive --compensate none
+    python examples/drive_robot.py                                          # nothing holds it: it falls
+
+SAPIEN's tutorial "Drive Robot with PID Controller" has the same two switches. Without compensation a drive keeps a
+steady-state error, because only an error makes it push back against gravity; the integral of a PID removes it.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from sim import Robot, Runner
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which robot, and what drives it."""
+
+    robot: Literal["jaco2", "panda"] = "jaco2"
+    use_internal_drive: bool = False
+    """PhysX's PD drive, stiffness 20 and damping 5."""
+    use_external_pid: bool = False
+    """One PID a joint with the tutorial's gains, computed at every sim step."""
+    compensate: Literal["gravity+coriolis", "gravity", "none"] | None = None
+    """Passive force added to the joints; default gravity+coriolis where something drives them, else none."""
+    num_envs: int = 8
+    seconds: float = 3.0
+
+
+def main(options: Options) -> None:
+    """Run the robots, then print where each joint of the first one ended."""
+    if options.use_internal_drive and options.use_external_pid:
+        raise SystemExit("the internal drive and the PID would fight: choose one of the two switches")
+    driven = options.use_internal_drive or options.use_external_pid
+    control = "drive" if options.use_internal_drive else "pid" if options.use_external_pid else "effort"
+    compensate = options.compensate or ("gravity+coriolis" if driven else "none")
+
+    robot = Robot.load(options.robot)
+    target = robot.settings.target
+    command = (
+        target if driven else np.zeros(robot.dof)
+    )  # under "effort" the command is the joint effort itself
+    start = robot.start + np.random.default_rng(0).uniform(-0.1, 0.1, (options.num_envs, robot.dof))
+    start = np.clip(start, robot.lower, robot.upper)
+
+    with Runner(robot, options.num_envs, control=control, compensate=compensate) as runner:
+        runner.reset(start)
+        ticks = round(options.seconds / (runner.substeps * runner.timestep))
+        rollout = runner.rollout(np.broadcast_to(command, (ticks, robot.dof)))
+
+    print(
+        f"{options.num_envs} x {robot.name}, control {control!r}, compensate {compensate!r}, {rollout.time[-1]:g} s"
+    )
+    print(f"{'joint':30} {'start':>8} {'target':>8} {'end':>8} {'error':>9} {'worst env':>10}")
+    error = np.abs(rollout.qpos[-1] - target)
+    for j, joint in enumerate(robot.joints):
+        print(
+            f"{joint.name:30} {start[0, j]:8.3f} {target[j]:8.3f} {rollout.qpos[-1, 0, j]:8.3f} "
+            f"{error[0, j]:9.4f} {error[:, j].max():10.4f} {joint.unit}"
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

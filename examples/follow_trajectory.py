@@ -1,0 +1,61 @@
+"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, minimum jerk, or limited jerk.
+
+    python examples/follow_trajectory.py
+
+Each robot of the batch follows another profile over the same way in the same time. The PID is told the setpoint's rate,
+so it damps the error of velocity and not the velocity: what is left is how hard the profile is to follow.
+"""
+
+import numpy as np
+
+from batchpid.errors import MissingDependencyError
+from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
+from sim import Robot, Runner
+
+DT = 0.01  # a tick: 20 sim steps [s]
+# Stiffness and damping of the arm in libfranka's joint impedance example, and a soft hold of the fingers.
+KP = [600, 600, 600, 600, 250, 150, 50, 100, 100]  # N m/rad, N/m
+KD = [50, 50, 50, 50, 30, 25, 15, 10, 10]  # N m s/rad, N s/m
+
+
+def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
+    """The same move in four ways; the first two as fast as the limits allow, or nearly so."""
+    limits = {"max_velocity": velocity, "max_acceleration": acceleration}
+    moves = {"trapezoidal": trapezoidal(start, target, DT, **limits)}
+    try:
+        moves["jerk limited"] = jerk_limited(start, target, DT, **limits, max_jerk=10 * acceleration)
+    except MissingDependencyError as error:
+        print(error)
+    moves["minimum jerk"] = minimum_jerk(start, target, DT, **limits)
+    last = max(move.time[-1] for move in moves.values())
+    still = np.broadcast_to(target, (1, len(target)))
+    moves["step"] = Trajectory(np.array([DT]), still, 0 * still, 0 * still)
+    return {name: move.hold(last + 1.0 - move.time[-1]) for name, move in moves.items()}
+
+
+def main():
+    """Run one robot per profile, then compare."""
+    robot = Robot.load("panda")
+    velocity = 0.5 * robot.velocity_limit
+    moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)
+    ticks = min(move.ticks for move in moves.values())
+    position, rate = (
+        np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1)
+        for name in ("position", "velocity")
+    )
+    params = robot.params(kp=KP, ki=0.0, kd=KD, derivative_filter_time=0.002)
+    with Runner(robot, len(moves), params=params) as runner:
+        rollout = runner.rollout(position, setpoint_rates=rate)
+    arm = slice(0, 7)
+    error = np.abs(rollout.qpos - rollout.setpoint)[:, :, arm]
+    print(f"{'profile':14} {'arrives':>9} {'worst error':>12} {'final error':>12} {'peak effort':>12}")
+    for env, (name, move) in enumerate(moves.items()):
+        arrival = move.time[np.argmax((move.position == move.position[-1]).all(-1))]
+        print(
+            f"{name:14} {arrival:7.2f} s {error[:, env].max():8.3f} rad {error[-1, env].max():8.4f} rad "
+            f"{np.abs(rollout.effort[:, env, arm]).max():8.1f} N m"
+        )
+
+
+if __name__ == "__main__":
+    main()

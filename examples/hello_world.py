@@ -1,0 +1,50 @@
+"""Hello, world: in each of N scenes a ground, a robot, and a box that falls from 0.5 m above it.
+
+    python examples/hello_world.py
+
+``build(scene, env)`` is SAPIEN code as its tutorial has it. Without a screen its visuals and lights are left out;
+``batchpid demo --viewer`` shows a scene where there is one.
+"""
+
+import numpy as np
+
+from sim import Robot, Runner
+
+HALF = 0.5  # half the box's edge [m]
+
+
+def build(scene, env):
+    """Add a red box, each env's a little higher, and some light."""
+    import sapien
+
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[HALF, HALF, HALF])
+    builder.add_box_visual(half_size=[HALF, HALF, HALF], material=[1.0, 0.0, 0.0])
+    box = builder.build(name="box")
+    box.set_pose(sapien.Pose(p=[1.5, 0, HALF + 0.5 + 0.1 * env]))
+    scene.set_ambient_light([0.5, 0.5, 0.5])
+    scene.add_directional_light([0, 1, -1], [0.5, 0.5, 0.5])
+    return box  # what is returned can be watched
+
+
+def main(num_envs=4):
+    """Let the boxes fall while the robots hold still."""
+    robot = Robot.load("panda")
+    with Runner(robot, num_envs, build=build) as runner:
+        print("time [s]   height of each box's lower side [m]")
+        for tick in range(51):
+            if tick % 5 == 0:
+                heights = runner.poses()[:, 0, 2] - HALF
+                print(
+                    f"{tick * runner.substeps * runner.timestep:8.2f}   "
+                    + "  ".join(f"{z:6.3f}" for z in heights)
+                )
+            obs = runner.step(robot.start)
+        moved = np.abs(obs.qpos - robot.start).max()
+        print(f"the robots moved by {moved:.1e} rad at most")
+        runner.reset()
+        print("after a reset:", np.round(runner.poses()[:, 0, 2] - HALF, 3))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""List the joints of a robot: the fixed ones too, then the active ones in the order of every array.
+
+python examples/list_joints.py --robot jaco2
+python examples/list_joints.py --robot path/to/any.urdf
+"""
+
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from sim import Robot, Runner
+
+
+def main(
+    robot: str = "panda", stiffness: Annotated[float, tyro.conf.arg(help="of the internal drive")] = 0.0
+) -> None:
+    """Print what SAPIEN's tutorial prints of every joint."""
+    loaded = Robot.load(robot)
+    for joint in loaded.all_joints:
+        drive = stiffness if joint.moves else 0.0
+        print(
+            f"name: {joint.name}  type: {joint.type}  damping: {joint.damping:g}  stiffness: {drive:g}  "
+            f"friction: {joint.friction:g}  limits: [{joint.lower:g}, {joint.upper:g}] {joint.unit}  "
+            f"effort: {joint.effort_limit:g}  child link: {joint.child_link}  parent link: {joint.parent_link}"
+        )
+    print("active joints:", ", ".join(loaded.joint_names))
+    params = loaded.params() if loaded.settings else loaded.params(kp=0.0)
+    with Runner(loaded, 1, workers=0, params=params) as runner:
+        print("qpos:", np.round(runner.observe().qpos[0], 4))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

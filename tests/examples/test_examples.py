@@ -1,0 +1,74 @@
+"""Every example runs as its docstring says, and shows what it claims to show."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    def run(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+def errors(table: str) -> dict[str, float]:
+    """Joint -> error of env 0, from the table of drive_robot.py."""
+    return {row.split()[0]: float(row.split()[4]) for row in table.splitlines()[2:]}
+
+
+def test_every_example_is_tested():
+    tested = set(re.findall(r'"(\w+\.py)"', Path(__file__).read_text()))
+    assert {path.name for path in EXAMPLES.glob("*.py")} <= tested
+
+
+@pytest.mark.parametrize("robot", ["jaco2", "panda"])
+def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot):
+    drive = ("drive_robot.py", "--robot", robot, "--num-envs", "2", "--seconds", "5", "--use-internal-drive")
+    kept = errors(run(*drive, "--compensate", "none"))
+    removed = errors(run(*drive))
+    joint = {"jaco2": "j2s7s300_joint_4", "panda": "panda_joint2"}[robot]
+    assert kept[joint] > 0.1
+    assert removed[joint] < 0.02
+
+
+def test_undriven_it_falls_and_the_pid_brings_it_there(run):
+    panda = ("drive_robot.py", "--robot", "panda", "--num-envs", "2")
+    rows = [row.split() for row in run(*panda, "--seconds", "2").splitlines()[2:]]
+    assert max(abs(float(end) - float(start)) for _, start, _, end, *_ in rows) > 0.5
+    held = errors(run(*panda, "--seconds", "6", "--use-external-pid"))
+    assert held["panda_joint2"] < 0.1
+
+
+def test_both_switches_are_an_error(run):
+    with pytest.raises(SystemExit, match="choose one"):
+        run("drive_robot.py", "--use-internal-drive", "--use-external-pid")
+
+
+def test_hello_world_drops_the_boxes(run):
+    rows = [line.split() for line in run("hello_world.py").splitlines() if re.match(r" +\d\.\d\d ", line)]
+    first, last = ([float(z) for z in row[1:]] for row in (rows[0], rows[-1]))
+    assert first == pytest.approx([0.5, 0.6, 0.7, 0.8])
+    assert last == pytest.approx([0, 0, 0, 0], abs=5e-3)
+
+
+def test_list_joints_tells_of_every_joint(run):
+    text = run("list_joints.py", "--robot", "jaco2")
+    assert text.count("name: ") == 13
+    assert "child link: j2s7s300_link_1  parent link: j2s7s300_link_base" in text
+    assert "qpos: [0.   3.14 0." in text
+
+
+def test_a_profile_is_easier_to_follow_than_a_step(run):
+    text = run("follow_trajectory.py")
+    worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " rad " in row}
+    assert set(worst) >= {"trapezoidal", "minimum jerk", "step"}
+    assert worst["minimum jerk"] < worst["trapezoidal"] < 0.1 < worst["step"]
