@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from batchpid.errors import InvalidArgumentError
 
@@ -223,7 +225,17 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
     """
     path = check_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
+    if path.suffix.lower() == ".svg":
+        figure.savefig(path, dpi=dpi)
+        return path
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    # A palette of 256 colours cannot be told from the original, and takes a third of the bytes.
+    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        path, optimize=True, dpi=(dpi, dpi)
+    )
     return path
 
 
@@ -245,21 +257,22 @@ def _figure(
 ) -> tuple[Figure, Iterator[tuple[int, list[Axes]]]]:
     """A figure with one block of ``rows`` panels for each joint, in a grid; and (joint, panels) pairs."""
     chosen = traces.chosen(joints)
-    columns = min(len(chosen), 3 if len(chosen) <= 9 else 4)
+    # As few empty places as can be, in three columns, or four or five of many joints.
+    columns = min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
     lines = math.ceil(len(chosen) / columns)
-    height = 2.6 if rows == 2 else 1.7
-    figure = Figure(figsize=(4.0 * columns, height * lines + 0.75), layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.03, w_pad=0.05)  # type: ignore[call-arg, union-attr]
+    heights = (1.7, 0.85)[:rows]
+    size = ((4.0 if columns < 5 else 3.6) * columns, sum(heights) * lines + 0.75)
+    figure = Figure(figsize=size, layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.02, w_pad=0.05, hspace=0.0)  # type: ignore[call-arg, union-attr]
     if title:
         figure.suptitle(title, fontsize=11)
-    grid = figure.add_gridspec(lines, columns)
+    # One flat grid, so that the panels of a column are aligned.
+    grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
 
     def panels() -> Iterator[tuple[int, list[Axes]]]:
         for place, joint in enumerate(chosen):
-            inner = grid[divmod(place, columns)].subgridspec(
-                rows, 1, height_ratios=(2, 1)[:rows], hspace=0.02
-            )
-            block: list[Axes] = [figure.add_subplot(inner[row]) for row in range(rows)]
+            line, column = divmod(place, columns)
+            block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
             last = place + columns >= len(chosen)
             for axes in block:
                 axes.tick_params(labelsize=_SMALL, length=2)
@@ -344,7 +357,7 @@ def _draw_efforts(axes: Axes, traces: Traces, joint: int, mark: int | None) -> N
     else:
         note = f"peak {peak:.3g} {traces.effort_unit(joint)}, no limit"
     axes.text(
-        0.99, 0.04, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5, color="#444444"
+        0.99, 0.09, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5, color="#444444"
     )
 
 
