@@ -39,7 +39,7 @@ def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
 
 
 def flush(x: Any, tiny: Any) -> Any:
-    """Return x with magnitudes far below ``tiny`` rounded to 0 and large ones untouched; see :func:`tiny_of`.
+    """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers as they are.
 
     Arithmetic on denormal numbers is ten times slower, and a decaying filter ends there. Adding and taking away a
     tiny number costs two additions, and no branch.

@@ -29,7 +29,10 @@ class LeafBuilder:
                 remedy="name every joint once",
             )
         self.joints, self.names = int(joints), joint_names
-        self.dtype = np.dtype(dtype)
+        try:
+            self.dtype = np.dtype(dtype)
+        except TypeError:
+            self.dtype = np.dtype(object)
         if self.dtype not in (np.float32, np.float64):
             raise InvalidArgumentError(
                 "dtype", "is neither float32 nor float64", value=str(dtype), remedy="choose one of them"

@@ -128,15 +128,16 @@ class ScalarPID:
 
 def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
     """Return one :class:`ScalarPID` per env and joint with the options of ``params``."""
-    options = params.options()
     known = {field.name for field in fields(ScalarPID)}
+    options = {name: value for name, value in params.options().items() if name in known}
 
-    def of(env: int, joint: int) -> ScalarPID:
-        chosen: dict[str, Any] = {}
-        for name, value in options.items():
-            if name in known and not isinstance(value, str):
-                value = value[env if value.shape[0] > 1 else 0, joint].item()
-            chosen[name] = value
-        return ScalarPID(**{name: value for name, value in chosen.items() if name in known})
+    def pick(value: Any, env: int, joint: int) -> Any:
+        return value if isinstance(value, str) else value.tolist()[env if value.shape[0] > 1 else 0][joint]
 
-    return [[of(env, joint) for joint in range(params.joints)] for env in range(num_envs)]
+    return [
+        [
+            ScalarPID(**{name: pick(value, env, joint) for name, value in options.items()})
+            for joint in range(params.joints)
+        ]
+        for env in range(num_envs)
+    ]

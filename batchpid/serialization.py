@@ -122,12 +122,6 @@ def load_params(
             )
     head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
     options = _columns(path, {name: joints[name] for name in names})
-    if any(option.shape[0] > 1 for option in options.values()):
-        rows = max(option.shape[0] for option in options.values())
-        options = {
-            key: np.broadcast_to(option, (rows, len(names))) if option.shape[0] == 1 else option
-            for key, option in options.items()
-        }
     try:
         return make_params(len(names), **options, **head, joint_names=names), names
     except InvalidArgumentError as error:

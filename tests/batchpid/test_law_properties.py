@@ -1,0 +1,300 @@
+"""What must hold of the law for all numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import DT, ENVS, JOINTS, LIMITED, OPTIONS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+import batchpid as bp
+
+numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
+runs = st.tuples(*[npst.arrays(float, (6, ENVS, JOINTS), elements=numbers)] * 3)
+cases = st.sampled_from(sorted(OPTIONS))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def roll(params, r, y, ff=None, state=None):
+    """Return the states and the terms of a run."""
+    state, states, terms = bp.init(params, y[0]) if state is None else state, [], []
+    for t in range(len(r)):
+        state, _, shown = bp.step(
+            params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], aux=True
+        )
+        states.append(state)
+        terms.append(shown)
+    return states, terms
+
+
+def equal_bits(a, b):
+    return all(
+        (x is None) == (y is None) and (x is None or x.tobytes() == y.tobytes())
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@given(cases, runs)
+def test_effort_stays_within_its_limits_and_rate(case, run):
+    params = bp.make_params(JOINTS, **OPTIONS[case])
+    _, terms = roll(params, *run)
+    before = np.zeros((ENVS, JOINTS))
+    for shown in terms:
+        if params.effort_min is not None:
+            assert (shown.effort >= params.effort_min).all()
+        if params.effort_max is not None:
+            assert (shown.effort <= params.effort_max).all()
+        if params.effort_rate_limit is not None:
+            assert (np.abs(shown.effort - before) <= params.effort_rate_limit * DT * (1 + 1e-9)).all()
+        before = shown.effort
+
+
+@pytest.mark.parametrize("strategy", ["clamp", "conditional", "back_calculation"])
+@given(seeds)
+@settings(max_examples=20)
+def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
+    """However long the error pushes; the bound is what the limits and the other terms allow."""
+    rng = np.random.default_rng(seed)
+    kp, ki, limit = rng.uniform(0, 10), rng.uniform(0.1, 50), rng.uniform(0.1, 10)
+    params = bp.make_params(1, kp, ki, effort_limit=limit, anti_windup=strategy)
+    free = bp.make_params(1, kp, ki, effort_limit=limit)
+    r, y = rng.uniform(-3, 3, (2, 2000, 1, 1))
+    r[:1000] = np.abs(r[:1000]) + 4
+    bounded, wound_up = ([abs(s.integral.item()) for s in roll(p, r, y)[0]] for p in (params, free))
+    time = 0.0 if params.tracking_time is None else params.tracking_time.item()
+    most = {
+        "clamp": limit,
+        "conditional": limit + 10 * (kp + ki * DT),
+        "back_calculation": limit + 10 * (kp + ki * (time + DT)),
+    }
+    assert max(bounded) <= most[strategy] * (1 + 1e-9)
+    assert max(wound_up) > 1000 * ki * DT
+
+
+@given(cases, runs, seeds)
+def test_permuting_envs_permutes_the_results(case, run, seed):
+    order = np.random.default_rng(seed).permutation(ENVS)
+    params = bp.make_params(JOINTS, **OPTIONS[case])
+    states, terms = roll(params, *run)
+    others, shown = roll(params.for_envs(order), *(x[:, order] for x in run))
+    assert equal_bits(states[-1].for_envs(order), others[-1])
+    assert equal_bits([x[order] for x in terms[-1]], shown[-1])
+
+
+@given(cases, runs, st.integers(1, ENVS - 1), st.booleans())
+def test_sharding_envs_changes_no_bit(case, run, cut, spread):
+    params = bp.make_params(JOINTS, **OPTIONS[case])
+    whole = bp.init(params, run[1][0])
+    shards = (slice(cut), slice(cut, None))
+    parts = [bp.init(params.for_envs(rows), run[1][0][rows]) for rows in shards]
+    for t in range(len(run[0])):
+        whole, effort = bp.advance(
+            bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t]
+        )
+        for n, rows in enumerate(shards):
+            k = bp.discretise(params.for_envs(rows), DT, len(effort[rows]) if spread else None)
+            inputs = [x[t][rows] for x in run]
+            parts[n], part = bp.advance(k, parts[n], *inputs[:2], feedforward=inputs[2])
+            assert part.tobytes() == effort[rows].tobytes()
+            assert equal_bits(parts[n], whole.for_envs(rows))
+
+
+@given(runs, st.sampled_from([np.nan, np.inf, -np.inf]), st.integers(0, 2), st.sampled_from(["zero", "hold"]))
+def test_a_non_finite_input_stays_where_it_is(run, bad, which, policy):
+    """Its state is kept, its effort is 0 or the last, the mask says so, and the others change by no bit."""
+    params = bp.make_params(
+        JOINTS, **LIMITED, anti_windup="back_calculation", derivative_filter_time=0.02, non_finite=policy
+    )
+    hurt = [x.copy() for x in run]
+    hurt[which][3, 1, 2] = bad
+    (well, well_terms), (ill, ill_terms) = roll(params, *run), roll(params, *hurt)
+    hit = np.zeros((ENVS, JOINTS), bool)
+    hit[1, 2] = True
+    assert np.array_equal(ill_terms[3].finite, ~hit)
+    assert ill_terms[3].effort[1, 2] == (0 if policy == "zero" else ill_terms[2].effort[1, 2])
+    for t in range(6):
+        assert all(x is None or np.isfinite(x).all() for x in ill[t])
+        assert all(np.isfinite(x).all() for x in ill_terms[t])
+        for a, b in zip([*well[t], *well_terms[t]], [*ill[t], *ill_terms[t]], strict=True):
+            assert a is None or a[~hit].tobytes() == b[~hit].tobytes()
+    assert all(a is None or a[1, 2] == b[1, 2] for a, b in zip(ill[2], ill[3], strict=True))
+
+
+def test_without_the_option_a_nan_is_passed_on():
+    params = bp.make_params(2, 1.0, 1.0, 1.0, effort_limit=3.0, anti_windup="conditional")
+    y = np.array([[0.0, np.nan]])
+    _, effort, terms = bp.step(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT, aux=True)
+    assert np.isfinite(effort[0, 0])
+    assert np.isnan(effort[0, 1])
+    assert terms.finite.tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+@given(runs, npst.arrays(float, (ENVS, JOINTS), elements=st.floats(-0.9, 0.9)), st.booleans())
+@settings(max_examples=25)
+def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates):
+    options = OPTIONS[case] | {"ki": OPTIONS[case].get("ki", 0.0)}
+    for limited in ("integral_limit", "deadband"):
+        options.pop(limited, None)
+    if "clamp" in np.ravel(options.get("anti_windup", "none")):
+        options["anti_windup"] = "conditional"
+    params = bp.make_params(JOINTS, **options)
+    state = roll(params, *run)[0][-1]
+    limit = np.minimum(1e3 if params.effort_max is None else params.effort_max, 1e3)
+    effort = share * limit
+    inputs = {"feedforward": run[2][0]}
+    if rates:
+        inputs |= {"measurement_rate": run[2][1], "setpoint_rate": run[2][2]}
+    state = bp.track(params, state, run[0][0], run[1][0], effort, dt=DT, **inputs)
+    _, again = bp.step(params, state, run[0][0], run[1][0], DT, **inputs)
+    np.testing.assert_allclose(again, effort, rtol=1e-6, atol=1e-6)
+
+
+def test_track_needs_an_integral_and_where_it_integrates_first_a_time_step():
+    y = np.zeros((1, 2))
+    params = bp.make_params(2, 1.0)
+    with pytest.raises(bp.InvalidArgumentError, match=r"ki.*nothing can carry"):
+        bp.track(params, bp.init(params, y), y, y, y)
+    params = bp.make_params(2, 1.0, 1.0, integration="integrate_first")
+    with pytest.raises(bp.InvalidArgumentError, match=r"dt.*integrate first"):
+        bp.track(params, bp.init(params, y), y, y, y)
+
+
+@given(runs, st.floats(0, 100))
+def test_a_change_of_ki_is_bumpless(run, ki):
+    params = bp.make_params(JOINTS, 4.0, 3.0, 0.2)
+    state = roll(params, *run)[0][-1]
+    before = bp.step(params, state, run[0][0], run[1][0], DT)[1]
+    after = bp.step(params.replace(ki=ki), state, run[0][0], run[1][0], DT)[1]
+    assert before.tobytes() == after.tobytes()
+
+
+@pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
+@pytest.mark.parametrize(
+    "weights", [{}, {"setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}], ids=str
+)
+def test_a_turn_more_or_less_is_no_event(turns, weights):
+    """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or D."""
+    params = bp.make_params(1, 3.0, 2.0, 0.5, continuous=True, **weights)
+    rng = np.random.default_rng(3)
+    y = np.cumsum(rng.uniform(0, 0.3, (60, 1, 1)), 0)
+    r = y + 0.4
+    jumps = 2 * math.pi * turns * (rng.uniform(size=y.shape) < 0.3)
+    jumps[0] = 0
+    expected, terms = roll(params, r, y)[1], roll(params, r + 2 * math.pi, y + jumps)[1]
+    for a, b in zip(expected, terms, strict=True):
+        for x, z in zip(a[:6], b[:6], strict=True):
+            np.testing.assert_allclose(x, z, atol=1e-9)
+
+
+@given(st.floats(-50, 50), st.lists(st.floats(-50, 50), min_size=2, max_size=20))
+def test_a_constant_error_has_no_derivative_under_wrap(error, path):
+    y = np.array(path)[:, None, None]
+    r = np.mod(y + error + math.pi, 2 * math.pi) - math.pi
+    params = bp.make_params(1, 1.0, 0.0, 1.0, continuous=True, setpoint_weight_derivative=1.0)
+    for shown in roll(params, r, y)[1]:
+        assert abs(shown.d.item()) < 1e-9
+
+
+@pytest.mark.parametrize("strategy", ["clamp", "conditional", "back_calculation"])
+def test_recovery_from_saturation_overshoots_less_with_anti_windup(strategy):
+    """A double integrator with a weak motor: the textbook's case of windup."""
+    peaks = {}
+    for chosen in ("none", strategy):
+        params = bp.make_params(
+            1,
+            4.0,
+            3.0,
+            4.0,
+            effort_limit=0.2,
+            anti_windup=chosen,
+            **({"tracking_time": 0.3} if "back" in chosen else {}),
+        )
+        x, v, state, peak = np.zeros((1, 1)), np.zeros((1, 1)), None, 0.0
+        state = bp.init(params, x)
+        for _ in range(6000):
+            state, effort = bp.step(params, state, np.ones((1, 1)), x, DT)
+            v = v + effort * DT
+            x = x + v * DT
+            peak = max(peak, x.item())
+        peaks[chosen] = peak - 1
+    assert peaks[strategy] < 0.7 * peaks["none"]
+
+
+def test_the_first_step_has_no_derivative_kick():
+    y = np.full((1, 1), 5.0)
+    for options in ({}, {"setpoint_weight_derivative": 1.0}):
+        params = bp.make_params(1, 0.0, 0.0, 1.0, **options)
+        assert bp.step(params, bp.init(params, y), y + 3, y, DT)[1] == 0
+    kick = bp.make_params(1, 0.0, 0.0, 1.0, setpoint_weight_derivative=1.0, first_derivative="kick")
+    assert bp.step(kick, bp.init(kick, y), y + 3, y, DT)[1] == pytest.approx(3 / DT)
+
+
+@given(cases, runs, npst.arrays(bool, ENVS), st.booleans())
+def test_reset_starts_the_chosen_envs_anew_and_no_other(case, run, mask, keep):
+    params = bp.make_params(JOINTS, **OPTIONS[case])
+    state = roll(params, *run)[0][-1]
+    fresh = bp.init(params, run[1][0])
+    after = bp.reset(params, state, run[1][0], mask, keep_integral=keep)
+    for name, old, new, start in zip(state._fields, state, after, fresh, strict=True):
+        if old is not None:
+            chosen = old if keep and name == "integral" else start
+            assert np.array_equal(new[mask], chosen[mask])
+            assert np.array_equal(new[~mask], old[~mask])
+
+
+@given(cases, runs)
+def test_nothing_given_is_written_to_or_kept(case, run):
+    """Read-only arrays will do, and a caller may reuse its buffers."""
+    params = bp.make_params(JOINTS, **OPTIONS[case])
+    r, y, ff = (x.copy() for x in run)
+    expected = roll(params, r, y, ff)[1][-1]
+    state, buffers = bp.init(params, y[0]), [np.empty((ENVS, JOINTS)) for _ in range(3)]
+    for t in range(len(r)):
+        for buffer, source in zip(buffers, (r, y, ff), strict=True):
+            buffer.setflags(write=True)
+            buffer[...] = source[t]
+            buffer.setflags(write=False)
+        for leaf in state:
+            if leaf is not None:
+                leaf.setflags(write=False)
+        state, effort, terms = bp.step(
+            params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], aux=True
+        )
+        kept = effort.copy()
+        effort += 1e6  # the caller's own, from here on
+    assert np.array_equal(kept, expected.effort)
+    assert np.array_equal(terms.unsaturated, expected.unsaturated)
+
+
+@pytest.mark.parametrize("dt", [0, 0.0, -1e-3, math.nan, math.inf])
+def test_a_time_step_that_is_none_is_refused(dt):
+    params = bp.make_params(1, 1.0)
+    y = np.zeros((1, 1))
+    with pytest.raises(bp.InvalidArgumentError, match="dt: is not positive"):
+        bp.step(params, bp.init(params, y), y, y, dt)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_decayed_filters_never_hold_denormal_numbers(dtype):
+    params = bp.make_params(
+        1,
+        0.0,
+        1.0,
+        1.0,
+        derivative_filter_time=0.02,
+        effort_limit=0.0,
+        anti_windup="back_calculation",
+        tracking_time=0.02,
+        dtype=dtype,
+    )
+    zero, one = np.zeros((1, 1), dtype), np.ones((1, 1), dtype)
+    state, _ = bp.step(params, bp.init(params, zero), zero, one, DT)
+    tiny = np.finfo(dtype).tiny
+    for _ in range(10_000):
+        state, _ = bp.step(params, state, one, one, DT)
+        for leaf in (state.derivative, state.integral):
+            assert leaf == 0 or abs(leaf) >= tiny
+    assert abs(state.derivative) < np.sqrt(tiny)

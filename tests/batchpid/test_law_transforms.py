@@ -1,0 +1,146 @@
+"""The law under every JAX transform, over every option."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DT, ENVS, JOINTS
+
+import batchpid as bp
+
+GAINS = ("kp", "ki", "kd")
+
+
+@pytest.fixture(params=[np.float32, np.float64], ids=["f32", "f64"])
+def dtype(request):
+    if request.param == np.float64:
+        request.getfixturevalue("x64")
+    return request.param
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+def on_jax(tree, dtype):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+
+
+def rollout(params, setpoint, measurement):
+    """Return all efforts of a scan over time."""
+
+    def body(state, inputs):
+        return bp.step(params, state, *inputs, DT)
+
+    return jax.lax.scan(body, bp.init(params, measurement[0]), (setpoint, measurement))[1]
+
+
+def test_every_transform(options, inputs, dtype):
+    params = on_jax(bp.make_params(JOINTS, **options, dtype=dtype), dtype)
+    r, y = (jnp.asarray(x, dtype) for x in (inputs.setpoint, inputs.measurement))
+    tolerance = {"rtol": 1e-12, "atol": 1e-11} if dtype == np.float64 else {"rtol": 1e-4, "atol": 3e-4}
+
+    # jit, without recompilation
+    traces = []
+
+    @jax.jit
+    def step(params, state, r, y):
+        traces.append(None)
+        return bp.step(params, state, r, y, DT)
+
+    state, efforts = bp.init(params, y[0]), []
+    structure = jax.tree.structure(state)
+    for t in range(len(r)):
+        changed = params._replace(kp=params.kp * (1 + t)) if t == 29 else params
+        state, effort = step(changed, state, r[t], y[t])
+        efforts.append(effort)
+    assert len(traces) == 1
+    assert jax.tree.structure(state) == structure
+    assert all(
+        leaf.shape == (ENVS, JOINTS) and leaf.dtype == dtype for leaf in (*jax.tree.leaves(state), effort)
+    )
+
+    # scan
+    scanned = jax.jit(rollout)(params, r, y)
+    np.testing.assert_allclose(scanned[:29], jnp.stack(efforts)[:29], **tolerance)
+
+    # vmap over the gains
+    candidates = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, leaf]), params)
+    many = jax.vmap(rollout, (0, None, None))(candidates, r, y)
+    np.testing.assert_allclose(many[0], scanned, **tolerance)
+    np.testing.assert_allclose(many[2], scanned, **tolerance)
+    assert not np.allclose(many[1], scanned)
+
+    # pytree round trip
+    leaves, tree = jax.tree.flatten(params)
+    again = jax.tree.unflatten(tree, leaves)
+    assert type(again) is bp.PIDParams
+    assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
+
+    # grad with respect to every leaf is finite; that of the gains is tested below
+    gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_gradients_equal_finite_differences(options, inputs, x64):
+    """Away from saturation: the made-up run is scaled down, so that no limit but the rate's is near."""
+    options.pop("effort_rate_limit", None)
+    params = on_jax(bp.make_params(JOINTS, **options), np.float64)
+    if params.effort_min is not None:
+        params = params._replace(effort_min=100 * params.effort_min, effort_max=100 * params.effort_max)
+    if params.deadband is not None:
+        params = params._replace(deadband=1e-3 * params.deadband)
+    r, y = (jnp.asarray(x) * 1e-3 for x in (inputs.setpoint, inputs.measurement))
+    weights = jnp.asarray(inputs.feedforward)
+    gains = {name: getattr(params, name) for name in GAINS if getattr(params, name) is not None}
+
+    def loss(gains):
+        return jnp.sum(weights * rollout(params._replace(**gains), r, y))
+
+    gradient, h = jax.jit(jax.grad(loss))(gains), 1e-4
+    shifts = {
+        name: jax.random.normal(jax.random.key(n), value.shape)
+        for n, (name, value) in enumerate(gains.items())
+    }
+    loss = jax.jit(loss)
+    for name, value in gains.items():
+        up, down = (loss(gains | {name: value + s * h * shifts[name]}) for s in (1, -1))
+        slope = jnp.sum(gradient[name] * shifts[name])
+        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-6, atol=1e-9)
+        assert slope != 0
+
+
+@pytest.mark.parametrize("zero", ["derivative_filter_time", "tracking_time"])
+def test_gradients_survive_times_of_zero(zero, inputs, x64):
+    times = {"derivative_filter_time": [0.0, 0.0, 0.1], "tracking_time": [0.0, 0.0, 0.1]}
+    strategy = {"anti_windup": "back_calculation"} if zero == "tracking_time" else {}
+    params = on_jax(
+        bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy), np.float64
+    )
+    r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
+    gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_gradients_survive_non_finite_inputs(inputs, x64):
+    params = on_jax(bp.make_params(JOINTS, 40.0, 5.0, 2.0, non_finite="zero"), np.float64)
+    r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement).at[3, 0, 0].set(jnp.nan)
+    gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_numpy_params_may_meet_traced_arrays_anywhere(inputs, x64):
+    """Each of params, state and inputs may be NumPy while another is traced."""
+    params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="back_calculation")
+    r, y = inputs.setpoint[0], inputs.measurement[0]
+    state = bp.init(params, y)
+    expected = bp.step(params, state, r, y + 0.1, DT)[1]
+    for traced in range(4):
+        arguments = [params, state, r, y + 0.1]
+
+        def step(argument, traced=traced, arguments=arguments):
+            return bp.step(*arguments[:traced], argument, *arguments[traced + 1 :], DT)[1]
+
+        np.testing.assert_allclose(jax.jit(step)(arguments[traced]), expected, rtol=1e-12)

@@ -1,0 +1,206 @@
+"""The peers' numerics, step for step: the real simple-pid, and the others from their documented equations."""
+
+import math
+
+import numpy as np
+import pytest
+import simple_pid
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid import presets
+from batchpid.oracle import SimplePID
+
+DT = 0.01
+series = st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25)
+gain = st.floats(0, 50)
+
+
+def run(params, path, start=None, **inputs):
+    """Return the efforts of one joint along [(setpoint, measurement), ...]."""
+    r, y = np.array(path).T[:, :, None, None]
+    state, efforts = bp.init(params, y[0] if start is None else np.full((1, 1), start)), []
+    for t in range(len(path)):
+        now = {name: np.full((1, 1), values[t]) for name, values in inputs.items()}
+        state, effort = bp.step(params, state, r[t], y[t], DT, **now)
+        efforts.append(effort.item())
+    return efforts
+
+
+def close(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-8)
+
+
+@given(series, gain, gain, gain)
+def test_tutorial(path, kp, ki, kd):
+    pid = SimplePID(kp, ki, kd)
+    close(run(presets.tutorial(1, kp, ki, kd), path), [pid.compute(r - y, DT) for r, y in path])
+
+
+@given(
+    series,
+    gain,
+    gain,
+    gain,
+    st.sampled_from([(None, None), (-5.0, 5.0), (1.0, 20.0), (None, 3.0)]),
+    st.booleans(),
+    st.booleans(),
+)
+@settings(max_examples=300)
+def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_measurement):
+    options = {
+        "output_limits": limits,
+        "proportional_on_measurement": on_measurement,
+        "differential_on_measurement": differential_on_measurement,
+    }
+    peer = simple_pid.PID(kp, ki, kd, sample_time=None, **options)
+    expected = []
+    for r, y in path:
+        peer.setpoint = r
+        expected.append(peer(y, dt=DT))
+    close(run(presets.simple_pid(1, kp, ki, kd, **options), path), expected)
+
+
+def test_simple_pid_goes_from_manual_to_automatic_as_ours():
+    """Its way, an integral of the last output, is a state of ours; track is the bumpless one."""
+    peer = simple_pid.PID(
+        2.0, 1.0, 0.0, setpoint=1.0, sample_time=None, output_limits=(-3, 3), auto_mode=False
+    )
+    peer.set_auto_mode(True, last_output=2.5)
+    params = presets.simple_pid(1, 2.0, 1.0, 0.0, output_limits=(-3, 3))
+    y = np.full((1, 1), 0.2)
+    state = bp.init(params, y)._replace(integral=np.full((1, 1), 2.5))
+    assert bp.step(params, state, y * 0 + 1, y, DT)[1].item() == pytest.approx(peer(0.2, dt=DT))
+    tracked = bp.track(params, state, y * 0 + 1, y, np.full((1, 1), 2.5), dt=DT)
+    assert bp.step(params, tracked, y * 0 + 1, y, DT)[1].item() == pytest.approx(2.5, abs=1e-9)
+
+
+def test_simple_pid_spikes_where_an_angle_wraps_and_ours_does_not():
+    def shortest(error):
+        return math.remainder(error, 2 * math.pi)
+
+    path = [(3.0, 3.1), (3.0, -3.1)]
+    peer = simple_pid.PID(0, 0, 1.0, sample_time=None, error_map=shortest)
+    peer.setpoint = 3.0
+    peer(3.1, dt=DT)
+    assert peer(-3.1, dt=DT) > 600
+    params = bp.make_params(1, 0.0, 0.0, 1.0, continuous=True)
+    assert run(params, path)[1] == pytest.approx(-(2 * math.pi - 6.2) / DT)
+
+
+class ControlToolbox:
+    """control_toolbox's pid.cpp as documented: output, clamp, then integrate; the last error starts at 0."""
+
+    def __init__(self, p, i, d, u_max, u_min, i_max, i_min, antiwindup, tracking_time):
+        self.p, self.i, self.d = p, i, d
+        self.u_max, self.u_min, self.i_max, self.i_min = u_max, u_min, i_max, i_min
+        self.antiwindup, self.last_error, self.integral = antiwindup, 0.0, min(max(0.0, i_min), i_max)
+        if tracking_time == 0:
+            tracking_time = math.sqrt(d / i) if d != 0 else p / i
+        self.tracking_time = tracking_time
+
+    def compute(self, error, dt):
+        unsaturated = self.p * error + self.integral + self.d * (error - self.last_error) / dt
+        command = min(max(unsaturated, self.u_min), self.u_max)
+        if self.antiwindup == "back_calculation":
+            self.integral += dt * (self.i * error + (command - unsaturated) / self.tracking_time)
+        elif not (
+            self.antiwindup == "conditional_integration"
+            and command != unsaturated
+            and error * unsaturated > 0
+        ):
+            self.integral += dt * self.i * error
+        self.integral = min(max(self.integral, self.i_min), self.i_max)
+        self.last_error = error
+        return command
+
+
+@given(
+    series,
+    gain,
+    st.floats(0.01, 50),
+    gain,
+    st.sampled_from(["none", "back_calculation", "conditional_integration"]),
+    st.sampled_from([0, 0.05, 1.0]),
+    st.sampled_from([math.inf, 1.0]),
+)
+def test_control_toolbox(path, p, i, d, antiwindup, tracking_time, i_max):
+    if antiwindup == "back_calculation" and tracking_time == 0 and (math.sqrt(d / i) if d else p / i) < DT:
+        return  # there the peer oscillates, or divides by 0: not reproduced
+    peer = ControlToolbox(p, i, d, 8.0, -5.0, i_max, -i_max, antiwindup, tracking_time)
+    back = {"tracking_time": tracking_time or None} if antiwindup == "back_calculation" else {}
+    params = presets.control_toolbox(
+        1, p, i, d, u_max=8.0, u_min=-5.0, i_max=i_max, i_min=-i_max, antiwindup=antiwindup, **back
+    )
+    close(run(params, path), [peer.compute(r - y, DT) for r, y in path])
+
+
+@given(series, gain, gain, gain, st.sampled_from([math.inf, 0.05]), st.sampled_from([None, 6.0]))
+def test_newton(path, kp, ki, kd, integral_max, limit):
+    rng = np.random.default_rng(1)
+    v, v_d, ff = rng.normal(size=(3, len(path)))
+    integral, expected = 0.0, []
+    for t, (r, y) in enumerate(path):
+        integral = min(max(integral + (r - y) * DT, -integral_max), integral_max)
+        effort = ff[t] + kp * (r - y) + ki * integral + kd * (v_d[t] - v[t])
+        expected.append(effort if limit is None else min(max(effort, -limit), limit))
+    params = presets.newton(1, kp, ki, kd, integral_max=integral_max, effort_limit=limit)
+    close(run(params, path, measurement_rate=v, setpoint_rate=v_d, feedforward=ff), expected)
+
+
+# What control_toolbox's changelog lists as regressions, each as a promise of ours.
+
+
+def test_the_integral_does_not_wind_up_behind_its_clamp():
+    """Clamped is the state itself, so that it comes back at once (control_toolbox #34)."""
+    params = bp.make_params(1, 0.0, 10.0, integral_limit=1.0)
+    efforts = run(params, [(1.0, 0.0)] * 500 + [(-1.0, 0.0)] * 21)
+    assert efforts[499] == 1.0
+    assert efforts[-1] == pytest.approx(-1.0)
+
+
+def test_the_tracking_time_is_what_was_given_and_its_default_the_rule():
+    """(control_toolbox #511)"""
+    given = bp.make_params(
+        1, 4.0, 1.0, 9.0, effort_limit=1, anti_windup="back_calculation", tracking_time=0.7
+    )
+    ruled = given.replace(anti_windup="back_calculation")
+    without_d = bp.make_params(1, 4.0, 2.0, effort_limit=1, anti_windup="back_calculation")
+    assert [p.tracking_time.item() for p in (given, ruled, without_d)] == pytest.approx([0.7, 3.0, 2.0])
+
+
+def test_integral_gain_alone_with_back_calculation_is_finite():
+    params = bp.make_params(1, 0.0, 5.0, effort_limit=1.0, anti_windup="back_calculation")
+    efforts = run(params, [(1.0, 0.0)] * 100 + [(-1.0, 0.0)] * 2)
+    assert efforts[99] == 1.0
+    assert efforts[-1] == pytest.approx(1.0 - 5.0 * DT), "it leaves saturation in the step after"
+
+
+def test_garbage_leaves_the_state_alone():
+    """A time step of 0 raises, a NaN is stepped over, and neither comes back later (control_toolbox #326)."""
+    params = bp.make_params(1, 1.0, 2.0, 0.5, effort_limit=9.0, non_finite="hold")
+    y = np.zeros((1, 1))
+    state, _ = bp.step(params, bp.init(params, y), y + 1, y, DT)
+    with pytest.raises(bp.InvalidArgumentError):
+        bp.step(params, state, y + 1, y, 0.0)
+    after, _ = bp.step(params, state, y * math.nan, y, DT)
+    assert all(a is b is None or np.array_equal(a, b) for a, b in zip(state, after, strict=True))
+
+
+@pytest.mark.parametrize("name", ["kp", "ki", "kd"])
+def test_negative_gains_are_refused(name):
+    with pytest.raises(bp.InvalidArgumentError, match=f"{name}.*-0.1"):
+        bp.make_params(2, **{"kp": 1.0, name: [1.0, -0.1]})
+
+
+def test_wrong_limits_are_refused_before_anything_changes():
+    """(control_toolbox #554)"""
+    pid = bp.BatchPID(bp.make_params(1, 1.0, 1.0, effort_limit=2.0), 1, DT)
+    pid(1.0, np.zeros((1, 1)))
+    before = pid.params, pid.state
+    with pytest.raises(bp.InvalidArgumentError, match="effort_min"):
+        pid.params = pid.params.replace(effort_min=3.0)
+    with pytest.raises(bp.InvalidArgumentError, match=r"params\.kp"):
+        pid.params = pid.params._replace(kp=np.array([[np.nan]]))
+    assert (pid.params, pid.state) == before

@@ -1,0 +1,163 @@
+"""Params survive a file exactly, and a file from a stranger is at worst refused."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import JOINTS, OPTIONS
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+import batchpid as bp
+
+NAMES = ["shoulder", "elbow", "no"]  # "no" is a bool to careless YAML
+
+
+def same(a, b):
+    return all(
+        (x is y is None)
+        or (
+            type(x) is type(y)
+            and (not isinstance(x, np.ndarray) or (x.dtype == y.dtype and np.array_equal(x, y)))
+        )
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".json"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_every_option_survives(options, dtype, suffix, tmp_path):
+    params = bp.make_params(JOINTS, **options, dtype=dtype)
+    path = tmp_path / f"params{suffix}"
+    bp.save_params(path, params, NAMES)
+    loaded, names = bp.load_params(path)
+    assert names == NAMES
+    assert same(loaded, params)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@given(npst.arrays(float, (2, JOINTS), elements=st.floats(0, 1e300)), st.sampled_from([".yaml", ".json"]))
+def test_numbers_survive_exactly(tmp_path_factory, gains, suffix):
+    path = tmp_path_factory.mktemp("params") / f"params{suffix}"
+    params = bp.make_params(JOINTS, gains)
+    bp.save_params(path, params, NAMES)
+    assert same(bp.load_params(path)[0], params)
+
+
+def test_joints_are_matched_by_name(tmp_path):
+    path = tmp_path / "params.yaml"
+    bp.save_params(path, bp.make_params(JOINTS, [1.0, 2.0, 3.0], ki=[[1, 2, 3], [4, 5, 6]]), NAMES)
+    params, names = bp.load_params(path, NAMES[::-1])
+    assert names == NAMES[::-1]
+    assert params.kp.tolist() == [[3.0, 2.0, 1.0]]
+    assert params.ki.tolist() == [[3, 2, 1], [6, 5, 4]]
+    with pytest.raises(bp.InvalidArgumentError, match=r"missing \['wrist'\], unknown \['no'\]"):
+        bp.load_params(path, ["shoulder", "elbow", "wrist"])
+
+
+def test_a_file_written_by_hand(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text(
+        """
+format: batchpid-params-1
+joints:
+  a: {kp: 4, effort_max: 3}
+  b: {kp: [1, 2.5], ki: 1.0e-3, anti_windup: conditional, continuous: true}
+"""
+    )
+    params, names = bp.load_params(path)
+    assert names == ["a", "b"]
+    assert params.kp.tolist() == [[4, 1], [4, 2.5]]
+    assert params.ki.tolist() == [[0, 1e-3]]
+    assert params.effort_max.tolist() == [[3, np.inf]]
+    assert params.conditional.tolist() == params.continuous.tolist() == [[0, 1]]
+    assert params.effort_min is None
+
+
+GOOD = {"format": "batchpid-params-1", "joints": {"elbow": {"kp": 1.0, "kd": 2.0}}}
+JOINT = '{"format": "batchpid-params-1", "joints": {"elbow": {%s}}}'
+BAD = {
+    "nothing": ("", "cannot be read|holds no params"),
+    "no format": ('{"joints": {}}', "holds no params.*format: batchpid-params-1"),
+    "list": ("[1, 2]", "holds no params"),
+    "cut off": ('{"format": "batchpid', "cannot be read"),
+    "unknown key": ('{"format": "batchpid-params-1", "joint": {}}', "joint: is no known key.*joints"),
+    "no joints": ('{"format": "batchpid-params-1", "joints": {}}', "no mapping"),
+    "no kp": (JOINT % '"kd": 1.0', "'elbow'.*no kp"),
+    "unknown option": (
+        JOINT % '"kp": 1.0, "kq": 2.0',
+        "kq, joint 'elbow': is no known option.*choose from kp, ki",
+    ),
+    "negative": (JOINT % '"kp": -1.0', "kp, joint 'elbow'.*-1.0"),
+    "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
+    "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is no float"),
+    "bool": (JOINT % '"kp": true', "no float"),
+    "null": (JOINT % '"kp": null', "no float"),
+    "nested": (JOINT % '"kp": [[1.0]]', "no float"),
+    "empty": (JOINT % '"kp": []', "no float"),
+    "strategy": (
+        JOINT % '"kp": 1.0, "anti_windup": "magic"',
+        "anti_windup, joint 'elbow'.*magic.*back_calculation",
+    ),
+    "integration": (
+        '{"format": "batchpid-params-1", "integration": [], "joints": {"elbow": {"kp": 1.0}}}',
+        "integration.*choose from",
+    ),
+    "dtype": (
+        '{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}',
+        "dtype",
+    ),
+    "twice": (JOINT % '"kp": 1.0, "kp": 2.0', "given twice"),
+    "deep": ("[" * 100_000, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+@pytest.mark.parametrize(("text", "said"), BAD.values(), ids=BAD)
+def test_bad_files_are_refused_by_file_joint_and_key(text, said, suffix, tmp_path):
+    path = tmp_path / f"params{suffix}"
+    path.write_text(text)
+    with pytest.raises(bp.InvalidArgumentError, match=said) as caught:
+        bp.load_params(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "!!python/object/apply:os.mkdir [{marker}]",
+        "format: batchpid-params-1\njoints: {{a: {{kp: !!python/object/apply:os.mkdir [{marker}]}}}}",
+        "a: &a [1]\nb: *a",
+    ],
+)
+def test_yaml_executes_nothing_and_expands_nothing(text, tmp_path):
+    path, marker = tmp_path / "params.yaml", tmp_path / "marker"
+    path.write_text(text.format(marker=marker))
+    with pytest.raises(bp.InvalidArgumentError, match="cannot be read"):
+        bp.load_params(path)
+    assert not marker.exists()
+
+
+def test_what_cannot_be_saved_changes_no_file(tmp_path):
+    path = tmp_path / "params.json"
+    path.write_text("precious")
+    params = bp.make_params(JOINTS, 1.0)
+    for names in (NAMES[:2], ["a", "a", "b"]):
+        with pytest.raises(bp.InvalidArgumentError, match="joint_names"):
+            bp.save_params(path, params, names)
+    with pytest.raises(bp.InvalidArgumentError, match=r"\.yaml"):
+        bp.save_params(tmp_path / "params.toml", params, NAMES)
+    assert path.read_text() == "precious"
+    with pytest.raises(FileNotFoundError):
+        bp.load_params(tmp_path / "none.yaml")
+
+
+def test_json_is_json(tmp_path):
+    path = tmp_path / "params.json"
+    bp.save_params(path, bp.make_params(JOINTS, **OPTIONS["one limit"], dtype=np.float32), NAMES)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    assert json.loads(path.read_text(), parse_constant=refuse)["joints"]["elbow"]["kp"] == 20.0
