@@ -271,7 +271,7 @@ def jerk_limited(
     arrived = time[:, None, None] >= np.array([plan.duration for plan in plans])[:, None]
     position, velocity, acceleration = (
         np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
-        for k, rest in enumerate((last, 0.0, 0.0))
+        for k, rest in enumerate((last, np.zeros(()), np.zeros(())))
     )
     return Trajectory(time, position, velocity, acceleration)
 
@@ -308,7 +308,7 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
 def _ticks(dt: float, total: Float64) -> Float64:
     """Return the times of the ticks' ends up to the longest of the durations ``total``, at least one."""
     _positive("dt", dt, ())
-    return dt * np.arange(1, _count(float(total.max()), dt) + 1)
+    return float(dt) * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
 
 
 def _count(duration: float, dt: float) -> int:

@@ -1,0 +1,189 @@
+"""The Gymnasium environments: Gymnasium's own checks, and the vector env against one env at a time."""
+
+import gc
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+
+from batchpid.errors import InvalidArgumentError  # noqa: E402
+from sim import Runner  # noqa: E402
+from sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
+
+ID = "sim.gym:batchpid/Reach-v0"
+
+
+def test_gymnasiums_own_checks_pass():
+    env = gymnasium.make(ID)
+    check_env(env.unwrapped, skip_render_check=True)
+    env = gymnasium.make(ID, robot="jaco2", actions="increment")
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("actions", ["setpoint", "increment"])
+def test_the_vector_env_is_gymnasiums_own_vector_of_single_envs(mode, actions):
+    """Same observations, rewards, flags and infos, through time limits, success and resets, to the last bit."""
+    options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6}
+    ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=7, **options)
+    theirs = SyncVectorEnv(
+        [lambda: gymnasium.make(ID, max_episode_steps=7, **options)] * 3, autoreset_mode=mode
+    )
+    assert ours.unwrapped.spec.id == "batchpid/Reach-v0"
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert same(ours.reset(seed=5), theirs.reset(seed=5))
+    ours.action_space.seed(1)
+    ends = np.zeros(3, int)
+    for _ in range(24):
+        action = ours.action_space.sample()
+        step = ours.step(action)
+        assert same(step, theirs.step(action))
+        assert ours.observation_space.contains(step[0])
+        done = step[2] | step[3]
+        ends += done
+        if mode is AutoresetMode.DISABLED and done.any():
+            assert same(
+                ours.reset(options={"reset_mask": done.copy()}),
+                theirs.reset(options={"reset_mask": done.copy()}),
+            )
+    assert (ends >= 2).all()
+    assert step[0].flags.owndata
+    ours.close()
+    theirs.close()
+
+
+def same(ours, theirs):
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(entry) for key, entry in sorted(value.items())}
+        return (
+            [None if row is None else list(row) for row in value]
+            if getattr(value, "dtype", None) == np.dtype(object)
+            else value
+        )
+
+    assert set(ours[-1]) == set(theirs[-1])
+    return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(
+        plain(theirs[-1])
+    )
+
+
+def test_workers_change_nothing_and_seeds_everything():
+    def run(workers, seed):
+        with_workers = ReachVectorEnv(5, workers=workers, actions="increment")
+        first, _ = with_workers.reset(seed=seed)
+        action = np.full((5, 9), 0.5, np.float32)
+        last = [with_workers.step(action)[0] for _ in range(3)][-1]
+        with_workers.close()
+        return first, last
+
+    np.testing.assert_array_equal(run(0, 3), run(2, 3))
+    first, _ = run(0, 3)
+    other, _ = run(0, 4)
+    np.testing.assert_array_equal(first[1:], other[:-1])  # env k has seed + k
+    assert (first[0] != other[0]).any()
+
+
+def test_a_setpoint_at_the_goal_earns_more_and_reaches_it():
+    gains = {"kp": 600.0, "kd": 50.0, "ki": 0.0, "derivative_filter_time": 2e-3}
+    probe = ReachVectorEnv(1, workers=0)
+    env = ReachVectorEnv(
+        4, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None
+    )
+    obs, _ = env.reset(seed=0)
+    goal = obs[:, 18:]
+    action = 2 * (goal - env.low) / (env.high - env.low) - 1
+    rewards = []
+    for _ in range(150):
+        obs, reward, terminated, _, info = env.step(action)
+        rewards.append(reward)
+        assert not terminated.any()
+    assert (rewards[-1] > rewards[0]).all()
+    assert info["success"].all()
+    np.testing.assert_allclose(info["error"], np.abs(obs[:, :9] - goal).max(1), atol=1e-6)
+    probe.close()
+    env.close()
+
+
+def test_divergence_terminates_and_nothing_that_is_not_finite_comes_out():
+    env = ReachVectorEnv(2, workers=0, actions="increment")
+    env.reset(seed=0)
+    action = np.zeros((2, 9), np.float32)
+    env.step(action)
+    loop = env.runner._workers[0]._loop
+    loop.arrays.ok[0] = False
+    tick = env.runner.step
+    env.runner.step = lambda setpoint: broken(tick(setpoint))
+    obs, reward, terminated, _, info = env.step(action)
+    assert terminated.tolist() == [True, False]
+    assert info["diverged"].tolist() == [True, False]
+    assert np.isfinite(obs).all()
+    assert np.isfinite(reward).all()
+    env.runner.step = tick
+    obs, _, terminated, _, info = env.step(action)
+    assert not terminated.any()
+    assert not info["diverged"].any()
+    env.close()
+
+
+def broken(obs):
+    ok, qpos = obs.ok.copy(), obs.qpos.copy()
+    ok[0], qpos[0] = False, np.nan
+    return obs._replace(ok=ok, qpos=qpos)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InvalidArgumentError, match="actions"):
+        ReachVectorEnv(1, actions="torque")
+    with pytest.raises(InvalidArgumentError, match="render_mode"):
+        ReachVectorEnv(1, render_mode="human")
+    env = ReachVectorEnv(2, workers=0, autoreset_mode="Disabled", max_episode_steps=1)
+    with pytest.raises(InvalidArgumentError, match="seed"):
+        env.reset(seed=[1])
+    with pytest.raises(InvalidArgumentError, match="reset_mask"):
+        env.reset(options={"reset_mask": np.zeros(2, bool)})
+    env.reset(seed=[1, None])
+    with pytest.raises(InvalidArgumentError, match="actions"):
+        env.step(np.full((2, 9), np.nan))
+    env.step(np.zeros((2, 9)))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((2, 9)))
+    env.close()
+
+
+def test_gymnasiums_vector_wrappers_go_on_top():
+    from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+    env = RecordEpisodeStatistics(
+        NormalizeObservation(gymnasium.make_vec(ID, num_envs=2, max_episode_steps=3))
+    )
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step(env.action_space.sample())
+    assert info["episode"]["l"].tolist() == [3, 3]
+    env.close()
+
+
+def test_dlpack_hands_observations_over_without_a_copy():
+    jax = pytest.importorskip("jax")
+    env = ReachVectorEnv(2, workers=0)
+    obs, _ = env.reset(seed=0)
+    theirs = jax.dlpack.from_dlpack(obs)
+    np.testing.assert_array_equal(np.asarray(theirs), obs)
+    assert np.from_dlpack(obs).__array_interface__["data"] == obs.__array_interface__["data"]
+    env.close()
+
+
+def test_a_single_env_is_closed_with_its_scene():
+    env = ReachEnv()
+    runner = env._envs.runner
+    assert isinstance(runner, Runner)
+    env.close()
+    gc.collect()
+    assert runner._closed
