@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_overview())
         return 0 if arguments else 2
     if name == "--version":
-        print(importlib.metadata.version("batchpid"))
+        print(_version())
         return 0
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
@@ -71,13 +71,21 @@ def _run(name: str, arguments: list[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 128 + signal.SIGPIPE
         except OSError as error:
-            return _complain(str(error))
+            where = f"{error.filename}: " if error.filename else ""
+            return _complain(f"{where}{error.strerror or error}")
     return status or 0
 
 
 def _load(name: str) -> Any:
     module, _, attribute = COMMANDS[name][0].partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("batchpid")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed: running from its source tree"
 
 
 def _overview() -> str:

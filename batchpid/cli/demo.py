@@ -39,7 +39,7 @@ class Demo:
         """Run it."""
         from batchpid import plots
         from batchpid.cli import report
-        from batchpid.cli.follow import follow, start_poses
+        from batchpid.cli.follow import duration, follow, start_poses
         from batchpid.errors import InvalidArgumentError
         from sim import Robot, Runner
 
@@ -53,6 +53,7 @@ class Demo:
                 value=self.robot,
                 remedy=f"use one of {', '.join(Robot.bundled())}, or batchpid rollout --robot {self.robot}",
             )
+        seconds = duration(self.seconds)
         start = start_poses(robot, self.num_envs, SPREAD, self.seed)
         with Runner(
             robot, self.num_envs, workers=self.workers, timestep=1 / settings.rate_hz, substeps=SUBSTEPS
@@ -61,10 +62,10 @@ class Demo:
                 f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
                 f"PID and passive force at {settings.rate_hz:g} Hz, the tutorial's gains"
             )
-            run = follow(runner, settings.target, start, self.seconds, "simulating")
+            run = follow(runner, settings.target, start, seconds, "simulating")
         metrics = report.judge(robot, run.rollout, run.start)
-        print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall), "\n")
-        print(report.joint_table(robot, metrics), "\n")
+        print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall) + "\n")
+        print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):
             print(verdict)
         for note in settings.notes:

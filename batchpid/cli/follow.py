@@ -38,12 +38,19 @@ def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArra
     return np.clip(poses, robot.lower, robot.upper)
 
 
+def duration(seconds: float) -> float:
+    """``seconds`` if a run can last so long; checked before anything is started."""
+    return number("seconds", seconds, 1e-6, 1e6, "simulated time")
+
+
 def follow(
     runner: Runner, setpoint: NDArray[Any], start: NDArray[np.float64], seconds: float, label: str
 ) -> Followed:
-    """Reset a fresh runner to ``start`` and hold ``setpoint`` (dof,) or (envs, dof) for ``seconds``, under a bar."""
-    tick = runner.timestep * runner.substeps
-    ticks = round(number("seconds", seconds, 2 * tick, 1e6, f"at least 2 ticks of {tick:g} s") / tick)
+    """Reset a fresh runner to ``start`` and hold ``setpoint`` (dof,) or (envs, dof) for ``seconds``, under a bar.
+
+    Runs whole ticks, two at least.
+    """
+    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     shape = (ticks, runner.num_envs, runner.robot.dof)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)  # the report at the end says it

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Inspect:
     """The joints of a robot in the order of qpos, then what is odd about it."""
 
-    robot: tyro.conf.Positional[str]
+    robot: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ROBOT")]
     """A bundled robot, or the path of a URDF."""
     all: bool = False
     """List the fixed joints too."""
@@ -31,7 +31,7 @@ class Inspect:
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
-        print(_joints(robot, self.all), "\n")
+        print(_joints(robot, self.all) + "\n")
         findings = robot.check(setpoint=None if robot.settings is None else robot.settings.target)
         if not findings:
             print("Nothing odd about it.")

@@ -69,7 +69,10 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
         for j, joint in enumerate(robot.joints)
     ]
     headers = ["median / worst env", "final error", "overshoot", "settled after", "settled", "saturated"]
-    return table(rows, headers, "lrrrrr")
+    return table(rows, headers, "lrrrrr") + (
+        "\nfinal error: the largest in the last tenth of the run; settled: within 2 % of the move for good; "
+        "saturated: share of samples"
+    )
 
 
 def verdicts(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:

@@ -58,7 +58,7 @@ class Rollout:
         """Run it."""
         from batchpid import load_params, plots
         from batchpid.cli import report
-        from batchpid.cli.follow import follow, start_poses
+        from batchpid.cli.follow import duration, follow, start_poses
         from sim import Robot, Runner
         from sim.arguments import array
 
@@ -67,6 +67,7 @@ class Rollout:
         if self.picture is not None:
             plots.check_path(self.picture)
         robot = Robot.load(self.robot, dissipation=self.dissipation)
+        seconds = duration(self.seconds)
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         settings = robot.settings
         goal: Any = self.setpoint
@@ -85,10 +86,10 @@ class Rollout:
             compensate=self.compensate,
             physics=self.physics,
         ) as runner:
-            run = follow(runner, setpoint, start, self.seconds, "simulating")
+            run = follow(runner, setpoint, start, seconds, "simulating")
         metrics = report.judge(robot, run.rollout, run.start)
-        print(report.speed(self.num_envs, run.steps, self.timestep, run.wall), "\n")
-        print(report.joint_table(robot, metrics), "\n")
+        print(report.speed(self.num_envs, run.steps, self.timestep, run.wall) + "\n")
+        print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):
             print(verdict)
         if self.out is not None:
