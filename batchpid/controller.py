@@ -250,10 +250,11 @@ class _NumPy:
     def init(self, y: Any) -> PIDState:
         return law.init(self.params, y)
 
-    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-        if self.terms:
-            return law.advance(self.coefficients, state, *inputs, aux=True)
-        return *law.advance(self.coefficients, state, *inputs), None
+    def step(
+        self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
+    ) -> tuple[PIDState, Any, Terms | None]:
+        new, effort, *terms = law.advance(self.coefficients, state, r, y, y_rate, r_rate, ff, self.terms)
+        return new, effort, terms[0] if terms else None
 
     def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
         return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
@@ -273,8 +274,11 @@ class _JAX:
             raise MissingDependencyError("jax", "backend='jax'", "jax") from None
         self.jax = jax
 
-        def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-            new, effort, *shown = law.advance(discretise(params, dt), state, *inputs, aux=terms)
+        def step(
+            params: PIDParams, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
+        ) -> tuple[PIDState, Any, Terms | None]:
+            k = discretise(params, dt)
+            new, effort, *shown = law.advance(k, state, r, y, y_rate, r_rate, ff, terms)
             return new, effort, shown[0] if shown else None
 
         def reset(params: PIDParams, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:

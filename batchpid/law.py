@@ -191,13 +191,24 @@ def advance(
         return new, effort
 
     zero = xp.zeros_like(u)
-    i = zero if k.ki_dt is None else i
-    d = zero if k.kd is None else d
-    shown = [zero + term for term in (p, i, d, zero if ff is None else ff, u)]
-    if finite is None:
-        return new, effort, Terms(*shown, effort, effort != u, xp.isfinite(u))
-    shown = [xp.where(finite, term, 0) for term in shown]
-    return new, effort, Terms(*shown, effort, finite & (effort != u), finite)
+
+    def shown(term: Any) -> Any:  # a copy, over all envs
+        return zero + term if finite is None else xp.where(finite, term, zero)
+
+    return (
+        new,
+        effort,
+        Terms(
+            p=shown(p),
+            i=zero if k.ki_dt is None else shown(i),
+            d=zero if k.kd is None else shown(d),
+            feedforward=zero if ff is None else shown(ff),
+            unsaturated=shown(u),
+            effort=effort,
+            saturated=effort != u if finite is None else finite & (effort != u),
+            finite=xp.isfinite(u) if finite is None else finite,
+        ),
+    )
 
 
 def reset(

@@ -15,15 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.markers import (
-    CHOICES,
-    DerivativeKick,
-    Everywhere,
-    HoldEffort,
-    IntegrateFirst,
-    WeightFromStart,
-    ZeroEffort,
-)
+from batchpid.markers import CHOICES, Everywhere
 from batchpid.options import LeafBuilder
 
 
@@ -64,14 +56,14 @@ class PIDParams(NamedTuple):
     """Conditional integration: Everywhere(), or 1.0 on the joints that have it."""
     continuous: Any = None
     """1.0 on the joints whose position is an angle modulo 2 pi."""
-    integration: IntegrateFirst | None = None
-    """Off: the effort is computed first, with the integral of the past errors."""
-    first_derivative: DerivativeKick | None = None
-    """Off: the derivative of the first sample is 0."""
-    weight_origin: WeightFromStart | None = None
-    """Off: setpoint weighting takes positions as they are."""
-    non_finite: ZeroEffort | HoldEffort | None = None
-    """Off: what is not finite propagates."""
+    integration: Any = None
+    """IntegrateFirst(); off: the effort is computed first, with the integral of the past errors."""
+    first_derivative: Any = None
+    """DerivativeKick(); off: the derivative of the first sample is 0."""
+    weight_origin: Any = None
+    """WeightFromStart(); off: setpoint weighting takes positions as they are."""
+    non_finite: Any = None
+    """ZeroEffort() or HoldEffort(); off: what is not finite propagates."""
 
     @property
     def joints(self) -> int:

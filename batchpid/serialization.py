@@ -196,7 +196,7 @@ def _checked(path: Path, document: Any) -> dict[str, dict[str, Any]]:
 
 
 def _check_entry(path: Path, joint: str, key: str, entry: Any) -> None:
-    wanted: type | tuple[type, ...] = type(OFF[key])
+    wanted: type = type(OFF[key])
     if wanted is float:
         good = (isinstance(entry, float | int) and not isinstance(entry, bool)) or entry in ("inf", "-inf")
     else:
