@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from sim import Runner  # noqa: E402
-from sim.gym import ReachVectorEnv  # noqa: E402
+from sim import Runner
+from sim.gym import ReachVectorEnv
 
 ENVS, TICKS = 64, 12
 
