@@ -60,7 +60,8 @@ class Demo:
         ) as runner:
             print(
                 f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
-                f"PID and passive force at {settings.rate_hz:g} Hz, the tutorial's gains"
+                f"PID and passive force at {settings.rate_hz:g} Hz, the tutorial's gains",
+                flush=True,
             )
             run = follow(runner, settings.target, start, seconds, "simulating")
         metrics = report.judge(robot, run.rollout, run.start)
