@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from batchpid.oracle import SimplePID
 from numpy.typing import NDArray
+
+from batchpid.oracle import SimplePID
 
 from .robot import Robot
 from .scenes import sapien
