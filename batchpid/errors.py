@@ -55,7 +55,9 @@ class MissingDependencyError(BatchPIDError, ImportError):
 
     def __init__(self, package: str, purpose: str, extra: str) -> None:
         self.package, self.purpose, self.extra = package, purpose, extra
-        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'")
+        super().__init__(
+            f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'"
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (self.package, self.purpose, self.extra))
