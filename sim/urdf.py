@@ -115,7 +115,7 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     RobotError
         Malformed XML, an entity or DTD, a structure that SAPIEN cannot build, a missing mesh.
     """
-    root = _parse_xml(path)
+    root = parse_xml(path)
     if root.tag != "robot":
         raise RobotError(
             f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?"
@@ -142,7 +142,8 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     )
 
 
-def _parse_xml(path: Path) -> etree._Element:
+def parse_xml(path: Path) -> etree._Element:
+    """The root element of a description, which may come from a stranger."""
     if not path.is_file():
         raise RobotNotFoundError(f"no URDF file at {path}; check the path")
     # A description may come from a stranger: no entities, no DTD, no network, no oversized trees.
@@ -170,7 +171,7 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
         if mesh is None:
             continue
         name = mesh.get("filename", "")
-        found = _find_mesh(name, path, package_dirs)
+        found = find_mesh(name, path, package_dirs)
         if found is None:
             missing.append(name)
             collision.getparent().remove(collision)
@@ -179,7 +180,8 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
     return missing
 
 
-def _find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
+def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
+    """The mesh file that the URDF at ``path`` calls ``name``, if it exists."""
     relative = name.removeprefix("package://").removeprefix("file://")
     folders = [path.parent, *package_dirs]
     if name.startswith("package://"):

@@ -1,0 +1,44 @@
+"""Rotations as unit quaternions w, x, y, z, batched over any leading axes; the order that SAPIEN and viser use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
+    aw, ax, ay, az = (a[..., k] for k in range(4))
+    bw, bx, by, bz = (b[..., k] for k in range(4))
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def rotate(q: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:
+    """Return vectors v (..., 3) turned by q (..., 4): v + 2 w (u x v) + 2 u x (u x v), with u the vector part."""
+    w, u = q[..., :1], q[..., 1:]
+    t = 2 * np.cross(u, v)
+    return v + w * t + np.cross(u, t)
+
+
+def about(axis: NDArray[Any], angle: NDArray[Any]) -> NDArray[Any]:
+    """Return the rotations (..., 4) by ``angle`` (...) [rad] about a unit ``axis`` (3,)."""
+    half = np.asarray(angle) / 2
+    return np.concatenate([np.cos(half)[..., None], np.sin(half)[..., None] * axis], axis=-1)
+
+
+def from_rpy(rpy: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation of a URDF's ``rpy`` [rad]: about the fixed x, then y, then z."""
+    roll, pitch, yaw = (
+        about(axis, angle) for axis, angle in zip(np.eye(3), np.asarray(rpy, float), strict=True)
+    )
+    return multiply(yaw, multiply(pitch, roll))
