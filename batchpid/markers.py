@@ -33,11 +33,29 @@ class HoldEffort(NamedTuple):
     """Marker: a joint with a non-finite input gets its last effort again."""
 
 
-MARKERS = (Everywhere, IntegrateFirst, DerivativeKick, WeightFromStart, ZeroEffort, HoldEffort)
+class PerInertia(NamedTuple):
+    """Marker: the gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
+
+
+class PerMassMatrix(NamedTuple):
+    """Marker: the gains give accelerations, for the whole mass matrix to turn into efforts."""
+
+
+MARKERS = (
+    Everywhere,
+    IntegrateFirst,
+    DerivativeKick,
+    WeightFromStart,
+    ZeroEffort,
+    HoldEffort,
+    PerInertia,
+    PerMassMatrix,
+)
 CHOICES: dict[str, dict[str, Any]] = {
     "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
     "weight_origin": {"zero": None, "start": WeightFromStart()},
     "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
+    "gain_units": {"effort": None, "inertia": PerInertia(), "mass_matrix": PerMassMatrix()},
 }
 """Options chosen by name, and the marker that each name puts into the params (the first is the default)."""

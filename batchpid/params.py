@@ -64,6 +64,8 @@ class PIDParams(NamedTuple):
     """WeightFromStart(); off: setpoint weighting takes positions as they are."""
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: what is not finite propagates."""
+    gain_units: Any = None
+    """PerInertia() or PerMassMatrix(), for who runs the law on a robot; off: the gains give efforts."""
 
     @property
     def joints(self) -> int:
@@ -171,6 +173,7 @@ def make_params(
     first_derivative: str = "zero",
     weight_origin: str = "zero",
     non_finite: str = "propagate",
+    gain_units: str = "effort",
     joint_names: Sequence[str] | None = None,
     dtype: Any = np.float64,
 ) -> PIDParams:
@@ -216,6 +219,9 @@ def make_params(
     non_finite
         What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or keep the state and
         command "zero" effort, or "hold" the last effort.
+    gain_units
+        "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
+        which :class:`sim.Runner` turns into an effort at the robot's pose (see :mod:`batchpid.inertia`).
     joint_names
         Used in error messages.
     dtype
@@ -263,6 +269,7 @@ def make_params(
             ("first_derivative", first_derivative),
             ("weight_origin", weight_origin),
             ("non_finite", non_finite),
+            ("gain_units", gain_units),
         )
     }
     if conditional is not None:
