@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.inertia import advance_with_mass_matrix, per_inertia
+from batchpid.markers import PerMassMatrix
 
-from .scenes import Pack, SceneSpec, parse
+from .scenes import Pack, SceneSpec, mass_matrix, parse
 
 COMPENSATE = {
     # name: (gravity, Coriolis and centrifugal)
@@ -25,6 +27,8 @@ COMPENSATE = {
     "none": (False, False),
 }
 CONTROLS = ("pid", "drive", "effort")
+INERTIA_EVERY = 5
+"""Sim steps after which a mass matrix counts as old within a tick."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,7 @@ class _Cell:
     def __init__(self, pack: Pack, envs: slice, spec: LoopSpec) -> None:
         self.pack, self.envs = pack, envs
         self._dt = spec.scene.timestep
+        self._scene = replace(spec.scene, build=None)
         self._gravity, self._coriolis = COMPENSATE[spec.compensate]
         self._measurement_rate = spec.measurement_rate
         self._control = spec.control
@@ -142,6 +147,10 @@ class _Cell:
     def set_params(self, params: bp.PIDParams) -> None:
         self._params = params
         self._coefficients = bp.discretise(params, self._dt)
+        if self._control == "pid":
+            self._run = self._run_pid
+            if params.gain_units is not None:
+                self._run, self._mass_matrix = self._run_pid_inertia, mass_matrix(self._scene)
         if self._control == "drive":
             effort_max = np.inf if params.effort_max is None else params.effort_max
             self.pack.write_drive(
@@ -193,6 +202,40 @@ class _Cell:
             state, effort, *aux = bp.advance(
                 coefficients, state, setpoint, qpos, qvel, setpoint_rate, passive, aux=left == 0
             )
+            pack.write_qf(effort)
+            pack.step()
+            qpos = pack.read_qpos()
+        self._saturated = aux[0].saturated
+        self._state, self._qpos = state, qpos
+
+    def _run_pid_inertia(
+        self,
+        substeps: int,
+        setpoint: NDArray[np.float64],
+        setpoint_rate: NDArray[np.float64] | None,
+        feedforward: NDArray[np.float64] | None,
+    ) -> None:
+        """As :meth:`_run_pid`, with gains per unit of inertia; the mass matrix is kept for some substeps."""
+        pack, coefficients, state, qpos = self.pack, self._coefficients, self._state, self._qpos
+        whole = isinstance(self._params.gain_units, PerMassMatrix)
+        aux: list[bp.Terms] = []
+        for done in range(substeps):
+            if done % INERTIA_EVERY == 0:
+                matrix = self._mass_matrix(qpos)
+                k = coefficients if whole else per_inertia(coefficients, np.diagonal(matrix, axis1=1, axis2=2))
+            passive = self._passive()
+            if feedforward is not None:
+                passive = feedforward if passive is None else passive + feedforward
+            qvel = pack.read_qvel() if self._measurement_rate else None
+            last = done == substeps - 1
+            if whole:
+                state, effort, *aux = advance_with_mass_matrix(
+                    k, state, setpoint, qpos, matrix, qvel, setpoint_rate, passive, aux=last
+                )
+            else:
+                state, effort, *aux = bp.advance(
+                    k, state, setpoint, qpos, qvel, setpoint_rate, passive, aux=last
+                )
             pack.write_qf(effort)
             pack.step()
             qpos = pack.read_qpos()

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError, WorkerError
+from batchpid.inertia import check_gain_units
 
 from .arguments import array, choice, flag, integer, number
 from .loop import COMPENSATE, CONTROLS, LoopSpec
@@ -430,6 +431,13 @@ class Runner:
                 value=params,
                 remedy="build them with robot.params() or make_params()",
             )
+        if params.gain_units is not None and self.control != "pid":
+            raise InvalidArgumentError(
+                "gain_units",
+                f"have no meaning under control {self.control!r}",
+                remedy="use control 'pid', or params with gain_units 'effort'",
+            )
+        check_gain_units(params)
         if params.joints != self.robot.dof:
             raise InvalidArgumentError(
                 "params",
