@@ -27,6 +27,8 @@ COMPENSATE = {
     "none": (False, False),
 }
 CONTROLS = ("pid", "drive", "effort")
+IN_STEP = 16
+"""Envs that advance together: enough to share the cost of a call on arrays, few enough to stay in the cache."""
 INERTIA_EVERY = 5
 """Sim steps after which a mass matrix counts as old within a tick."""
 
@@ -41,7 +43,7 @@ class LoopSpec:
     control: str = "pid"
     compensate: str = "gravity+coriolis"
     measurement_rate: bool = False
-    pack_size: int = 8
+    pack_size: int = 4
     first_env: int = 0
 
 
@@ -83,10 +85,17 @@ class Loop:
     def __init__(self, spec: LoopSpec, arrays: Arrays) -> None:
         self.spec, self.arrays = spec, arrays
         builder = parse(spec.scene)
-        starts = range(0, spec.num_envs, spec.pack_size)
-        slices = [slice(start, min(start + spec.pack_size, spec.num_envs)) for start in starts]
+        size = max(IN_STEP // spec.pack_size, 1) * spec.pack_size
+        starts = range(0, spec.num_envs, size)
+        slices = [slice(start, min(start + size, spec.num_envs)) for start in starts]
         self._cells = [
-            _Cell(Pack(builder, spec.scene, envs.stop - envs.start, spec.first_env + envs.start), envs, spec)
+            _Cell(
+                Pack(
+                    builder, spec.scene, envs.stop - envs.start, spec.first_env + envs.start, spec.pack_size
+                ),
+                envs,
+                spec,
+            )
             for envs in slices
         ]
         self.set_params(spec.params)
@@ -146,7 +155,7 @@ class _Cell:
 
     def set_params(self, params: bp.PIDParams) -> None:
         self._params = params
-        self._coefficients = bp.discretise(params, self._dt)
+        self._coefficients = bp.discretise(params, self._dt, self.pack.size)
         if self._control == "pid":
             self._run = self._run_pid
             if params.gain_units is not None:
@@ -222,7 +231,11 @@ class _Cell:
         for done in range(substeps):
             if done % INERTIA_EVERY == 0:
                 matrix = self._mass_matrix(qpos)
-                k = coefficients if whole else per_inertia(coefficients, np.diagonal(matrix, axis1=1, axis2=2))
+                k = (
+                    coefficients
+                    if whole
+                    else per_inertia(coefficients, np.diagonal(matrix, axis1=1, axis2=2))
+                )
             passive = self._passive()
             if feedforward is not None:
                 passive = feedforward if passive is None else passive + feedforward

@@ -122,7 +122,7 @@ class Runner:
         measurement_rate: bool = False,
         ground: bool = True,
         build: Callable[[Any, int], Any] | None = None,
-        pack_size: int = 8,
+        pack_size: int = 4,
         timeout: float = 60.0,
     ) -> None:
         self._workers: list[LocalWorker | ProcessWorker] = []

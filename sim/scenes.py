@@ -1,6 +1,6 @@
 """A pack of scenes in one process, read and written as arrays. The only module that touches SAPIEN.
 
-A pack is M scenes, one robot each, that share one PhysX system. All stand at the origin; the shapes of each scene
+A pack is M scenes, one robot each, in step with each other, some of them to a PhysX system. All stand at the origin; the shapes of each scene
 carry a collision group of their own, so that scenes never meet. Stepping a pack is bit-identical to stepping
 one system per scene, and a fifth to a third cheaper.
 
@@ -56,6 +56,7 @@ class SceneSpec:
     ground: bool = True
     fixed_base: bool = True
     build: Build | None = None
+    gravity: tuple[float, float, float] = GRAVITY
 
 
 def parse(spec: SceneSpec) -> ArticulationBuilder:
@@ -90,7 +91,7 @@ def mass_matrix(spec: SceneSpec) -> Callable[[NDArray[Any]], NDArray[np.float64]
 
     Its base counts as fixed. It is Pinocchio's composite rigid body algorithm, on the model that SAPIEN derives.
     """
-    with _global_config(spec.physics):
+    with _global_config(spec):
         scene = _bare_scene(physx.PhysxCpuSystem())
         robot = _build_robot(parse(spec), scene, spec)
     model, dof = robot.create_pinocchio_model(), robot.dof
@@ -105,18 +106,25 @@ def mass_matrix(spec: SceneSpec) -> Callable[[NDArray[Any]], NDArray[np.float64]
 
 
 class Pack:
-    """M scenes of one robot in one PhysX system. Arrays are (M, dof), in SAPIEN's joint order, SI units."""
+    """M scenes of one robot, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units."""
 
-    def __init__(self, builder: ArticulationBuilder, spec: SceneSpec, size: int, first_env: int = 0) -> None:
-        with _global_config(spec.physics):
+    def __init__(
+        self,
+        builder: ArticulationBuilder,
+        spec: SceneSpec,
+        size: int,
+        first_env: int = 0,
+        system_size: int = 8,
+    ) -> None:
+        with _global_config(spec):
             # PhysX solves the contacts of free bodies in an order that depends on what else its system holds, so
             # scenes with content of their own do not share one: that would cost the last bits.
-            count = 1 if spec.build is None else size
-            self._systems = [physx.PhysxCpuSystem() for _ in range(count)]
+            shared = system_size if spec.build is None else 1
+            self._systems = [physx.PhysxCpuSystem() for _ in range(-(-size // shared))]
             for system in self._systems:
                 system.timestep = spec.timestep
             # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
-            self._scenes = [_bare_scene(self._systems[index % count]) for index in range(size)]
+            self._scenes = [_bare_scene(self._systems[index // shared]) for index in range(size)]
             self._robots = [_build_robot(builder, scene, spec) for scene in self._scenes]
             if spec.ground:
                 for scene in self._scenes:
@@ -138,11 +146,12 @@ class Pack:
         # set_qf from a kept row view costs half of what a fresh one does.
         self._qf = np.zeros((size, self.dof), np.float32)
         self._set_qf = [(robot.set_qf, row) for robot, row in zip(self._robots, self._qf, strict=True)]
-        self.step = self._systems[0].step if len(self._systems) == 1 else self._step_each
+        self._steps = [system.step for system in self._systems]
 
-    def _step_each(self) -> None:
-        for system in self._systems:
-            system.step()
+    def step(self) -> None:
+        """One sim step of every scene."""
+        for step in self._steps:
+            step()
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions [rad or m], a new array."""
@@ -225,7 +234,7 @@ def _bare_scene(system: Any) -> Any:
 
 
 @contextmanager
-def _global_config(physics: Physics) -> Iterator[None]:
+def _global_config(spec: SceneSpec) -> Iterator[None]:
     """SAPIEN's process-wide settings, ours while a pack is built, then the caller's again.
 
     Every setting is given, so that a result depends on nothing that the caller's process did before.
@@ -233,18 +242,18 @@ def _global_config(physics: Physics) -> Iterator[None]:
     scene, body = physx.get_scene_config(), physx.get_body_config()
     shape, material = physx.get_shape_config(), physx.get_default_material()
     physx.set_scene_config(
-        gravity=np.array(GRAVITY, np.float32),
+        gravity=np.array(spec.gravity, np.float32),
         bounce_threshold=2.0,
         enable_pcm=True,
-        enable_tgs=physics.solver == "TGS",
+        enable_tgs=spec.physics.solver == "TGS",
         enable_ccd=False,
         enable_enhanced_determinism=False,
         enable_friction_every_iteration=True,
         cpu_workers=0,
     )
     physx.set_body_config(
-        solver_position_iterations=physics.position_iterations,
-        solver_velocity_iterations=physics.velocity_iterations,
+        solver_position_iterations=spec.physics.position_iterations,
+        solver_velocity_iterations=spec.physics.velocity_iterations,
         sleep_threshold=0.0,
     )
     physx.set_shape_config(contact_offset=0.01, rest_offset=0.0)
