@@ -18,7 +18,7 @@ import batchpid as bp
 from batchpid.inertia import advance_with_mass_matrix, per_inertia
 from batchpid.markers import PerMassMatrix
 
-from .scenes import Pack, SceneSpec, mass_matrix, parse
+from .scenes import Pack, SceneSpec, parse, probe
 
 COMPENSATE = {
     # name: (gravity, Coriolis and centrifugal)
@@ -159,7 +159,7 @@ class _Cell:
         if self._control == "pid":
             self._run = self._run_pid
             if params.gain_units is not None:
-                self._run, self._mass_matrix = self._run_pid_inertia, mass_matrix(self._scene)
+                self._run, self._mass_matrix = self._run_pid_inertia, probe(self._scene).mass_matrix
         if self._control == "drive":
             effort_max = np.inf if params.effort_max is None else params.effort_max
             self.pack.write_drive(

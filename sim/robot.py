@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -18,6 +18,9 @@ from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from .check import Finding, check
 from .physics import DISSIPATION, PHYSICS
 from .urdf import Joint, Link, read_urdf
+
+if TYPE_CHECKING:
+    from .scenes import Probe
 
 Float64 = NDArray[np.float64]
 _ASSETS = Path(assets.__file__).parent
@@ -168,6 +171,11 @@ class Robot:
         return np.array([joint.continuous for joint in self.joints])
 
     @property
+    def damping(self) -> Float64:
+        """Viscous damping of the joints (dof,) [N m s/rad or N s/m]."""
+        return np.array([joint.damping for joint in self.joints])
+
+    @property
     def start(self) -> Float64:
         """Start pose (dof,): the bundled settings', else zero moved inside the joint limits."""
         if self.settings is not None:
@@ -234,19 +242,20 @@ class Robot:
             params = self.params()
         return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
 
+    def sample(self, count: int, seed: int = 0) -> Float64:
+        """``count`` seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""
+        low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
+        return np.random.default_rng(seed).uniform(low, high, (count, self.dof))
+
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof) or (dof,), on a fixed base."""
-        from .scenes import SceneSpec, mass_matrix  # loads SAPIEN
+        return self.probe().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
-        spec = SceneSpec(
-            urdf=self.urdf,
-            srdf=self.srdf,
-            joints=self.joints,
-            timestep=1e-3,
-            physics=PHYSICS["fast"],
-            ground=False,
-        )
-        return mass_matrix(spec)(np.atleast_2d(np.asarray(qpos, np.float64)))
+    def probe(self, ground: bool = True) -> Probe:
+        """Return what answers questions about poses: mass matrix, inverse dynamics, contact. Loads SAPIEN."""
+        from .scenes import SceneSpec, probe
+
+        return probe(SceneSpec(self.urdf, self.srdf, self.joints, 1e-3, PHYSICS["fast"], ground=ground))
 
     def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
         """Entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -85,24 +85,59 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     return builders[0]
 
 
-@lru_cache(maxsize=8)
-def mass_matrix(spec: SceneSpec) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
-    """Return the function qpos (n, dof) -> joint-space mass matrices (n, dof, dof) [kg m^2 or kg] of the robot alone.
+class Probe:
+    """One robot by itself on a fixed base, asked about poses qpos (n, dof); nothing of it moves in time.
 
-    Its base counts as fixed. It is Pinocchio's composite rigid body algorithm, on the model that SAPIEN derives.
+    The dynamics are Pinocchio's, on the model that SAPIEN derives.
     """
-    with _global_config(spec):
-        scene = _bare_scene(physx.PhysxCpuSystem())
-        robot = _build_robot(parse(spec), scene, spec)
-    model, dof = robot.create_pinocchio_model(), robot.dof
 
-    def evaluate(qpos: NDArray[Any]) -> NDArray[np.float64]:
-        matrices = np.empty((len(qpos), dof, dof))
+    def __init__(self, spec: SceneSpec) -> None:
+        with _global_config(spec):
+            self._system = physx.PhysxCpuSystem()
+            self._system.timestep = 1e-6
+            self._scene = _bare_scene(self._system)
+            self._robot = _build_robot(parse(spec), self._scene, spec)
+            if spec.ground:
+                self._scene.add_ground(0.0, render=False)
+        self._dof = self._robot.dof
+        self._model = self._robot.create_pinocchio_model()
+
+    def mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+        """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
+        matrices = np.empty((len(qpos), self._dof, self._dof))
         for matrix, row in zip(matrices, np.asarray(qpos, np.float64), strict=True):
-            matrix[...] = model.compute_generalized_mass_matrix(row)
+            matrix[...] = self._model.compute_generalized_mass_matrix(row)
         return matrices
 
-    return evaluate
+    def inverse_dynamics(
+        self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        """Efforts (n, dof) [N m or N] of a motion, gravity included, friction and damping left out."""
+        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, qacc)), strict=True)
+        return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
+
+    def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
+        """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,), the base left out."""
+        return np.array([self._touches(row.astype(np.float32), clearance) for row in np.asarray(qpos)])
+
+    def _touches(self, qpos: Float32, clearance: float) -> bool:
+        self._robot.set_qpos(qpos)
+        self._robot.set_qvel(np.zeros_like(qpos))
+        self._system.step()
+        static = physx.PhysxRigidStaticComponent
+        for contact in self._system.get_contacts():
+            on_ground = any(isinstance(body, static) for body in contact.bodies)
+            if on_ground and any(getattr(body, "is_root", False) for body in contact.bodies):
+                continue
+            if any(point.separation < clearance for point in contact.points):
+                return True
+        return False
+
+
+@lru_cache(maxsize=8)
+def probe(spec: SceneSpec) -> Probe:
+    """Return the probe of this scene, built at most once."""
+    return Probe(spec)
 
 
 class Pack:
