@@ -3,6 +3,7 @@
 from batchpid import presets
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.controller import BatchPID
+from batchpid.design import design_gains
 from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.law import advance, init, reset, step, track
@@ -21,6 +22,7 @@ __all__ = [
     "PIDState",
     "Terms",
     "advance",
+    "design_gains",
     "discretise",
     "drive_target",
     "init",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from batchpid import law
-from batchpid.coefficients import discretise
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.backends import JAXBackend, NumPyBackend
+from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
@@ -71,7 +71,7 @@ class BatchPID:
             raise _no_params(params)
         self._dt, self._backend, self._names = float(dt), backend, joint_names
         self._shape = (int(num_envs), params.joints)
-        self._engine = _NumPy(self._dt, terms) if backend == "numpy" else _JAX(self._dt, terms)
+        self._engine = NumPyBackend(self._dt, terms) if backend == "numpy" else JAXBackend(self._dt, terms)
         self._keeps_terms = terms
         self._state: PIDState | None = None
         self._stale = False  # whether the state may lack leaves that the params now need
@@ -232,86 +232,3 @@ def _no_params(value: Any) -> InvalidArgumentError:
     return InvalidArgumentError(
         "params", "are no PIDParams", value=type(value).__name__, remedy="build them with make_params"
     )
-
-
-class _NumPy:
-    """Runs the law on NumPy, with the coefficients at hand and spread over all envs."""
-
-    def __init__(self, dt: float, terms: bool) -> None:
-        self.dt, self.terms = dt, terms
-
-    def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
-        self.params, self.dtype = params, params.dtype
-        self.coefficients = discretise(params, self.dt, shape[0])
-
-    def array(self, value: Any) -> Any:
-        return np.asarray(value, dtype=self.dtype)
-
-    def init(self, y: Any) -> PIDState:
-        return law.init(self.params, y)
-
-    def step(
-        self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
-    ) -> tuple[PIDState, Any, Terms | None]:
-        new, effort, *terms = law.advance(self.coefficients, state, r, y, y_rate, r_rate, ff, self.terms)
-        return new, effort, terms[0] if terms else None
-
-    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
-        return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
-
-    def track(self, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any) -> PIDState:
-        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-        return law.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
-
-
-class _JAX:
-    """Runs the law compiled by JAX: once per structure of params and inputs, the state's buffers donated."""
-
-    def __init__(self, dt: float, terms: bool) -> None:
-        try:
-            import jax
-        except ImportError:
-            raise MissingDependencyError("jax", "backend='jax'", "jax") from None
-        self.jax = jax
-
-        def step(
-            params: PIDParams, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
-        ) -> tuple[PIDState, Any, Terms | None]:
-            k = discretise(params, dt)
-            new, effort, *shown = law.advance(k, state, r, y, y_rate, r_rate, ff, terms)
-            return new, effort, shown[0] if shown else None
-
-        def reset(params: PIDParams, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
-            return law.reset(params, state, y, mask, keep_integral=keep_integral)
-
-        def track(
-            params: PIDParams, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any
-        ) -> PIDState:
-            rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-            return law.track(params, state, r, y, u, dt=dt, feedforward=ff, **rates)
-
-        self._init = jax.jit(law.init)
-        self._step = jax.jit(step, donate_argnums=1)
-        self._reset = jax.jit(reset, static_argnums=4)
-        self._track = jax.jit(track)
-
-    def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
-        self.params = self.jax.tree.map(self.jax.numpy.asarray, params)
-        self.dtype = self.params.dtype
-
-    def array(self, value: Any) -> Any:
-        if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
-            return value
-        return np.asarray(value, dtype=self.dtype)
-
-    def init(self, y: Any) -> PIDState:
-        return self._init(self.params, y)
-
-    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-        return self._step(self.params, state, *inputs)
-
-    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
-        return self._reset(self.params, state, y, mask, keep_integral)
-
-    def track(self, state: PIDState, *inputs: Any) -> PIDState:
-        return self._track(self.params, state, *inputs)
