@@ -1,0 +1,219 @@
+r"""Gains from a robot's inertia: no tuning, for any robot.
+
+A joint of inertia I under u = kp (b r - q) + I_term - kd q' has the characteristic polynomial
+s^3 + (kd/I) s^2 + (kp/I) s + ki/I. With the bandwidth w, damping ratio zeta and integral time Ti asked for::
+
+    kp = I w^2        kd = 2 zeta w I - c        ki = kp / Ti        b = 1 / (Ti |s1|)
+
+c is the joint's own viscous damping, which does part of the work. s1 is the real pole nearest to zero, the slow one
+that the integral brings: the closed loop's zero at -ki / (b kp) is put onto it, so that a step shows no tail of it.
+
+Three limits shape the rest. An arm's inertia changes with its pose: I is the largest that the poses show, since a joint
+lighter than designed for is only damped more. Two light joints nearly in line move against each other with much less
+inertia than either: the derivative's filter is made as slow as the stability bound over all those poses asks for
+(:mod:`batchpid.stability`). And where a filter that slow would spoil the damping, the bandwidth gives way.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.markers import CHOICES
+from batchpid.params import PIDParams
+from batchpid.stability import stability_bound
+
+Float64 = NDArray[np.float64]
+FILTER_STEPS = 2.0
+"""The derivative's filter time, in sampling steps, where stability asks for no more: it halves quantisation noise."""
+FILTER_SHARE = 0.1
+"""The largest filter time allowed, as a share of 1 / w: it costs at most this many radians of phase at w."""
+BACK_OFF = 0.8
+"""Factor by which the bandwidth gives way, as often as it must."""
+
+
+class Designable(Protocol):
+    """What :func:`design_gains` asks of a robot; :class:`sim.Robot` is one."""
+
+    joint_names: Any
+
+    def mass_matrix(self, qpos: ArrayLike) -> Float64:
+        """Joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
+
+    def sample(self, count: int, seed: int) -> Float64:
+        """``count`` poses (count, dof) spread over the joints' ranges."""
+
+    def params(self, **options: Any) -> PIDParams:
+        """Params with the robot's limits filled in."""
+
+    @property
+    def damping(self) -> Float64:
+        """Viscous damping of the joints (dof,)."""
+
+
+def pid_from_inertia(
+    inertia: ArrayLike,
+    bandwidth_hz: ArrayLike,
+    damping_ratio: float = 1.0,
+    *,
+    integral_time: float | None = None,
+    damping: ArrayLike = 0.0,
+) -> dict[str, Float64]:
+    """Return kp, ki, kd and setpoint_weight for joints of known inertia, as options of :func:`batchpid.make_params`.
+
+    Parameters
+    ----------
+    inertia
+        (joints,) [kg m^2 or kg].
+    bandwidth_hz
+        w / (2 pi), a number or (joints,) [Hz].
+    damping_ratio
+        zeta; 1 is critical.
+    integral_time
+        Ti [s]; default 10 / w, inf for no integral.
+    damping
+        Viscous damping of the joints (joints,) [N m s/rad or N s/m].
+    """
+    own, load = np.broadcast_arrays(np.asarray(inertia, np.float64), np.asarray(damping, np.float64))
+    w = np.broadcast_to(2 * np.pi * np.asarray(bandwidth_hz, np.float64), own.shape)
+    ti = 10 / w if integral_time is None else np.full(own.shape, float(integral_time))
+    kp = own * w**2
+    with np.errstate(divide="ignore"):
+        ki = kp / ti
+    return {
+        "kp": kp,
+        "ki": ki,
+        # A fifth at least: all of the damping may not be the joint's where the inertia is less than the largest.
+        "kd": np.maximum(2 * damping_ratio * w * own - load, 0.4 * damping_ratio * w * own),
+        "setpoint_weight": np.array([_weight(x, damping_ratio, t) for x, t in zip(w, ti, strict=True)]),
+    }
+
+
+def design_gains(
+    robot: Designable,
+    bandwidth_hz: float = 2.0,
+    damping_ratio: float = 1.0,
+    *,
+    integral_time: float | None = None,
+    dt: float = 1 / 2000,
+    poses: ArrayLike | None = None,
+    gain_units: str = "effort",
+    margin: float = 0.5,
+    **options: Any,
+) -> PIDParams:
+    """Return params for ``robot`` from its inertia alone.
+
+    Parameters
+    ----------
+    robot
+        A :class:`sim.Robot`, or anything that gives mass matrices (:class:`Designable`).
+    bandwidth_hz, damping_ratio
+        Of the closed loop, at the largest inertia. A step settles to 2 % in about 1 / bandwidth_hz.
+    integral_time
+        Ti [s]; default 10 / (2 pi bandwidth_hz), inf for no integral.
+    dt
+        Control and simulation step [s].
+    poses
+        (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded ones within the
+        limits.
+    gain_units
+        "effort", "inertia" or "mass_matrix": what the gains are per (:mod:`batchpid.inertia`).
+    margin
+        Share of the stability range that may be used, below 1.
+    options
+        More options of ``robot.params``; they replace those designed.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A number out of range, an unknown unit, or a robot whose mass matrix is not positive definite.
+    """
+    for name, value, top in (
+        ("bandwidth_hz", bandwidth_hz, math.inf),
+        ("damping_ratio", damping_ratio, math.inf),
+        ("dt", dt, math.inf),
+        ("margin", margin, 1.0),
+        ("integral_time", 1.0 if integral_time is None else min(integral_time, 1.0), math.inf),
+    ):
+        if not 0 < value < top:
+            raise InvalidArgumentError(
+                name, "is out of range", value=value, remedy=f"use 0 < {name} < {top:g}"
+            )
+    if gain_units not in CHOICES["gain_units"]:
+        raise InvalidArgumentError(
+            "gain_units",
+            "is unknown",
+            value=gain_units,
+            remedy=f"use one of {', '.join(CHOICES['gain_units'])}",
+        )
+    mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
+    own = np.diagonal(mass, axis1=1, axis2=2)
+    inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[
+        gain_units
+    ]
+    # Per unit of inertia, the joint's own damping counts most where it has least inertia to damp.
+    damping = robot.damping if gain_units == "effort" else robot.damping / own.max(0)
+    bandwidth = float(bandwidth_hz)
+    while True:
+        gains = pid_from_inertia(
+            inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
+        )
+        filter_time = _filter_time(mass, gains, dt, robot.damping, gain_units, margin)
+        if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
+            break
+        bandwidth *= BACK_OFF
+    designed = {
+        **gains,
+        "derivative_filter_time": filter_time,
+        "weight_origin": "start",
+        "gain_units": gain_units,
+    }
+    return robot.params(**(designed | options))
+
+
+def _weight(w: float, zeta: float, ti: float) -> float:
+    """Return b = 1 / (Ti |s1|), s1 the real root nearest to zero of s^3 + 2 zeta w s^2 + w^2 s + w^2 / Ti."""
+    if math.isinf(ti):
+        return 1.0
+    roots = np.roots([1.0, 2 * zeta * w, w**2, w**2 / ti])
+    real = np.abs(roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real)
+    return min(1.0, 1.0 / (ti * float(real.min())))
+
+
+def _filter_time(
+    mass: Float64, gains: dict[str, Float64], dt: float, damping: Float64, gain_units: str, margin: float
+) -> float:
+    """Return the shortest filter time from FILTER_STEPS on that keeps the ratio below ``margin`` at every pose."""
+    joints = mass.shape[1]
+    if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia by itself
+        mass, damping = np.eye(joints)[None], np.zeros(joints)
+    scale = np.diagonal(mass, axis1=1, axis2=2) if gain_units == "inertia" else np.ones((len(mass), joints))
+
+    def ratios(filter_time: float) -> Float64:
+        kp, kd = gains["kp"] * scale, gains["kd"] * scale
+        return stability_bound(mass, kp, kd, dt, filter_time=filter_time, damping=damping).ratio
+
+    low = FILTER_STEPS * dt
+    at_low = ratios(low)
+    if at_low.max() <= margin:
+        return low
+    worst = np.argsort(at_low)[-10:]  # the pose that decides is among these
+    mass, scale = mass[worst], scale[worst]
+
+    def ratio(filter_time: float) -> float:
+        return float(ratios(filter_time).max())
+
+    # The filter passes dt / (dt + 2 tau), so the ratio falls about as 1 / tau down to kp's own share of it.
+    high = low
+    while ratio(high) > margin:
+        high *= 2
+        if high > 1e3:
+            return math.inf
+    for _ in range(40):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if ratio(middle) > margin else (low, middle)
+    return high
