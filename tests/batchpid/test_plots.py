@@ -13,6 +13,7 @@ from PIL import Image
 
 from batchpid import plots
 from batchpid.errors import InvalidArgumentError
+from batchpid.panels import MEDIAN, quantile
 
 TICKS, ENVS = 30, 6
 
@@ -59,7 +60,7 @@ def test_fan_holds_every_env_and_the_line_is_the_median():
             (fan,) = (c for c in axes.collections if type(c).__name__ == "LineCollection")
             drawn = np.array([segment[:, 1] for segment in fan.get_segments()])
             np.testing.assert_array_equal(drawn, values[..., joint].T)
-            medians = [line.get_ydata() for line in axes.lines if line.get_color() == plots.MEDIAN]
+            medians = [line.get_ydata() for line in axes.lines if line.get_color() == MEDIAN]
             np.testing.assert_allclose(medians, [np.median(values[..., joint], 1)])
         low, high = above.get_ylim()
         assert low < traces.qpos[..., joint].min() < traces.qpos[..., joint].max() < high
@@ -91,13 +92,13 @@ def test_a_run_that_flies_off_is_shown_near_its_limits():
 
 @given(hnp.arrays(np.float64, (7, 5), elements=st.floats(-1e6, 1e6) | st.just(np.nan)), st.floats(0, 1))
 def test_quantile_is_that_of_what_is_finite(values, q):
-    got = plots._quantile(values, q)
-    for row, quantile in zip(values, got, strict=True):
+    got = quantile(values, q)
+    for row, value in zip(values, got, strict=True):
         finite = row[np.isfinite(row)]
         if finite.size:
-            assert quantile == pytest.approx(np.quantile(finite, q), rel=1e-9, abs=1e-9)
+            assert value == pytest.approx(np.quantile(finite, q), rel=1e-9, abs=1e-9)
         else:
-            assert np.isnan(quantile)
+            assert np.isnan(value)
 
 
 @settings(max_examples=8, deadline=None)
