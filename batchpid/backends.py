@@ -20,25 +20,31 @@ class NumPyBackend:
         self.dt, self.terms = dt, terms
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
+        """Take these params for (envs, joints) ``shape``."""
         self.params, self.dtype = params, params.dtype
         self.coefficients = discretise(params, self.dt, shape[0])
 
     def array(self, value: Any) -> Any:
+        """Return ``value`` as an array that the backend steps on."""
         return np.asarray(value, dtype=self.dtype)
 
     def init(self, y: Any) -> PIDState:
+        """Return the state at a first measurement."""
         return law.init(self.params, y)
 
     def step(
         self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
     ) -> tuple[PIDState, Any, Terms | None]:
+        """Return the new state, the effort, and the terms where they are kept."""
         new, effort, *terms = law.advance(self.coefficients, state, r, y, y_rate, r_rate, ff, self.terms)
         return new, effort, terms[0] if terms else None
 
     def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
+        """Return the state with the envs of ``mask`` begun anew."""
         return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
 
     def track(self, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any) -> PIDState:
+        """Return the state whose next step gives the effort ``u``."""
         rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
         return law.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
 
@@ -92,6 +98,7 @@ class JAXBackend:
         return self.jax.jit(packed, static_argnums=0, **options)
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
+        """Take these params for (envs, joints) ``shape``."""
         jnp = self.jax.numpy
         leaves, tree = self.jax.tree.flatten(params)
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
@@ -102,21 +109,26 @@ class JAXBackend:
         self.dtype = self.packed[1].dtype
 
     def array(self, value: Any) -> Any:
+        """Return ``value`` as an array that the backend steps on."""
         if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
             return value
         return np.asarray(value, dtype=self.dtype)
 
     def init(self, y: Any) -> PIDState:
+        """Return the state at a first measurement."""
         return self._init(*self.packed, y)
 
     def step(
         self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
     ) -> tuple[PIDState, Any, Terms | None]:
+        """Return the new state, the effort, and the terms where they are kept."""
         return self._step(*self.packed, state, r, y, y_rate, r_rate, ff)
 
     def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
+        """Return the state with the envs of ``mask`` begun anew."""
         function = self._reset_but_integral if keep_integral else self._reset
         return function(*self.packed, state, y, mask)
 
     def track(self, state: PIDState, *inputs: Any) -> PIDState:
+        """Return the state whose next step gives the effort ``u``."""
         return self._track(*self.packed, state, *inputs)

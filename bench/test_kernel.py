@@ -1,0 +1,256 @@
+"""The law as a kernel: envs from 1 to 2^20 by 9 joints, beside what it must beat and the machine's own bandwidth.
+
+The typical law: P, I, filtered D, feedforward, effort limits, back-calculation, float32. A step's necessary bytes are
+each input read once and each output written once: setpoint, measurement, feedforward, integral, last measurement and
+filtered rate in, and effort, integral, measurement and filtered rate out, 10 arrays of envs x joints. Bandwidth is
+that over the best time of a step; ``of triad`` is its share of a[i] = b[i] + s c[i] over arrays of the same size,
+counted as 3 arrays, measured next to it on all cores (numba), or of a copy on the GPU where JAX has one. Compilation
+is never timed.
+"""
+
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import simple_pid
+
+import batchpid as bp
+from batchpid.oracle import SimplePID
+
+numba = pytest.importorskip("numba")
+
+JOINTS, DT = 9, 1 / 2000
+GAINS = {"kp": 40.0, "ki": 5.0, "kd": 2.0}
+PARAMS = bp.make_params(
+    JOINTS,
+    **GAINS,
+    effort_limit=87.0,
+    derivative_filter_time=0.01,
+    anti_windup="back_calculation",
+    dtype=np.float32,
+)
+ARRAYS = 10
+SIZES = [1, 64, 4096, 2**16, 2**20]
+ON_GPU = jax.default_backend() != "cpu"
+
+
+def inputs(envs):
+    """Setpoint, two measurements to alternate between, and feedforward."""
+    rng = np.random.default_rng(0)
+    return [rng.normal(size=(envs, JOINTS)).astype(np.float32) for _ in range(4)]
+
+
+def best(call, seconds=0.6, least=5):
+    """Return the least time of a call [s]."""
+    call()
+    times, until = [], time.perf_counter() + seconds
+    while len(times) < least or time.perf_counter() < until:
+        began = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+@numba.njit(parallel=True, fastmath=True)
+def _triad(a, b, c, s):
+    for i in numba.prange(a.size):
+        a[i] = b[i] + s * c[i]
+
+
+def machine_bandwidth(envs):
+    """Return bytes per second of the triad (CPU, all cores) or of a copy (GPU)."""
+    size = envs * JOINTS
+    if ON_GPU:
+        copy, source = jax.jit(lambda x: x + 1, donate_argnums=0), [jnp.ones(size, jnp.float32)]
+
+        def call():
+            source[0] = copy(source[0])
+            source[0].block_until_ready()
+
+        return 2 * 4 * size / best(call)
+    a, b, c = np.ones((3, size), np.float32)
+    return 3 * 4 * size / best(lambda: _triad(a, b, c, np.float32(2)))
+
+
+@numba.njit(parallel=True)
+def _by_hand(kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, integral, last, rate, effort):
+    for i in numba.prange(r.shape[0]):
+        for j in range(r.shape[1]):
+            e = r[i, j] - y[i, j]
+            v = decay[j] * rate[i, j] + intake[j] * (last[i, j] - y[i, j]) * per_dt
+            u = kp[j] * e + integral[i, j] + kd[j] * v + ff[i, j]
+            s = min(max(u, low[j]), high[j])
+            integral[i, j] += ki[j] * dt * e + back[j] * (s - u)
+            last[i, j], rate[i, j], effort[i, j] = y[i, j], v, s
+
+
+def numpy_step(envs):
+    r, y0, y1, ff = inputs(envs)
+    pid, turn = bp.BatchPID(PARAMS, envs, DT), [y0, y1]
+
+    def call():
+        turn.reverse()
+        return pid(r, turn[0], feedforward=ff)
+
+    return call
+
+
+def jax_step(envs):
+    """BatchPID on device arrays; waits for the effort."""
+    r, y0, y1, ff = (jnp.asarray(x) for x in inputs(envs))
+    pid, turn = bp.BatchPID(PARAMS, envs, DT, "jax"), [y0, y1]
+
+    def call():
+        turn.reverse()
+        return pid(r, turn[0], feedforward=ff).block_until_ready()
+
+    return call
+
+
+def numba_step(envs):
+    r, y0, y1, ff = inputs(envs)
+    k = bp.discretise(PARAMS, DT)
+    rows = [
+        np.asarray(x, np.float32).ravel()
+        for x in (k.kp, PARAMS.ki, k.kd, k.effort_min, k.effort_max, k.decay, k.intake)
+    ]
+    scalars, back = (np.float32(k.per_dt), np.float32(DT)), np.asarray(k.tracking, np.float32).ravel()
+    state = [np.zeros_like(r), y1.copy(), np.zeros_like(r)]
+    effort, turn = np.empty_like(r), [y0, y1]
+
+    def call():
+        turn.reverse()
+        _by_hand(*rows, *scalars, back, r, turn[0], ff, *state, effort)
+        return effort
+
+    return call
+
+
+def scalar_step(make):
+    """One Python object per joint, one call after another, as the tutorial has it."""
+
+    def build(envs):
+        r, y0, y1, ff = (x.astype(float).ravel().tolist() for x in inputs(envs))
+        compute, turn = [make() for _ in r], [y0, y1]
+
+        def call():
+            turn.reverse()
+            return [f(a, b) + c for f, a, b, c in zip(compute, r, turn[0], ff, strict=True)]
+
+        return call
+
+    return build
+
+
+def tutorial():
+    pid = SimplePID(*GAINS.values())
+    return lambda r, y: pid.compute(r - y, DT)
+
+
+def simple():
+    pid = simple_pid.PID(*GAINS.values(), sample_time=None, output_limits=(-87, 87))
+
+    def compute(r, y):
+        pid.setpoint = r
+        return pid(y, dt=DT)
+
+    return compute
+
+
+KERNELS = {"numpy": numpy_step, "jax": jax_step, "numba by hand": numba_step}
+SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
+
+
+@pytest.mark.parametrize("envs", SIZES)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_step(benchmark, kernel, envs):
+    call = KERNELS[kernel](envs)
+    first = np.array(call())
+    assert np.isfinite(first).all()
+    assert not np.array_equal(first, call()), "the efforts follow the measurements"
+    rounds = max(5, min(5000, int(0.5 / best(call, 0.1))))
+    benchmark.pedantic(call, rounds=rounds, warmup_rounds=2)
+    bandwidth, least = machine_bandwidth(envs), benchmark.stats.stats.min
+    moved = ARRAYS * 4 * envs * JOINTS
+    benchmark.extra_info |= {
+        "us per step": round(1e6 * least, 2),
+        "ns per env": round(1e9 * least / envs, 2),
+        "necessary MB": round(moved / 1e6, 3),
+        "GB/s": round(moved / least / 1e9, 2),
+        "of triad": round(moved / least / bandwidth, 3),
+        "triad GB/s": round(bandwidth / 1e9, 1),
+        "device": str(jax.devices()[0]) if kernel == "jax" else f"{os.cpu_count()} CPUs",
+    }
+
+
+@pytest.mark.parametrize("kernel", SCALARS)
+@pytest.mark.parametrize("envs", [1, 64, 4096])
+def test_scalar_loop(benchmark, kernel, envs):
+    """Its time is proportional to the envs, so the ns per env hold for 2^20 too."""
+    call = SCALARS[kernel](envs)
+    benchmark.pedantic(call, rounds=max(3, 4096 // envs), warmup_rounds=1)
+    benchmark.extra_info["ns per env"] = round(1e9 * benchmark.stats.stats.min / envs, 1)
+
+
+def test_against_the_scalar_loop_in_one_run(benchmark):
+    """The JAX step at 2^20 x 9 against the tutorial's scalar loop, per env."""
+    slow = best(SCALARS["tutorial"](4096)) / 4096
+    call = jax_step(2**20)
+    benchmark.pedantic(call, rounds=5, warmup_rounds=2)
+    ratio = slow / (benchmark.stats.stats.min / 2**20)
+    benchmark.extra_info["times the scalar loop"] = round(ratio)
+    assert ratio > 10
+
+
+@pytest.mark.parametrize("envs", [64, 4096])
+def test_scan(benchmark, envs):
+    """jax.lax.scan of a closed loop: the law on a double integrator; time per step."""
+    steps, params = 2000, jax.tree.map(jnp.asarray, PARAMS)
+    r, y, _, ff = (jnp.asarray(x) for x in inputs(envs))
+
+    @jax.jit
+    def run(params, y):
+        def body(carry, _):
+            state, y, v = carry
+            state, effort = bp.step(params, state, r, y, DT, feedforward=ff)
+            v = v + effort * DT
+            return (state, y + v * DT, v), None
+
+        return jax.lax.scan(body, (bp.init(params, y), y, jnp.zeros_like(y)), None, length=steps)[0][1]
+
+    assert np.abs(run(params, y) - y).max() > 0.01, "the loop moved"
+    benchmark.pedantic(lambda: run(params, y).block_until_ready(), rounds=5)
+    benchmark.extra_info["us per step"] = round(1e6 * benchmark.stats.stats.min / steps, 3)
+
+
+@pytest.mark.parametrize("kernel", ["numpy", "jax"])
+def test_settled_filters_cost_the_same(benchmark, kernel):
+    """After 10,000 steps at rest the filters have decayed; fresh and settled steps alternate in blocks."""
+    y = np.zeros((64, JOINTS), np.float32)
+    r = np.zeros_like(y)
+    pids = {name: bp.BatchPID(PARAMS, 64, DT, kernel) for name in ("moving", "settled")}
+    for pid in pids.values():
+        pid(r, y + 1)
+    for _ in range(10_000):
+        pids["settled"](r, y)
+    moving = [y + 0.1, y - 0.1]
+    ratios = []
+
+    def block(pid, measurements):
+        began = time.perf_counter()
+        for _ in range(250):
+            for measurement in measurements:
+                effort = pid(r, measurement)
+        np.asarray(effort)
+        return time.perf_counter() - began
+
+    def both():
+        ratios.append(block(pids["settled"], [y, y]) / block(pids["moving"], moving))
+
+    benchmark.pedantic(both, rounds=15, warmup_rounds=2)
+    assert np.abs(np.asarray(pids["settled"].state.derivative)).max() < 1e-10
+    benchmark.extra_info["settled / moving"] = round(float(np.median(ratios)), 3)
+    assert np.median(ratios) < 1.2
