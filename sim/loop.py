@@ -88,7 +88,7 @@ class Loop:
         size = max(IN_STEP // spec.pack_size, 1) * spec.pack_size
         starts = range(0, spec.num_envs, size)
         slices = [slice(start, min(start + size, spec.num_envs)) for start in starts]
-        self._cells = [
+        self.cells = [
             _Cell(
                 Pack(
                     builder, spec.scene, envs.stop - envs.start, spec.first_env + envs.start, spec.pack_size
@@ -102,19 +102,19 @@ class Loop:
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
-        for cell in self._cells:
+        for cell in self.cells:
             cell.reset(mask[cell.envs], qpos[cell.envs], qvel[cell.envs])
             cell.observe(self.arrays.rows(cell.envs))
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
-        for cell in self._cells:
+        for cell in self.cells:
             cell.set_params(params.for_envs(cell.envs))
 
     def tick(self, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
         """Run ``substeps`` sim steps under the commands in ``arrays``; returns the seconds it took."""
         began = time.perf_counter()
-        for cell in self._cells:
+        for cell in self.cells:
             rows = self.arrays.rows(cell.envs)
             cell.run(
                 substeps,
@@ -127,13 +127,13 @@ class Loop:
 
     def poses(self) -> list[NDArray[np.float32]]:
         """Poses of the entities that each env's content wants watched, (watched, 7) each."""
-        return [rows for cell in self._cells for rows in cell.pack.read_poses()]
+        return [rows for cell in self.cells for rows in cell.pack.read_poses()]
 
     def close(self) -> None:
         """Free the scenes."""
-        for cell in self._cells:
+        for cell in self.cells:
             cell.pack.close()
-        self._cells = []
+        self.cells = []
 
 
 class _Cell:

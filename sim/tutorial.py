@@ -33,6 +33,7 @@ class TutorialLoop:
         *,
         external_pid: bool = True,
         internal_drive: bool = False,
+        start: NDArray[np.float64] | None = None,
     ) -> None:
         settings = robot.settings
         if settings is None:
@@ -47,17 +48,19 @@ class TutorialLoop:
             path.write_text(robot.urdf)
             self.robot: Any = loader.load(str(path))
         self.robot.set_root_pose(sapien.Pose([0, 0, 0], [1, 0, 0, 0]))
-        self.robot.set_qpos(settings.start)
+        self._gains = list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
         self.target = target
-        self.pids = (
-            [SimplePID(*gains) for gains in zip(settings.kp, settings.ki, settings.kd, strict=True)]
-            if external_pid
-            else []
-        )
+        self.reset(settings.start if start is None else start)
         if internal_drive:
             for joint, position in zip(self.robot.get_active_joints(), target, strict=True):
                 joint.set_drive_property(stiffness=settings.drive_stiffness, damping=settings.drive_damping)
                 joint.set_drive_target(position)
+
+    def reset(self, qpos: NDArray[np.float64]) -> None:
+        """Start anew from ``qpos`` (dof,), at rest."""
+        self.robot.set_qpos(qpos)
+        self.robot.set_qvel(np.zeros_like(qpos))
+        self.pids = [SimplePID(*gains) for gains in self._gains]
 
     def step(self) -> None:
         """One sim step: passive force, one PID object per joint, set_qf, scene.step."""

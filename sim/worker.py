@@ -31,7 +31,7 @@ from .shared import SharedArrays
 TICK = struct.Struct("<cI??")  # b"T", substeps, use_rate, use_feedforward
 DONE = struct.Struct("<cd")  # b"D", seconds of work
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 class LocalWorker:
@@ -83,7 +83,7 @@ class ProcessWorker:
                 ],
                 pass_fds=(theirs.fileno(), self._shared.fd),
                 stdin=subprocess.DEVNULL,
-                env=os.environ | dict.fromkeys(_ONE_THREAD, "1"),
+                env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
             )
         self._connection = Connection(ours.detach())
         self._connection.send_bytes(message)

@@ -1,0 +1,354 @@
+"""What the runner is measured against, side by side in one run: ``batchpid bench`` and ``bench/`` are made of this.
+
+Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and with SAPIEN's own friction
+and damping, so that what is compared is the way of stepping and not the motion. The cases that step scenes by hand
+run in worker processes of their own, one for each worker, each with its share of the envs.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import BatchPIDError, InvalidArgumentError
+
+from .loop import Arrays, Loop, LoopSpec
+from .physics import PHYSICS
+from .robot import Robot
+from .runner import Runner
+from .scenes import Pack, SceneSpec, parse
+from .tutorial import TutorialLoop
+from .worker import ONE_THREAD
+
+Float64 = NDArray[np.float64]
+DISTANCE = 0.3
+"""How far the arm starts from its target [rad]."""
+PACK = 8
+"""Scenes to a PhysX system in the bare engine's packed cases."""
+
+CASES = {
+    "tutorial": "the tutorial's loop as written: one robot, one process",
+    "tutorial, a process a core": "the tutorial's loop, one robot in each of the processes",
+    "drive, a scene a robot": "internal drive, no control, one PhysX system to a robot, all stepped in turn",
+    "bare engine": "internal drive, no control, no gravity, packed scenes, all stepped in turn",
+    "bare engine, pack by pack": "the same, each pack stepped for a tick while it is in the cache",
+    "closed loop": "the Runner: PID with gravity and Coriolis compensation at every sim step",
+}
+PHASES = {
+    "read": ("read_qpos", "read_qvel"),
+    "passive": ("passive_force",),
+    "write": ("write_qf",),
+    "step": ("step",),
+}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One comparison: which robot, how many, on how many processes, for how long."""
+
+    robot: Robot
+    num_envs: int = 64
+    workers: int = 2
+    physics: str = "accurate"
+    substeps: int = 20
+    ticks: int = 100
+    rounds: int = 5
+
+    @property
+    def target(self) -> Float64:
+        """Where every case moves to (dof,) [rad or m]."""
+        assert self.robot.settings is not None
+        return self.robot.settings.target
+
+    @property
+    def start(self) -> Float64:
+        """Where every case starts (dof,): ``DISTANCE`` short of the target on the joints that have the room."""
+        away = self.target - DISTANCE
+        roomy = (self.robot.upper - self.robot.lower > 1.0) & (away > self.robot.lower)
+        return np.where(roomy, away, self.target)
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """Joints that have a way to go (dof,)."""
+        return self.start != self.target
+
+    def scene(self, gravity: bool) -> SceneSpec:
+        """Scene of every case; without gravity a drive needs no compensation to reach the same place."""
+        robot = self.robot
+        spec = SceneSpec(
+            urdf=robot.urdf,
+            srdf=robot.srdf,
+            joints=robot.joints,
+            timestep=1 / 2000,
+            physics=PHYSICS[self.physics],
+            dissipation="sapien",
+        )
+        return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Figures of one case: env-steps per second of every round, and where the first env ended (dof,)."""
+
+    rates: tuple[float, ...]
+    final: Float64
+
+    @property
+    def rate(self) -> float:
+        """Median env-steps per second."""
+        return statistics.median(self.rates)
+
+
+def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -> dict[str, Result]:
+    """Measure every case ``setup.rounds`` times in turn; the rounds of different cases are paired.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot carries no gains and target to move with.
+    BatchPIDError
+        The robots of a case did not move, or ended elsewhere: its figure would mean nothing.
+    """
+    robot = setup.robot
+    if robot.settings is None:
+        raise InvalidArgumentError(
+            "robot", f"{robot.name!r} carries no gains and target", remedy=f"use one of {Robot.bundled()}"
+        )
+    rates: dict[str, list[float]] = {case: [] for case in CASES}
+    final: dict[str, Float64] = {}
+    hands = [_Hand(setup, index) for index in range(max(setup.workers, 1))]
+    robot = Robot.load(robot.path, dissipation="sapien")
+    try:
+        with Runner(
+            robot, setup.num_envs, workers=setup.workers, physics=setup.physics, substeps=setup.substeps
+        ) as runner:
+            for _ in range(setup.rounds):
+                for case in CASES:
+                    progress(case)
+                    if case == "closed loop":
+                        seconds, steps, final[case] = _run_closed_loop(runner, setup)
+                    else:
+                        taken = hands[:1] if case == "tutorial" else hands
+                        seconds, steps, final[case] = _run_by_hand(case, taken, setup)
+                    rates[case].append(steps / seconds)
+    finally:
+        for hand in hands:
+            hand.close()
+    for case, place in final.items():
+        _check_motion(case, place, setup)
+    return {case: Result(tuple(rates[case]), final[case]) for case in CASES}
+
+
+def phases(setup: Setup) -> dict[str, float]:
+    """Microseconds per env step that each phase of the closed loop takes, in one process with a worker's share.
+
+    "control" is all that is not a call on the engine. The clock's own calls are in the figures: they add about one
+    percent. "waiting" is what a tick takes beyond the work of the slower worker, measured on a Runner.
+    """
+    share = max(1, setup.num_envs // max(setup.workers, 1))
+    spec = LoopSpec(
+        setup.scene(gravity=True), share, Robot.load(setup.robot.path, dissipation="sapien").params()
+    )
+    layout = Arrays.layout(share, setup.robot.dof).items()
+    arrays = Arrays(**{name: np.zeros(shape, dtype) for name, (shape, dtype) in layout})
+    loop = Loop(spec, arrays)
+    clocks = [_Clock(cell) for cell in loop.cells]
+    everyone, still = np.ones(share, bool), np.zeros((share, setup.robot.dof))
+    loop.reset(everyone, np.tile(setup.start, (share, 1)), still)
+    arrays.setpoint[...] = setup.target
+    for clock in clocks:
+        clock.seconds.clear()
+    total = sum(loop.tick(setup.substeps, False, False) for _ in range(setup.ticks))
+    loop.close()
+    steps = setup.ticks * setup.substeps * share
+    spent = {
+        phase: sum(clock.seconds.get(call, 0.0) for clock in clocks for call in calls)
+        for phase, calls in PHASES.items()
+    }
+    spent["control"] = total - sum(spent.values())
+    spent["waiting"] = _waiting(setup) * steps
+    order = ("read", "control", "passive", "write", "step", "waiting")
+    return {phase: spent[phase] / steps * 1e6 for phase in order}
+
+
+def _waiting(setup: Setup) -> float:
+    """Seconds per env step of a worker between the end of its work and the next tick, on average."""
+    with Runner(
+        setup.robot, setup.num_envs, workers=setup.workers, physics=setup.physics, substeps=setup.substeps
+    ) as runner:
+        runner.step(setup.target)
+        idle = 0.0
+        for _ in range(setup.ticks):
+            began = time.perf_counter()
+            runner.step(setup.target)
+            idle += time.perf_counter() - began - float(np.mean(runner.work_seconds))
+    return idle / (setup.ticks * setup.substeps * setup.num_envs / max(setup.workers, 1))
+
+
+def _run_closed_loop(runner: Runner, setup: Setup) -> tuple[float, int, Float64]:
+    runner.reset(setup.start)
+    began = time.perf_counter()
+    for _ in range(setup.ticks):
+        obs = runner.step(setup.target)
+    seconds = time.perf_counter() - began
+    return seconds, setup.num_envs * setup.ticks * setup.substeps, obs.qpos[0].astype(np.float64)
+
+
+def _run_by_hand(case: str, hands: list[_Hand], setup: Setup) -> tuple[float, int, Float64]:
+    for hand in hands:
+        hand.prepare(case)
+    began = time.perf_counter()
+    for hand in hands:
+        hand.go()
+    results = [hand.result() for hand in hands]
+    seconds = time.perf_counter() - began
+    return seconds, sum(steps for steps, _ in results), results[0][1]
+
+
+def _check_motion(case: str, place: Float64, setup: Setup) -> None:
+    moving = setup.moving
+    way = np.abs(place - setup.start)[moving]
+    left = np.abs(place - setup.target)[moving]
+    if not np.isfinite(place).all() or way.min() < 0.1 * DISTANCE or left.max() > DISTANCE:
+        raise BatchPIDError(
+            f"case {case!r}: the robots did not move as they should (moved {way.round(3)}, left {left.round(3)}); "
+            "its speed would mean nothing: run more ticks"
+        )
+
+
+class _Clock:
+    """Adds up the seconds of every call on a cell's pack, by the call's name."""
+
+    def __init__(self, cell: Any) -> None:
+        self.seconds: dict[str, float] = {}
+        self._pack = cell.pack
+        cell.pack = self
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._pack, name)
+        if name not in {call for calls in PHASES.values() for call in calls}:
+            return value
+        clock, seconds = time.perf_counter, self.seconds
+
+        def timed(*args: Any) -> Any:
+            began = clock()
+            result = value(*args)
+            seconds[name] = seconds.get(name, 0.0) + clock() - began
+            return result
+
+        self.__dict__[name] = timed
+        return timed
+
+
+class _Hand:
+    """A process that steps its share of the scenes by hand, case after case."""
+
+    def __init__(self, setup: Setup, index: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        count = max(setup.workers, 1)
+        share = setup.num_envs * (index + 1) // count - setup.num_envs * index // count
+        saved = {name: os.environ.get(name) for name in ONE_THREAD}
+        os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+        try:
+            self._process = context.Process(target=_serve, args=(theirs, setup, share), daemon=True)
+            self._process.start()
+        finally:
+            for name, value in saved.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+        theirs.close()
+
+    def prepare(self, case: str) -> None:
+        self._connection.send(case)
+        self._connection.recv()
+
+    def go(self) -> None:
+        self._connection.send(None)
+
+    def result(self) -> tuple[int, Float64]:
+        steps, final = self._connection.recv()
+        return steps, final
+
+    def close(self) -> None:
+        self._connection.close()
+        self._process.join(5.0)
+        if self._process.is_alive():
+            self._process.kill()
+
+
+def _serve(connection: Connection, setup: Setup, share: int) -> None:
+    cases: dict[str, _Tutorial | _Engine] = {}
+    gc.disable()
+    try:
+        while True:
+            case: str = connection.recv()
+            if case not in cases:
+                cases[case] = _Tutorial(setup) if case.startswith("tutorial") else _Engine(case, setup, share)
+            cases[case].reset()
+            connection.send(None)
+            connection.recv()
+            connection.send(cases[case].run(setup.ticks * setup.substeps))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass
+
+
+class _Tutorial:
+    """The tutorial's loop, alone in its process."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._start = setup.start
+        self._loop = TutorialLoop(setup.robot, setup.target, start=setup.start)
+
+    def reset(self) -> None:
+        self._loop.reset(self._start)
+
+    def run(self, steps: int) -> tuple[int, Float64]:
+        final = self._loop.run(steps).astype(np.float64)
+        return steps, final
+
+
+class _Engine:
+    """Scenes under PhysX's drive and nothing else: no gravity, so that the drive reaches what the PID reaches."""
+
+    def __init__(self, case: str, setup: Setup, share: int) -> None:
+        assert setup.robot.settings is not None
+        spec = setup.scene(gravity=False)
+        size = 1 if case == "drive, a scene a robot" else PACK
+        self._in_turn = case != "bare engine, pack by pack"
+        self._substeps = setup.substeps
+        builder = parse(spec)
+        sizes = [min(size, share - first) for first in range(0, share, size)]
+        self._packs = [Pack(builder, spec, count, system_size=size) for count in sizes]
+        self._start, self._share = setup.start, share
+        for pack in self._packs:
+            stiffness, damping = setup.robot.settings.drive_stiffness, setup.robot.settings.drive_damping
+            pack.write_drive(np.array(stiffness), np.array(damping), np.array(np.inf))
+            pack.write_drive_target(np.tile(setup.target, (pack.size, 1)))
+
+    def reset(self) -> None:
+        for pack in self._packs:
+            rows = np.tile(self._start, (pack.size, 1))
+            pack.write_state(range(pack.size), rows, np.zeros_like(rows))
+
+    def run(self, steps: int) -> tuple[int, Float64]:
+        packs = self._packs
+        if self._in_turn:
+            for _ in range(steps):
+                for pack in packs:
+                    pack.step()
+        else:
+            for _ in range(steps // self._substeps):
+                for pack in packs:
+                    for _ in range(self._substeps):
+                        pack.step()
+        return steps * self._share, packs[0].read_qpos()[0]
