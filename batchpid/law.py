@@ -124,10 +124,9 @@ def advance(
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
     finite = None
     if k.non_finite is not None:
-        total = r + y
+        finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
-            total = total if optional is None else total + optional
-        finite = xp.isfinite(total)
+            finite = finite if optional is None else finite & xp.isfinite(optional)
         r, y, r_rate, y_rate, ff = (
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )

@@ -122,6 +122,14 @@ def test_a_non_finite_input_stays_where_it_is(run, bad, which, policy):
     assert all(a is None or a[1, 2] == b[1, 2] for a, b in zip(ill[2], ill[3], strict=True))
 
 
+def test_opposite_infinities_and_huge_numbers_are_told_apart():
+    params = bp.make_params(2, 1e-9, non_finite="zero")
+    r, y = np.array([[np.inf, 1e308]]), np.array([[np.inf, 1e308]])
+    _, effort, terms = bp.step(params, bp.init(params, np.ones((1, 2))), r, y, DT, aux=True)
+    assert terms.finite.tolist() == [[False, True]]
+    assert effort.tolist() == [[0, 0]]
+
+
 def test_without_the_option_a_nan_is_passed_on():
     params = bp.make_params(2, 1.0, 1.0, 1.0, effort_limit=3.0, anti_windup="conditional")
     y = np.array([[0.0, np.nan]])
