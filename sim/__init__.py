@@ -1,8 +1,23 @@
 """The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control."""
 
 from .check import Finding
+from .faults import Fault
 from .physics import Physics
+from .pool import RecoveryWarning
 from .robot import Robot
-from .runner import Observation, Rollout, Runner, SetpointWarning
+from .runner import FaultWarning, Observation, Rollout, Runner, SetpointWarning
+from .snapshot import Snapshot
 
-__all__ = ["Finding", "Observation", "Physics", "Robot", "Rollout", "Runner", "SetpointWarning"]
+__all__ = [
+    "Fault",
+    "FaultWarning",
+    "Finding",
+    "Observation",
+    "Physics",
+    "RecoveryWarning",
+    "Robot",
+    "Rollout",
+    "Runner",
+    "SetpointWarning",
+    "Snapshot",
+]

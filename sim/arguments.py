@@ -54,11 +54,16 @@ def flag(argument: str, value: Any) -> bool:
 
 
 def array(
-    argument: str, value: ArrayLike, shape: tuple[int, ...], joint_names: Sequence[str]
+    argument: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    joint_names: Sequence[str],
+    *,
+    finite: bool = True,
 ) -> NDArray[np.float64]:
-    """``value`` as finite float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
+    """``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
-    A scalar stands for all joints, (dof,) for all envs.
+    A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
     """
     try:
         result = np.asarray(value, np.float64)
@@ -76,7 +81,7 @@ def array(
             f"has shape {result.shape}, needs {shape} or ({shape[-1]},)",
             remedy=f"the last axis counts the joints {', '.join(joint_names)}",
         ) from None
-    if not np.isfinite(result).all():
+    if finite and not np.isfinite(result).all():
         *_, env, joint = (int(index) for index in np.argwhere(~np.isfinite(result))[0])
         raise InvalidArgumentError(
             argument,

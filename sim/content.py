@@ -94,6 +94,40 @@ class Content:
             robot.set_qpos(qpos)
             robot.set_qvel(np.zeros_like(qpos))
 
+    def read(self) -> NDArray[np.float32]:
+        """State of everything that moves, in one row of numbers."""
+        parts: list[Any] = []
+        for body, entity, _ in self._bodies:
+            pose = entity.get_pose()
+            parts += [pose.p, pose.q, body.get_linear_velocity(), body.get_angular_velocity()]
+        for robot, *_ in self._articulations:
+            pose = robot.get_root_pose()
+            parts += [pose.p, pose.q, robot.get_root_linear_velocity(), robot.get_root_angular_velocity()]
+            parts += [robot.get_qpos(), robot.get_qvel(), robot.get_qf()]
+        return np.concatenate(parts, dtype=np.float32) if parts else np.zeros(0, np.float32)
+
+    def write(self, row: NDArray[np.float32]) -> None:
+        """Put everything that moves into the state that :meth:`read` gave."""
+        numbers = iter(np.asarray(row, np.float32))
+
+        def take(count: int) -> NDArray[np.float32]:
+            return np.fromiter(numbers, np.float32, count)
+
+        for body, entity, _ in self._bodies:
+            entity.set_pose(sapien.Pose(take(3), take(4)))
+            linear, angular = take(3), take(3)
+            if not body.kinematic:
+                body.set_linear_velocity(linear)
+                body.set_angular_velocity(angular)
+        for robot, *_ in self._articulations:
+            robot.set_root_pose(sapien.Pose(take(3), take(4)))
+            robot.set_root_linear_velocity(take(3))
+            robot.set_root_angular_velocity(take(3))
+            dof = robot.dof
+            robot.set_qpos(take(dof))
+            robot.set_qvel(take(dof))
+            robot.set_qf(take(dof))
+
     def poses(self) -> NDArray[np.float32]:
         """Poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
         rows = [np.concatenate([pose.p, pose.q]) for pose in (entity.get_pose() for entity in self.watched)]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable
-from itertools import pairwise
+from dataclasses import astuple
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -14,15 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.errors import ClosedError, InvalidArgumentError, WorkerError
+from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.inertia import check_gain_units
 
 from .arguments import array, choice, flag, integer, number
+from .command import Call, Tick, Worker
+from .faults import ACTIONS, CAUSES, Fault
 from .loop import COMPENSATE, CONTROLS, LoopSpec
 from .physics import PHYSICS, Physics
+from .pool import WorkerPool
 from .robot import Robot
 from .scenes import SceneSpec
-from .worker import LocalWorker, ProcessWorker
+from .snapshot import EnvStates, Snapshot
+from .worker import ProcessWorker
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -32,12 +37,16 @@ class SetpointWarning(UserWarning):
     """A setpoint or start pose lies outside a joint's limits."""
 
 
+class FaultWarning(UserWarning):
+    """An env failed: its state is no longer finite, or a joint is too fast."""
+
+
 class Observation(NamedTuple):
     """State of every env after a tick. (envs, dof) in the robot's joint order, ``ok`` (envs,).
 
     ``qpos`` [rad or m], ``qvel`` [rad/s or m/s]; ``effort`` [N m or N] and ``saturated`` as applied in the last
     substep (under control "drive" the effort is the qf beside the drive, which PhysX keeps to itself).
-    ``ok`` is False for an env whose state is no longer finite.
+    ``ok`` is False for an env that failed in this tick, or is held since it did: see :attr:`Runner.faults`.
     """
 
     qpos: Float32
@@ -98,8 +107,24 @@ class Runner:
         of. A reset puts what it added back to where it left it.
     pack_size
         Scenes that share a PhysX system; a matter of speed alone.
+    on_fault
+        What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it was at
+        the end of the last tick, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
+        ``ok`` False for that tick. An env fails when its state is no longer finite, or by ``speed_limit``.
+    speed_limit
+        Joint speed at which an env fails, one for all joints or (dof,) [rad/s or m/s]; default none.
+    non_finite
+        What a NaN or infinity in a setpoint, its rate, a feedforward or a pose to reset to does: ``"raise"`` an
+        error, or ``"contain"`` it: the env that it is for fails.
+    recover
+        Whether a worker process that dies or gets stuck is replaced, and its envs brought back by replay: the results
+        are the same bytes as if nothing had happened. Otherwise :class:`batchpid.errors.WorkerError` is raised.
+    checkpoint_steps
+        Sim steps after which all workers start from a snapshot anew, so that no replay is longer than that; None:
+        never. Results depend on it in the last bits after contacts, on nothing else said here about workers.
     timeout
-        Seconds to wait for a worker before it counts as stuck.
+        Seconds, beyond any time that its work can take, before a worker counts as stuck. One that is stopped or asleep
+        amid a tick counts as stuck within a second.
 
     Raises
     ------
@@ -123,10 +148,14 @@ class Runner:
         ground: bool = True,
         build: Callable[[Any, int], Any] | None = None,
         pack_size: int = 4,
+        on_fault: str = "hold",
+        speed_limit: ArrayLike | None = None,
+        non_finite: str = "raise",
+        recover: bool = True,
+        checkpoint_steps: int | None = 8000,
         timeout: float = 60.0,
     ) -> None:
-        self._workers: list[LocalWorker | ProcessWorker] = []
-        self._closed = False
+        self._pool: WorkerPool | None = None
         if not isinstance(robot, Robot):
             raise InvalidArgumentError(
                 "robot",
@@ -148,7 +177,15 @@ class Runner:
             raise InvalidArgumentError(
                 "build", "must be a function", value=build, remedy="define build(scene, env)"
             )
-        self.timeout = number("timeout", timeout, 1e-3, 1e9, "seconds")
+        self._on_fault = choice("on_fault", on_fault, ACTIONS)
+        limit = None if speed_limit is None else self._check_speed_limit(speed_limit)
+        self._contains = choice("non_finite", non_finite, ("raise", "contain")) == "contain"
+        self._checkpoint_steps = (
+            None if checkpoint_steps is None else integer("checkpoint_steps", checkpoint_steps, 1, 10**9)
+        )
+        measurement_rate = flag("measurement_rate", measurement_rate)
+        recover = flag("recover", recover)
+        timeout = number("timeout", timeout, 1e-3, 1e9, "seconds")
         self._params = self._check_params(self._default_params() if params is None else params)
         scene = SceneSpec(
             urdf=robot.urdf,
@@ -162,26 +199,44 @@ class Runner:
             build=build,
         )
         self._warned: set[tuple[str, int]] = set()
-        self._ticks = 0
+        self._steps = self._since_checkpoint = 0
+        self.faults: deque[Fault] = deque(maxlen=10_000)
+        """Envs that failed, latest last."""
+        self._fault_steps = np.full(self.num_envs, -1)
         self.work_seconds = np.zeros(0)
         """Seconds that each worker worked in the last tick."""
-        self._slices = _share(self.num_envs, count, pack_size)
-        kind = LocalWorker if count == 0 else ProcessWorker
+        self._about = {
+            "robot": robot.name,
+            "urdf": hashlib.sha256(robot.urdf.encode()).hexdigest(),
+            "joints": list(robot.joint_names),
+            "num_envs": self.num_envs,
+            "timestep": self.timestep,
+            "control": self.control,
+            "compensate": self.compensate,
+            "physics": list(astuple(physics)),
+            "dissipation": robot.dissipation,
+            "ground": scene.ground,
+            "fixed_base": robot.fixed_base,
+            "measurement_rate": measurement_rate,
+        }
+
+        def spec(envs: slice) -> LoopSpec:
+            return LoopSpec(
+                scene=scene,
+                num_envs=envs.stop - envs.start,
+                params=first_params.for_envs(envs),
+                control=self.control,
+                compensate=self.compensate,
+                measurement_rate=measurement_rate,
+                pack_size=pack_size,
+                first_env=envs.start,
+                on_fault=on_fault,
+                speed_limit=limit,
+            )
+
+        first_params = self._params
+        self._pool = WorkerPool(spec, self.num_envs, count, pack_size, recover=recover, timeout=timeout)
         try:
-            for index, envs in enumerate(self._slices):
-                spec = LoopSpec(
-                    scene=scene,
-                    num_envs=envs.stop - envs.start,
-                    params=self._params.for_envs(envs),
-                    control=self.control,
-                    compensate=self.compensate,
-                    measurement_rate=flag("measurement_rate", measurement_rate),
-                    pack_size=pack_size,
-                    first_env=envs.start,
-                )
-                self._workers.append(kind(spec, index, envs.start))
-            if count:
-                self._receive()
             self.reset()
         except BaseException:
             self.close()
@@ -201,16 +256,15 @@ class Runner:
         mask
             (envs,) bool: which envs; default all. The others go on undisturbed.
         """
-        self._check_open()
-        shape = (self.num_envs, self.robot.dof)
+        pool = self._open()
         start = self.robot.start if qpos is None else qpos
-        position = array("qpos", start, shape, self.robot.joint_names)
-        velocity = array("qvel", 0.0 if qvel is None else qvel, shape, self.robot.joint_names)
+        position = self._rows("qpos", start)
+        velocity = self._rows("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else self._check_mask(mask)
         self._warn_limits("qpos", position[chosen])
-        for worker, envs in zip(self._workers, self._slices, strict=True):
-            worker.send("reset", chosen[envs], position[envs], velocity[envs])
-        self._receive()
+        pool.run(Call("reset", (chosen, position, velocity)))
+        self._fault_steps[chosen] = -1
+        self._note_faults()
         return self.observe()
 
     def step(
@@ -234,12 +288,11 @@ class Runner:
         substeps
             Sim steps of this tick; default the runner's.
         """
-        self._check_open()
+        self._open()
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
-        shape, names = (self.num_envs, self.robot.dof), self.robot.joint_names
-        target = array("setpoint", setpoint, shape, names)
-        rate = None if setpoint_rate is None else array("setpoint_rate", setpoint_rate, shape, names)
-        extra = None if feedforward is None else array("feedforward", feedforward, shape, names)
+        target = self._rows("setpoint", setpoint)
+        rate = None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate)
+        extra = None if feedforward is None else self._rows("feedforward", feedforward)
         if self.control != "effort":
             self._warn_limits("setpoint", target)
         self._tick(target, rate, extra, count)
@@ -264,8 +317,7 @@ class Runner:
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        self._check_open()
-        names = self.robot.joint_names
+        pool = self._open()
         table = np.asarray(setpoints)
         ticks = table.shape[0] if table.ndim in (2, 3) else 0
         if ticks == 0:
@@ -281,7 +333,7 @@ class Runner:
             if value is None:
                 return None
             rows = np.asarray(value)
-            return array(name, rows[:, None] if rows.ndim == 2 else rows, shape, names)
+            return self._rows(name, rows[:, None] if rows.ndim == 2 else rows, shape)
 
         targets = over_time("setpoints", setpoints)
         rates, extras = over_time("setpoint_rates", setpoint_rates), over_time("feedforwards", feedforwards)
@@ -289,7 +341,7 @@ class Runner:
         if self.control != "effort":
             self._warn_limits("setpoint", targets)
         result = Rollout(
-            time=np.asarray((self._ticks + 1 + np.arange(ticks)) * (self.substeps * self.timestep)),
+            time=(self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep,
             setpoint=np.array(targets),
             qpos=np.empty(shape, np.float32),
             qvel=np.empty(shape, np.float32),
@@ -305,13 +357,13 @@ class Runner:
                 self.substeps,
             )
             for name in Observation._fields:
-                self._gather(name, getattr(result, name)[tick])
+                pool.gather(name, getattr(result, name)[tick])
         return result
 
     def observe(self) -> Observation:
         """State of every env now, as fresh arrays."""
-        self._check_open()
-        return Observation(*(self._gather(name) for name in Observation._fields))
+        pool = self._open()
+        return Observation(*(pool.gather(name) for name in Observation._fields))
 
     def poses(self) -> Float32:
         """Poses now of the entities that ``build`` returned, (envs, entities, 7): x, y, z [m], quaternion w, x, y, z.
@@ -321,10 +373,7 @@ class Runner:
         InvalidArgumentError
             There is no ``build``, or it returned more entities for one env than for another.
         """
-        self._check_open()
-        for worker in self._workers:
-            worker.send("poses")
-        rows = [row for part in self._receive() for row in part]
+        rows = [row for part in self._open().run(Call("poses"), keep=False) for row in part]
         counts = [len(row) for row in rows]
         if not rows or len(set(counts)) > 1:
             raise InvalidArgumentError(
@@ -341,11 +390,51 @@ class Runner:
 
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
-        self._check_open()
-        self._params = self._check_params(params)
-        for worker, envs in zip(self._workers, self._slices, strict=True):
-            worker.send("set_params", self._params.for_envs(envs))
-        self._receive()
+        pool = self._open()
+        params = self._check_params(params)
+        pool.run(Call("set_params", (params,)))
+        self._params = params
+
+    def snapshot(self) -> Snapshot:
+        """State of all envs, physics and controller, to go on from: :meth:`restore`.
+
+        It is a barrier: this runner, too, goes on from it as from a restored one, so that both give the same bytes.
+        """
+        states = EnvStates.join(self._open().run(Call("snapshot")))
+        snapshot = Snapshot(self._about, self._steps, self._params, states)
+        self._start_from(snapshot)
+        return snapshot
+
+    def restore(self, snapshot: Snapshot) -> Observation:
+        """Put all envs into the state of ``snapshot``, with its params, from this runner or another like it.
+
+        Raises
+        ------
+        InvalidArgumentError
+            It is of another robot, number of envs, timestep, control, ...
+        """
+        pool = self._open()
+        if not isinstance(snapshot, Snapshot):
+            raise InvalidArgumentError(
+                "snapshot", "is none", value=type(snapshot).__name__, remedy="take one with runner.snapshot()"
+            )
+        snapshot.check(self._about)
+        self._check_params(snapshot.params)
+        pool.run(Call("restore", (snapshot,)))
+        self._steps, self._params = snapshot.steps, snapshot.params
+        self._fault_steps = snapshot.states.containment["step"].copy()
+        self._start_from(snapshot)
+        return self.observe()
+
+    @property
+    def time(self) -> float:
+        """Simulated seconds since the start."""
+        return self._steps * self.timestep
+
+    @property
+    def recoveries(self) -> int:
+        """How many lost workers were replaced."""
+        return 0 if self._pool is None else self._pool.recoveries
 
     @property
     def pids(self) -> tuple[int, ...]:
@@ -354,10 +443,13 @@ class Runner:
 
     def close(self) -> None:
         """End the workers and free the scenes. May be called again."""
-        self._closed = True
-        workers, self._workers = self._workers, []
-        for worker in workers:
-            worker.close()
+        if self._pool is not None:
+            self._pool.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed, or a worker was lost for good."""
+        return self._pool is None or self._pool.closed
 
     def __enter__(self) -> Runner:
         return self
@@ -368,7 +460,7 @@ class Runner:
         self.close()
 
     def __del__(self) -> None:
-        if not getattr(self, "_closed", True):
+        if getattr(self, "_pool", None) is not None:
             self.close()
 
     # -- inside --------------------------------------------------------------------------------------------------
@@ -380,38 +472,63 @@ class Runner:
         feedforward: NDArray[np.float64] | None,
         substeps: int,
     ) -> None:
-        for worker, envs in zip(self._workers, self._slices, strict=True):
-            arrays = worker.arrays
-            arrays.setpoint[...] = setpoint[envs]
-            if rate is not None:
-                arrays.setpoint_rate[...] = rate[envs]
-            if feedforward is not None:
-                arrays.feedforward[...] = feedforward[envs]
-            worker.send_tick(substeps, rate is not None, feedforward is not None)
-        self.work_seconds = np.array(self._receive())
-        self._ticks += 1
+        pool = self._open()
+        if self._checkpoint_steps is not None and self._since_checkpoint >= self._checkpoint_steps:
+            self.snapshot()
+        self._steps += substeps
+        self._since_checkpoint += substeps
+        self.work_seconds = np.array(pool.run(Tick(setpoint, rate, feedforward, substeps)))
+        self._note_faults()
 
-    def _receive(self) -> list[Any]:
-        """One answer of every worker; on failure all answers are taken before the first error is raised."""
-        deadline = time.monotonic() + self.timeout
-        results, errors = [], []
-        for worker in self._workers:
-            try:
-                results.append(worker.receive(max(deadline - time.monotonic(), 1e-3)))
-            except Exception as error:
-                errors.append(error)
-        if errors:
-            if any(isinstance(error, WorkerError) for error in errors):
-                self.close()
-            raise errors[0]
-        return results
+    def _start_from(self, snapshot: Snapshot) -> None:
+        self._since_checkpoint = 0
+        self._open().start_from(Call("restore", (snapshot,)))
 
-    def _gather(self, name: str, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        return np.concatenate([getattr(worker.arrays, name) for worker in self._workers], out=out)
+    def _note_faults(self) -> None:
+        """Add what failed since the last look to :attr:`faults`; warn of the first."""
+        if all(worker.arrays.ok.all() for worker in self._workers):
+            return
+        pool = self._open()
+        steps, joints, causes = (pool.gather(f"fault_{name}") for name in ("step", "joint", "cause"))
+        for env in np.flatnonzero((steps >= 0) & (steps != self._fault_steps)).tolist():
+            step = int(steps[env])
+            joint, cause = self.robot.joint_names[joints[env]], CAUSES[causes[env]]
+            self.faults.append(Fault(env, step, step * self.timestep, joint, cause, self._on_fault))
+        self._fault_steps = steps
+        if self.faults and ("fault", 0) not in self._warned:
+            self._warned.add(("fault", 0))
+            warnings.warn(
+                f"{self.faults[0]}; see runner.faults for more, of which there is no further warning",
+                FaultWarning,
+                stacklevel=4,
+            )
 
-    def _check_open(self) -> None:
-        if self._closed:
+    @property
+    def _workers(self) -> list[Worker]:
+        return [] if self._pool is None else self._pool.workers
+
+    def _open(self) -> WorkerPool:
+        if self._pool is None or self.closed:
             raise ClosedError("this Runner is closed; make a new one")
+        self._pool.settle()
+        return self._pool
+
+    def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
+        shape = (self.num_envs, self.robot.dof) if shape is None else shape
+        return array(name, value, shape, self.robot.joint_names, finite=not self._contains)
+
+    def _check_speed_limit(self, value: ArrayLike) -> NDArray[np.float64]:
+        limit = array("speed_limit", value, (1, self.robot.dof), self.robot.joint_names)[0]
+        if (limit <= 0).any():
+            index = int(np.argmax(limit <= 0))
+            raise InvalidArgumentError(
+                "speed_limit",
+                "must be > 0",
+                joint=self.robot.joint_names[index],
+                value=float(limit[index]),
+                remedy="leave it out for none",
+            )
+        return limit
 
     def _default_params(self) -> bp.PIDParams:
         settings = self.robot.settings
@@ -481,12 +598,3 @@ class Runner:
                 SetpointWarning,
                 stacklevel=3,
             )
-
-
-def _share(num_envs: int, workers: int, pack_size: int) -> list[slice]:
-    """Contiguous slices of envs, one for each worker, cut where packs end as far as that keeps the load even."""
-    count = max(1, min(workers, num_envs))
-    packs = -(-num_envs // pack_size)
-    unit = pack_size if packs % count == 0 else 1
-    cuts = [min(num_envs, unit * (-(-num_envs // unit) * k // count)) for k in range(count + 1)]
-    return [slice(low, high) for low, high in pairwise(cuts) if high > low]

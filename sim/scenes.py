@@ -37,6 +37,8 @@ with warnings.catch_warnings():
 
 GRAVITY = (0.0, 0.0, -9.81)
 
+_ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
+
 Float32 = NDArray[np.float32]
 
 
@@ -181,6 +183,7 @@ class Pack:
         # set_qf from a kept row view costs half of what a fresh one does.
         self._qf = np.zeros((size, self.dof), np.float32)
         self._set_qf = [(robot.set_qf, row) for robot, row in zip(self._robots, self._qf, strict=True)]
+        self._held: NDArray[np.bool_] = np.zeros(size, bool)
         self._steps = [system.step for system in self._systems]
 
     def step(self) -> None:
@@ -212,22 +215,60 @@ class Pack:
         """The efforts last written, as the engine received them (a view)."""
         return self._qf
 
-    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
+    def write_state(
+        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], root: NDArray[Any] | None = None
+    ) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof); their efforts become zero.
 
-        Also the way back from NaN, which is why the root is placed too.
+        ``root`` (len(rows), 13), as :meth:`read_root` gives it, is by default the origin, at rest. Also the way back
+        from NaN, which is why the root is placed too.
         """
-        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+        roots = np.tile(_ORIGIN, (len(rows), 1)) if root is None else root
+        for row, position, velocity, base in zip(rows, qpos, qvel, roots, strict=True):
             robot = self._robots[row]
-            robot.set_root_pose(sapien.Pose())
-            robot.set_root_linear_velocity([0.0, 0.0, 0.0])
-            robot.set_root_angular_velocity([0.0, 0.0, 0.0])
+            robot.set_root_pose(sapien.Pose(base[:3], base[3:7]))
+            robot.set_root_linear_velocity(base[7:10])
+            robot.set_root_angular_velocity(base[10:])
             robot.set_qpos(position.astype(np.float32))
             robot.set_qvel(velocity.astype(np.float32))
             self._qf[row] = 0.0
             robot.set_qf(self._qf[row])
             if self._contents:
                 self._contents[row].reset()
+
+    def read_root(self) -> Float32:
+        """Each robot's root link (M, 13): position, quaternion w, x, y, z, linear and angular velocity."""
+        rows = [
+            np.concatenate(
+                [pose.p, pose.q, robot.get_root_linear_velocity(), robot.get_root_angular_velocity()]
+            )
+            for robot, pose in ((robot, robot.get_root_pose()) for robot in self._robots)
+        ]
+        return np.array(rows, np.float32)
+
+    def read_content(self) -> Float32:
+        """State of each scene's own content (M, numbers), NaN where a scene has less of it than another."""
+        rows = [content.read() for content in self._contents] or [np.zeros(0, np.float32)] * self.size
+        table = np.full((self.size, max(map(len, rows))), np.nan, np.float32)
+        for line, row in zip(table, rows, strict=True):
+            line[: len(row)] = row
+        return table
+
+    def write_content(self, table: NDArray[Any]) -> None:
+        """Put each scene's own content into the state that :meth:`read_content` gave."""
+        for content, row in zip(self._contents, table, strict=False):
+            content.write(row)
+
+    def hold(self, mask: NDArray[np.bool_]) -> None:
+        """Let go of the robots of ``mask`` (M,): no effort reaches them, and no gravity. The others are in the loop."""
+        if (mask == self._held).all():
+            return
+        for robot, held in zip(self._robots, mask, strict=True):
+            for link in robot.links:
+                link.disable_gravity = bool(held)
+        self._held = mask.copy()
+        rows = zip(self._robots, self._qf, mask, strict=True)
+        self._set_qf = [(robot.set_qf, row) for robot, row, held in rows if not held]
 
     def read_poses(self) -> list[Float32]:
         """Poses of each scene's watched entities, (watched, 7) each."""
@@ -260,7 +301,7 @@ class Pack:
         """Free the scenes. The pack cannot be used afterwards."""
         self._set_qf, self._get_qpos, self._get_qvel, self._passive = [], [], [], []
         self._joints, self._robots, self._contents = [], [], []
-        self._scenes = []
+        self._scenes, self._systems, self._steps = [], [], []
 
 
 def _bare_scene(system: Any) -> Any:

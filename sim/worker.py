@@ -2,21 +2,26 @@
 
 The process is started afresh (no fork, no re-import of the caller's ``__main__``), so it works from notebooks and from
 scripts without a main guard. It shares with its parent one socket and one block of memory, both by file
-descriptor; when either process dies the other sees the socket close. Requests on the hot path are one struct;
-all others are pickled.
+descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the worker, which waits
+for that in a thread, ends at once. Requests on the hot path are one struct; all others are pickled.
 """
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import gc
 import json
 import os
 import pickle
+import select
 import signal
 import socket
 import struct
 import subprocess
 import sys
+import threading
+import time
 import traceback
 from multiprocessing.connection import Connection
 from typing import Any
@@ -25,6 +30,7 @@ import cloudpickle
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 
+from .liveness import Pulse
 from .loop import Arrays, Loop, LoopSpec
 from .shared import SharedArrays
 
@@ -34,12 +40,16 @@ DONE = struct.Struct("<cd")  # b"D", seconds of work
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
+class WorkerLost(WorkerError):
+    """A worker died, or is stuck; the message names it, its envs and the cause."""
+
+
 class LocalWorker:
     """The loop in this process, behind the same calls as a worker process."""
 
-    def __init__(self, spec: LoopSpec, index: int, first_env: int) -> None:
-        layout = Arrays.layout(spec.num_envs, len(spec.scene.joints))
-        self._shared = SharedArrays(layout)
+    def __init__(self, spec: LoopSpec, index: int) -> None:
+        self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
+        self._shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)))
         self.arrays = Arrays(**self._shared.arrays)
         self._loop = Loop(spec, self.arrays)
         self._result: Any = None
@@ -52,25 +62,31 @@ class LocalWorker:
         """Run one tick; :meth:`receive` gives the seconds it took."""
         self._result = self._loop.tick(substeps, use_rate, use_feedforward)
 
-    def receive(self, timeout: float) -> Any:
+    def receive(self) -> Any:
         """Result of the last request."""
         return self._result
 
-    def close(self) -> None:
+    def close(self, patience: float = 0.0) -> None:
         """Free the scenes."""
         self._loop.close()
         self._shared.close()
 
 
 class ProcessWorker:
-    """The parent's end of a worker process: ``send`` a request, then ``receive`` its result."""
+    """The parent's end of a worker process: ``send`` a request, then ``receive`` its result.
 
-    def __init__(self, spec: LoopSpec, index: int, first_env: int) -> None:
-        self.index, self.envs = index, range(first_env, first_env + spec.num_envs)
+    The first result, None, comes unasked, when the loop is built.
+    """
+
+    def __init__(self, spec: LoopSpec, index: int) -> None:
+        self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
         message = _pickle(spec)
+        self._owner = os.getpid()
         self._shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)))
         self.arrays = Arrays(**self._shared.arrays)
+        self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         ours, theirs = socket.socketpair()
+        descriptors = (theirs.fileno(), self._shared.fd, self._trace)
         with theirs:
             self._process = subprocess.Popen(
                 [
@@ -78,49 +94,47 @@ class ProcessWorker:
                     "-c",
                     _BOOT,
                     json.dumps(sys.path),
-                    str(theirs.fileno()),
-                    str(self._shared.fd),
+                    str(os.getpid()),
+                    *map(str, descriptors),
                 ],
-                pass_fds=(theirs.fileno(), self._shared.fd),
+                pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
             )
         self._connection = Connection(ours.detach())
-        self._connection.send_bytes(message)
+        self._pulse = Pulse(self.pid)
+        self._began = time.monotonic()
+        with contextlib.suppress(OSError):  # it died: the first receive says so
+            self._connection.send_bytes(message)
 
     @property
     def pid(self) -> int:
         """Process id of the worker."""
         return self._process.pid
 
+    def fileno(self) -> int:
+        """File descriptor that becomes readable when there is a result, or the worker is dead."""
+        return self._connection.fileno()
+
     def send(self, method: str, *args: Any) -> None:
         """Ask for ``loop.method(*args)``."""
-        try:
-            self._connection.send((method, args))
-        except OSError as error:
-            raise self._death() from error
+        self._send(pickle.dumps((method, args)))
 
     def send_tick(self, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
         """Ask for one tick; its result is the seconds it took."""
-        try:
-            self._connection.send_bytes(TICK.pack(b"T", substeps, use_rate, use_feedforward))
-        except OSError as error:
-            raise self._death() from error
+        self._send(TICK.pack(b"T", substeps, use_rate, use_feedforward))
 
-    def receive(self, timeout: float) -> Any:
+    def receive(self) -> Any:
         """Wait for the result of the last request.
 
         Raises
         ------
+        WorkerLost
+            The worker died.
         WorkerError
-            The worker died, raised, or gave no answer within ``timeout`` seconds.
+            The loop raised; the message holds the worker's traceback. What it raised on purpose comes as it is.
         """
         try:
-            if not self._connection.poll(timeout):
-                raise WorkerError(
-                    f"{self._name()}: no answer within {timeout:g} s; it may be stuck, or the machine overloaded: "
-                    "raise timeout=, or close the runner and start again"
-                )
             message = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
             raise self._death() from error
@@ -133,48 +147,105 @@ class ProcessWorker:
             raise WorkerError(f"{self._name()} raised:\n{failure}")
         return result
 
+    def check_alive(self, idle_limit: float, limit: float) -> None:
+        """Look at a worker that has not answered yet.
+
+        Raises
+        ------
+        WorkerLost
+            It has been stopped or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``.
+        """
+        now = time.monotonic()
+        if (idle := self._pulse.idle(now)) > idle_limit:
+            state = "stopped" if self._pulse.stopped else "asleep"
+            raise self._lost(f"is stuck: {state} for {idle:.1f} s amid a request")
+        if now - self._began > limit:
+            raise self._lost(
+                f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short"
+            )
+
     def close(self, patience: float = 5.0) -> None:
-        """End the process: ask, and after ``patience`` seconds kill."""
+        """End the process: ask, and kill it after ``patience`` seconds."""
         self._connection.close()
-        try:
-            self._process.wait(patience)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
+        if os.getpid() == self._owner:  # else we are a fork of the parent, and the process is not ours to end
+            try:
+                self._process.wait(patience) if patience else self._process.kill()
+            except subprocess.TimeoutExpired:
+                self._process.kill()
             self._process.wait()
         self._shared.close()
+        if self._trace >= 0:
+            os.close(self._trace)
+            self._trace = -1
+
+    def _send(self, message: bytes) -> None:
+        self._began = time.monotonic()
+        self._pulse.begin(self._began)
+        try:
+            self._connection.send_bytes(message)
+        except OSError as error:
+            raise self._death() from error
 
     def _name(self) -> str:
         return f"worker {self.index} (pid {self.pid}, envs {self.envs.start} to {self.envs.stop - 1})"
 
-    def _death(self) -> WorkerError:
+    def _death(self) -> WorkerLost:
         try:
             code = self._process.wait(1.0)
         except subprocess.TimeoutExpired:
-            return WorkerError(f"{self._name()} closed its connection; close the runner and start again")
-        cause = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        return WorkerError(
-            f"{self._name()} died ({cause}); its envs are lost: close the runner and start again"
-        )
+            return self._lost("closed its connection")
+        return self._lost(f"died ({_signal_name(-code)})" if code < 0 else f"died (exit code {code})")
+
+    def _lost(self, cause: str) -> WorkerLost:
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGUSR1)  # it writes its stack, unless it is stopped
+            time.sleep(0.05)
+        trace = os.pread(self._trace, 100_000, 0).decode(errors="replace").strip()
+        return WorkerLost(f"{self._name()} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 _BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.worker import main; main()"
 
 
 def main() -> None:
-    """Entry point of the child: ``argv`` holds the import path and the two file descriptors."""
+    """Entry point of the child: ``argv`` holds the import path, the parent's pid and three file descriptors."""
     # The parent handles Ctrl-C and closes the socket; the worker must not die half-way through a tick.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    connection, fd = Connection(int(sys.argv[2])), int(sys.argv[3])
+    parent, channel, memory, trace = map(int, sys.argv[2:])
+    faulthandler.enable(trace)
+    faulthandler.register(signal.SIGUSR1, trace)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    connection = Connection(channel)
     try:
         spec: LoopSpec = connection.recv()
-        _serve(connection, spec, fd)
+        _serve(connection, spec, memory)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent closed, or died
+    os._exit(0)  # nothing is left to save, and the engine's own end can take long
 
 
-def _serve(connection: Connection, spec: LoopSpec, fd: int) -> None:
-    shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)), fd)
-    loop: Loop | None = None
+def _end_with(parent: int) -> None:
+    """End this process when ``parent`` is gone, even in the midst of a long tick."""
+    try:
+        watched = os.pidfd_open(parent)
+    except OSError:  # gone already, or a kernel before 5.3
+        while os.getppid() == parent:
+            time.sleep(0.2)
+    else:
+        if os.getppid() == parent:
+            select.select([watched], [], [])
+    os._exit(1)
+
+
+def _serve(connection: Connection, spec: LoopSpec, memory: int) -> None:
+    shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)), memory)
     try:
         loop = Loop(spec, Arrays(**shared.arrays))
     except Exception as error:

@@ -186,4 +186,4 @@ def test_a_single_env_is_closed_with_its_scene():
     assert isinstance(runner, Runner)
     env.close()
     gc.collect()
-    assert runner._closed
+    assert runner.closed

@@ -1,0 +1,82 @@
+"""What workers are asked to do. A command is for all envs, and knows how to ask each worker for its part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .worker import LocalWorker, ProcessWorker
+
+Worker = LocalWorker | ProcessWorker
+
+
+class Command:
+    """Base of all commands."""
+
+    idle_limit = 10.0
+    """Seconds for which a worker may sleep meanwhile: it may be building, with the caller's own code."""
+
+    def send(self, worker: Worker, envs: slice) -> None:
+        """Ask ``worker``, whose envs are ``envs``."""
+        raise NotImplementedError
+
+    def limit(self, envs: int) -> float:
+        """Seconds that it takes for so many envs at the very most."""
+        return 1e-2 * envs
+
+
+@dataclass(frozen=True)
+class Start(Command):
+    """What a new process does unasked: build its loop."""
+
+    def send(self, worker: Worker, envs: slice) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class Call(Command):
+    """Call a method of the loop. Arrays among ``args`` have a row for each env; ``for_envs`` takes parts of others."""
+
+    method: str
+    args: tuple[Any, ...] = ()
+
+    def send(self, worker: Worker, envs: slice) -> None:
+        """Ask ``worker``, whose envs are ``envs``."""
+        parts = (arg.for_envs(envs) if hasattr(arg, "for_envs") else arg[envs] for arg in self.args)
+        worker.send(self.method, *parts)
+
+
+@dataclass(frozen=True)
+class Tick(Command):
+    """Run a tick. The arrays are (envs, dof)."""
+
+    setpoint: NDArray[np.float64]
+    setpoint_rate: NDArray[np.float64] | None
+    feedforward: NDArray[np.float64] | None
+    substeps: int
+
+    idle_limit = 0.7  # a tick does nothing but compute
+
+    def send(self, worker: Worker, envs: slice) -> None:
+        """Ask ``worker``, whose envs are ``envs``."""
+        arrays = worker.arrays
+        arrays.setpoint[...] = self.setpoint[envs]
+        if self.setpoint_rate is not None:
+            arrays.setpoint_rate[...] = self.setpoint_rate[envs]
+        if self.feedforward is not None:
+            arrays.feedforward[...] = self.feedforward[envs]
+        worker.send_tick(self.substeps, self.setpoint_rate is not None, self.feedforward is not None)
+
+    def limit(self, envs: int) -> float:
+        """Seconds that it takes for so many envs at the very most: a sim step of one takes some 20 us."""
+        return 1e-3 * self.substeps * envs
+
+    def kept(self) -> Tick:
+        """Copy of it, which stays as it is when the caller writes to the arrays."""
+        rate, feedforward = (
+            None if rows is None else rows.copy() for rows in (self.setpoint_rate, self.feedforward)
+        )
+        return Tick(self.setpoint.copy(), rate, feedforward, self.substeps)

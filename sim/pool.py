@@ -1,0 +1,270 @@
+"""The runner's workers: each has a slice of the envs; one that is lost is replaced and brought back by replay.
+
+Every command that changes a worker is kept until the next checkpoint, a snapshot of all envs. A new worker is given the
+last checkpoint and the commands since; since a checkpoint is a barrier for the workers that live, too (see
+:mod:`sim.snapshot`), it arrives at the same bytes. The commands of a worker stand in a queue, so that one worker can
+catch up while the others go on, and an interrupted wait (Ctrl-C) can be taken up again.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import BatchPIDError, WorkerError
+
+from .command import Command, Start, Tick, Worker
+from .loop import LoopSpec
+from .worker import LocalWorker, ProcessWorker, WorkerLost
+
+_LOOK = 0.1  # seconds between two looks at workers that do not answer
+_LIVES = 5  # times that a worker may be lost before it has finished the command in hand
+
+
+class RecoveryWarning(UserWarning):
+    """A worker was lost and brought back."""
+
+
+@dataclass
+class _Seat:
+    """The place of one worker: its envs, what it has to do, and how far it is with the first of that."""
+
+    spec: LoopSpec
+    index: int
+    envs: slice
+    worker: Worker
+    queue: deque[Command] = field(default_factory=deque)
+    phase: str = "idle"  # "idle", "busy", or "torn": interrupted amid a message
+    result: Any = None
+    losses: int = 0
+    cause: str = ""
+    lost: float = 0.0
+
+
+class WorkerPool:
+    """Workers for ``num_envs`` envs: ``count`` processes, or with 0 the loop in this process.
+
+    Parameters
+    ----------
+    spec
+        For a slice of envs, the spec of their loop.
+    recover
+        Whether lost workers are brought back. Otherwise the loss is raised, and the pool is closed.
+    timeout
+        Seconds, beside what a command should take at the very most, before a worker counts as stuck.
+    """
+
+    def __init__(
+        self,
+        spec: Callable[[slice], LoopSpec],
+        num_envs: int,
+        count: int,
+        pack_size: int,
+        *,
+        recover: bool,
+        timeout: float,
+    ) -> None:
+        self._kind = ProcessWorker if count else LocalWorker
+        self._recover, self._timeout = recover, timeout
+        self._journal: list[Command] = []
+        self._seats: list[_Seat] = []
+        self._poller = select.poll()
+        self._kept = True  # whether the command in hand is in the journal
+        self._warning: str | None = None
+        self.recoveries = 0
+        """How many lost workers were replaced."""
+        try:
+            for index, envs in enumerate(_share(num_envs, count, pack_size)):
+                seat = _Seat(spec(envs), index, envs, self._kind(spec(envs), index))
+                self._seats.append(seat)
+                self._welcome(seat)
+            self._finish()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` was called, or a worker was lost for good."""
+        return not self._seats
+
+    @property
+    def workers(self) -> list[Worker]:
+        """The workers, in the order of their envs."""
+        return [seat.worker for seat in self._seats]
+
+    def run(self, command: Command, *, keep: bool = True) -> list[Any]:
+        """Let every worker run ``command``; return their results.
+
+        ``keep`` it for replay unless it changes nothing.
+
+        Raises
+        ------
+        BatchPIDError
+            What a loop raised on purpose; nothing was changed.
+        WorkerError
+            A loop raised something else, or a worker was lost for good; the pool is closed.
+        """
+        self.settle()
+        for seat in self._seats:
+            seat.queue.append(command)
+        self._kept = keep
+        if keep and self._recover:
+            self._journal.append(command.kept() if isinstance(command, Tick) else command)
+        try:
+            self._finish()
+        except Exception as error:
+            if _on_purpose(error) and keep and self._recover:
+                self._journal.pop()
+            if not _on_purpose(error):
+                self.close()
+            raise
+        if self._warning is not None:
+            message, self._warning = self._warning, None
+            warnings.warn(message, RecoveryWarning, stacklevel=4)
+        return [seat.result for seat in self._seats]
+
+    def settle(self) -> None:
+        """Finish what a wait that was interrupted left unfinished."""
+        if any(seat.queue for seat in self._seats):
+            try:
+                self._finish()
+            except Exception:
+                self.close()
+                raise
+
+    def start_from(self, command: Command) -> None:
+        """Forget the commands so far: ``command`` takes a new worker to where the workers are now."""
+        if self._recover:
+            self._journal = [command]
+
+    def gather(self, name: str, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """One of the loops' arrays over all envs."""
+        return np.concatenate([getattr(seat.worker.arrays, name) for seat in self._seats], out=out)
+
+    def close(self) -> None:
+        """End all workers; those amid a command at once."""
+        seats, self._seats = self._seats, []
+        for seat in seats:
+            self._dismiss(seat, patience=0.0 if seat.queue else 5.0)
+
+    # -- one command, until every worker has done it ---------------------------------------------------------------
+
+    def _finish(self) -> None:
+        """Serve the queues until all are empty; only then raise what the loops raised."""
+        errors: list[Exception] = []
+        look = time.monotonic() + _LOOK
+        while busy := [seat for seat in self._seats if seat.queue]:
+            for seat in busy:
+                if seat.phase == "torn":
+                    self._lose(seat, WorkerLost(f"worker {seat.index} was interrupted amid a message"))
+                if seat.phase == "idle":
+                    self._attempt(seat, self._send, errors)
+            answered = self._answered(busy)
+            for seat in answered:
+                self._attempt(seat, self._receive, errors)
+            if time.monotonic() > look:
+                for seat in busy:
+                    if seat.phase == "busy" and seat not in answered:
+                        self._attempt(seat, self._look, errors)
+                look = time.monotonic() + _LOOK
+        if errors:
+            raise next((error for error in errors if not _on_purpose(error)), errors[0])
+
+    def _attempt(self, seat: _Seat, act: Callable[[_Seat], None], errors: list[Exception]) -> None:
+        try:
+            act(seat)
+        except WorkerLost as error:
+            self._lose(seat, error)
+        except Exception as error:
+            seat.phase = "idle"
+            seat.queue.popleft()
+            errors.append(error)
+
+    def _send(self, seat: _Seat) -> None:
+        seat.phase = "torn"
+        seat.queue[0].send(seat.worker, seat.envs)
+        seat.phase = "busy"
+
+    def _receive(self, seat: _Seat) -> None:
+        seat.phase = "torn"
+        seat.result = seat.worker.receive()
+        seat.phase = "idle"
+        seat.queue.popleft()
+        if not seat.queue and seat.losses:
+            self.recoveries += 1
+            self._warning = f"{seat.cause}; brought back in {time.monotonic() - seat.lost:.1f} s by replay"
+            seat.losses = 0
+
+    def _look(self, seat: _Seat) -> None:
+        command, envs = seat.queue[0], seat.envs.stop - seat.envs.start
+        assert isinstance(seat.worker, ProcessWorker)
+        seat.worker.check_alive(command.idle_limit, self._timeout + command.limit(envs))
+
+    def _answered(self, busy: list[_Seat]) -> list[_Seat]:
+        """Wait a little; return those of the busy seats whose worker has answered, or died."""
+        waiting = [seat for seat in busy if seat.phase == "busy"]
+        if self._kind is LocalWorker:
+            return waiting
+        readable = {descriptor for descriptor, _ in self._poller.poll(1e3 * _LOOK)}
+        return [seat for seat in waiting if seat.worker.fileno() in readable]  # type: ignore[union-attr]
+
+    # -- lost workers ----------------------------------------------------------------------------------------------
+
+    def _lose(self, seat: _Seat, error: WorkerLost) -> None:
+        """Put a new worker in the place of one that is lost, with all it has to do to catch up."""
+        if not self._recover:
+            raise WorkerLost(
+                f"{error}; its envs are lost, because recovery is off: pass recover=True"
+            ) from error
+        seat.losses += 1
+        if seat.losses >= _LIVES:
+            raise WorkerLost(
+                f"{error}; lost {_LIVES} times amid the same command, so that a further try is no use: run these "
+                "envs with workers=0 to see why"
+            ) from error
+        if seat.losses == 1:
+            seat.cause, seat.lost = str(error), time.monotonic()
+        current = seat.queue[-1]
+        self._dismiss(seat, patience=0.0)
+        seat.worker = self._kind(seat.spec, seat.index)
+        self._welcome(seat)
+        if not isinstance(current, Start):
+            seat.queue.extend(self._journal)
+            if not self._kept:
+                seat.queue.append(current)
+
+    def _welcome(self, seat: _Seat) -> None:
+        seat.phase = "idle"
+        seat.queue.clear()
+        if isinstance(seat.worker, ProcessWorker):
+            self._poller.register(seat.worker.fileno(), select.POLLIN)
+            seat.queue.append(Start())
+
+    def _dismiss(self, seat: _Seat, patience: float) -> None:
+        if isinstance(seat.worker, ProcessWorker):
+            self._poller.unregister(seat.worker.fileno())
+        seat.worker.close(patience)
+
+
+def _on_purpose(error: Exception) -> bool:
+    """Whether a loop raised this on purpose, before it changed anything."""
+    return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)
+
+
+def _share(num_envs: int, workers: int, pack_size: int) -> list[slice]:
+    """Contiguous slices of envs, one for each worker, cut where packs end as far as that keeps the load even."""
+    count = max(1, min(workers, num_envs))
+    packs = -(-num_envs // pack_size)
+    unit = pack_size if packs % count == 0 else 1
+    cuts = [min(num_envs, unit * (-(-num_envs // unit) * k // count)) for k in range(count + 1)]
+    return [slice(low, high) for low, high in pairwise(cuts) if high > low]
