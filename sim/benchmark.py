@@ -126,7 +126,7 @@ def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -
         )
     rates: dict[str, list[float]] = {case: [] for case in CASES}
     final: dict[str, Float64] = {}
-    hands = [_Hand(setup, index) for index in range(max(setup.workers, 1))]
+    hands = [Hand(setup, index) for index in range(max(setup.workers, 1))]
     robot = Robot.load(robot.path, dissipation="sapien")
     try:
         with Runner(
@@ -139,13 +139,13 @@ def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -
                         seconds, steps, final[case] = _run_closed_loop(runner, setup)
                     else:
                         taken = hands[:1] if case == "tutorial" else hands
-                        seconds, steps, final[case] = _run_by_hand(case, taken, setup)
+                        seconds, steps, final[case] = run_by_hand(case, taken, setup)
                     rates[case].append(steps / seconds)
     finally:
         for hand in hands:
             hand.close()
     for case, place in final.items():
-        _check_motion(case, place, setup)
+        check_motion(case, place, setup)
     return {case: Result(tuple(rates[case]), final[case]) for case in CASES}
 
 
@@ -204,7 +204,8 @@ def _run_closed_loop(runner: Runner, setup: Setup) -> tuple[float, int, Float64]
     return seconds, setup.num_envs * setup.ticks * setup.substeps, obs.qpos[0].astype(np.float64)
 
 
-def _run_by_hand(case: str, hands: list[_Hand], setup: Setup) -> tuple[float, int, Float64]:
+def run_by_hand(case: str, hands: list[Hand], setup: Setup) -> tuple[float, int, Float64]:
+    """Run one round of ``case`` on ``hands`` at once: (seconds, env-steps, where the first env ended)."""
     for hand in hands:
         hand.prepare(case)
     began = time.perf_counter()
@@ -215,7 +216,8 @@ def _run_by_hand(case: str, hands: list[_Hand], setup: Setup) -> tuple[float, in
     return seconds, sum(steps for steps, _ in results), results[0][1]
 
 
-def _check_motion(case: str, place: Float64, setup: Setup) -> None:
+def check_motion(case: str, place: Float64, setup: Setup) -> None:
+    """Raise unless the robot at ``place`` (dof,) has moved from the start towards the target."""
     moving = setup.moving
     way = np.abs(place - setup.start)[moving]
     left = np.abs(place - setup.target)[moving]
@@ -250,7 +252,7 @@ class _Clock:
         return timed
 
 
-class _Hand:
+class Hand:
     """A process that steps its share of the scenes by hand, case after case."""
 
     def __init__(self, setup: Setup, index: int) -> None:
@@ -269,17 +271,21 @@ class _Hand:
         theirs.close()
 
     def prepare(self, case: str) -> None:
+        """Build what ``case`` needs, and put its robots at the start."""
         self._connection.send(case)
         self._connection.recv()
 
     def go(self) -> None:
+        """Begin to step."""
         self._connection.send(None)
 
     def result(self) -> tuple[int, Float64]:
+        """Wait for the env-steps made, and where the first env ended."""
         steps, final = self._connection.recv()
         return steps, final
 
     def close(self) -> None:
+        """End the process."""
         self._connection.close()
         self._process.join(5.0)
         if self._process.is_alive():

@@ -23,7 +23,9 @@ COMMANDS = {
         "batchpid.cli.rollout:Rollout",
         "N of any robot follow a setpoint; what happened goes to a file",
     ),
+    "bench": ("batchpid.cli.bench:Bench", "the closed loop beside the tutorial's loop and the bare engine"),
     "inspect": ("batchpid.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
+    "view": ("batchpid.cli.view:View", "robots in the browser, live: sliders, charts, pushes and payloads"),
 }
 
 
