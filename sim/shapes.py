@@ -25,7 +25,7 @@ Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Rgba = tuple[float, float, float, float]
 
-_SEGMENTS = 28  # of a circle
+_SEGMENTS = 20  # of a circle
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 
 

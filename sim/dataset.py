@@ -1,0 +1,104 @@
+"""Rollouts as labelled data: read back from a file, and as an ``xarray.Dataset`` with dimensions, units and names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
+
+from .robot import Robot
+from .runner import Rollout
+
+if TYPE_CHECKING:
+    import xarray
+
+_SAYS = {
+    "setpoint": "setpoint",
+    "qpos": "joint position",
+    "qvel": "joint velocity",
+    "effort": "applied joint effort",
+    "saturated": "effort at its limit",
+    "ok": "state is finite",
+}
+
+
+class Recorded(NamedTuple):
+    """A rollout from a file, and what the file says of its robot: ``units`` are "rad" or "m", by joint."""
+
+    rollout: Rollout
+    robot: str
+    joint_names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+def read_rollout(path: str | Path) -> Recorded:
+    """Read what ``batchpid rollout --out FILE.npz`` wrote.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The file is not there, or holds something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidArgumentError("path", "is no file", value=str(path), remedy="check the spelling")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return Recorded(
+                Rollout(*(data[name] for name in Rollout._fields)),
+                str(data["robot"]),
+                tuple(map(str, data["joint_names"])),
+                tuple(map(str, data["units"])),
+            )
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InvalidArgumentError(
+            "path",
+            f"cannot be read as a rollout: {error}",
+            value=str(path),
+            remedy="give a file that batchpid rollout --out wrote",
+        ) from error
+
+
+def to_dataset(rollout: Rollout, robot: Robot | Recorded) -> xarray.Dataset:
+    """Return ``rollout`` as a dataset with dimensions time, env and joint.
+
+    Coordinates: ``time`` [s], ``env``, ``joint`` (names) and ``unit`` (rad or m, by joint). Every variable has a
+    ``long_name`` and ``units``; "rad|m" means the joint's own ``unit``. The arrays are not copied.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without the ``xarray`` package.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise MissingDependencyError("xarray", "a labelled dataset", "data") from None
+    units = {"setpoint": "rad|m", "qpos": "rad|m", "qvel": "rad/s|m/s", "effort": "N m|N"}
+    variables: dict[str, Any] = {}
+    for name, says in _SAYS.items():
+        dims = ("time", "env") if name == "ok" else ("time", "env", "joint")
+        variables[name] = (dims, getattr(rollout, name), {"long_name": says, "units": units.get(name, "1")})
+    if isinstance(robot, Robot):
+        title, joint_units = robot.name, [joint.unit for joint in robot.joints]
+    else:
+        title, joint_units = robot.robot, list(robot.units)
+    return xarray.Dataset(
+        variables,
+        coords={
+            "time": ("time", rollout.time, {"long_name": "simulated time", "units": "s"}),
+            "env": np.arange(rollout.qpos.shape[1]),
+            "joint": list(robot.joint_names),
+            "unit": ("joint", joint_units, {"long_name": "unit of the joint's position"}),
+        },
+        attrs={"robot": title},
+    )
+
+
+def open_dataset(path: str | Path) -> xarray.Dataset:
+    """Return the rollout in a file as a dataset; see :func:`read_rollout` and :func:`to_dataset`."""
+    recorded = read_rollout(path)
+    return to_dataset(recorded.rollout, recorded)

@@ -1,0 +1,79 @@
+"""The charts of one joint: position and setpoint, error, effort within its limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .source import Source
+
+_INK = {"setpoint": "#4a82ff", "limit": "#b6bcc6"}
+_COLOURS = ("#15803d", "#d97706", "#7c3aed")
+"""The first group's curve, the second's, ..."""
+WINDOW = 8.0
+"""Length of the time axis [s]."""
+
+
+class Charts:
+    """Three charts in a panel of ``gui``, of one joint of the same robot in every group."""
+
+    def __init__(self, gui: Any, source: Source) -> None:
+        self._source = source
+        names = source.groups if len(source.groups) > 1 else ("",)
+        still = np.array([0.0, 1.0])
+
+        def chart(title: str, series: list[dict[str, Any]]) -> Any:
+            data = tuple(still for _ in range(len(series) + 1))
+            return gui.add_uplot(
+                data,
+                ({"label": "s"}, *series),
+                title=title,
+                scales={"x": {"time": False}},
+                legend={"show": True},
+                height=168,
+                axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
+                padding=(4, 14, 0, 0),
+            )
+
+        def lines(what: str) -> list[dict[str, Any]]:
+            return [
+                {"label": f"{what} {name}".strip(), "stroke": colour, "width": 2}
+                for name, colour in zip(names, _COLOURS, strict=False)
+            ]
+
+        self._position = chart("position", [*lines("qpos"), _dashed("setpoint", _INK["setpoint"])])
+        self._error = chart("error", lines("error"))
+        self._effort = chart(
+            "effort", [*lines("effort"), _dashed("limits", _INK["limit"]), _dashed("", _INK["limit"])]
+        )
+
+    def show(self, env: int, joint: int) -> None:
+        """Draw the recent past of a joint of robot ``env`` of every group."""
+        source = self._source
+        robots = [group * source.per_group + env for group in range(len(source.groups))]
+        traces = [source.traces(robot, joint) for robot in robots]
+        time = traces[0].time
+        if len(time) < 2:
+            return
+        recent = time >= time[-1] - WINDOW
+        unit = source.robot.joints[joint].unit
+        force = "N" if unit == "m" else "N m"
+        name = source.robot.joint_names[joint]
+        keep = [tuple(column[recent] for column in trace) for trace in traces]
+        low, high = source.effort_limits(robots[0], joint)
+        limits = tuple(
+            np.full(int(recent.sum()), bound if np.isfinite(bound) else np.nan) for bound in (low, high)
+        )
+        for chart, title, columns in (
+            (self._position, f"{name} [{unit}]", (*(trace[1] for trace in keep), keep[0][2])),
+            (self._error, f"setpoint - qpos [{unit}]", tuple(trace[2] - trace[1] for trace in keep)),
+            (self._effort, f"effort [{force}]", (*(trace[3] for trace in keep), *limits)),
+        ):
+            if chart.title != title:
+                chart.title = title
+            chart.data = (keep[0][0], *columns)
+
+
+def _dashed(label: str, colour: str) -> dict[str, Any]:
+    return {"label": label, "stroke": colour, "width": 1, "dash": [6, 4]}

@@ -1,0 +1,262 @@
+"""Robots that run: one Runner for each way of control, driven by what the panel wishes."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+
+from ..arguments import choice, integer, number
+from ..kinematics import Kinematics
+from ..loop import CONTROLS
+from ..robot import Robot
+from ..runner import Runner
+from .source import Frame, History, Traces
+
+Float64 = NDArray[np.float64]
+
+MOST = 64
+"""Robots that a view shows at most."""
+REMEMBERED = 8.0
+"""How much of the past the charts show [s]."""
+PUSH_TIME = 0.25
+"""How long a push lasts [s]."""
+GRAVITY = 9.81
+
+GAINS = ("kp", "ki", "kd", "derivative_filter_time", "effort_limit")
+"""What can be changed while robots move, each (dof,)."""
+
+
+class Live:
+    """``num_envs`` robots for each of ``controls``, all after the same setpoints, side by side.
+
+    Parameters
+    ----------
+    controls
+        ``"pid"``, ``"drive"``, or both.
+    period
+        Simulated time of a frame [s], rounded to whole sim steps.
+    spread
+        How far from the robot's start pose each begins [rad or m].
+    seed
+        Of start poses and random setpoints.
+    workers
+        Processes in all; default one for each core.
+    options
+        Of :class:`sim.Runner`: physics, compensate, timestep, ...
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        *,
+        controls: tuple[str, ...] = ("pid",),
+        period: float = 1 / 30,
+        spread: float = 0.2,
+        seed: int = 0,
+        workers: int | None = None,
+        **options: Any,
+    ) -> None:
+        self.robot = robot
+        self.groups = tuple(
+            choice("controls", control, [c for c in CONTROLS if c != "effort"]) for control in controls
+        )
+        self.per_group = integer("num_envs", num_envs, 1, MOST // max(1, len(self.groups)))
+        self.kinematics = Kinematics(robot)
+        timestep = options.get("timestep", 1 / 2000)
+        substeps = max(1, round(number("period", period, timestep, 1.0, "seconds of a frame") / timestep))
+        self.period = substeps * timestep
+        cores = len(os.sched_getaffinity(0)) if workers is None else workers
+        share = 0 if cores == 0 else max(1, cores // len(self.groups))
+        self._random = np.random.default_rng(seed)
+        low, high = robot.lower, robot.upper
+        offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
+        self.start = np.clip(robot.start + offsets, low, high)
+        self._low, self._high = np.maximum(low, -np.pi), np.minimum(high, np.pi)
+        self.gains = {control: self._initial_gains(control) for control in self.groups}
+        self._changed = dict.fromkeys(self.groups, False)
+        self.setpoint = np.tile(robot.start, (self.per_group, 1))
+        self.payload = 0.0
+        """Mass that hangs on the load link, as a weight without inertia [kg]."""
+        self.load_link = self.kinematics.tool
+        self._push: Float64 = np.zeros(3)
+        self._push_left = 0.0
+        self._loaded = False
+        self._history = History(round(REMEMBERED / self.period))
+        self._runners: list[Runner] = []
+        try:
+            for control in self.groups:
+                self._runners.append(
+                    Runner(
+                        robot,
+                        self.per_group,
+                        params=self._params(control, None),
+                        control=control,
+                        substeps=substeps,
+                        workers=share,
+                        **options,
+                    )
+                )
+        except BaseException:
+            self.close()
+            raise
+        self._pool = ThreadPoolExecutor(len(self._runners)) if len(self._runners) > 1 else None
+        self.reset()
+
+    # -- what the panel wishes -------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Put every robot back to its start pose, at rest, with a fresh controller."""
+        for runner in self._runners:
+            runner.reset(self.start)
+        self.time = 0.0
+        self._push_left = 0.0
+        self._history.clear()
+        zero = np.zeros((len(self.groups) * self.per_group, self.robot.dof))
+        self._frame = self._observe(zero)
+        self._history.add(self._frame)
+
+    def go(self, joint: int, position: float, env: int | None = None) -> None:
+        """Set the setpoint of a joint [rad or m], of one env of every group or (None) of all."""
+        self.setpoint[slice(None) if env is None else env, joint] = position
+
+    def go_to(self, pose: Float64) -> None:
+        """Set every setpoint: (dof,) or (envs, dof) [rad or m]."""
+        self.setpoint = np.array(np.broadcast_to(pose, self.setpoint.shape), np.float64)
+
+    def go_anywhere(self) -> None:
+        """Draw a setpoint within the joint limits for each env: near enough to the start to stay off the ground."""
+        near = self.robot.start + self._random.uniform(-1.0, 1.0, self.setpoint.shape)
+        self.go_to(np.clip(near, self.robot.lower, self.robot.upper))
+
+    def tune(self, control: str, gain: str, joint: int, value: float) -> None:
+        """Change one of :data:`GAINS` of a joint, on every robot of a group."""
+        self.gains[control][choice("gain", gain, GAINS)][joint] = value
+        self._changed[control] = True
+
+    def restore_gains(self) -> None:
+        """Return to the gains of the beginning."""
+        self.gains = {control: self._initial_gains(control) for control in self.groups}
+        self._changed = dict.fromkeys(self.groups, True)
+
+    def push(self, force: tuple[float, float, float]) -> None:
+        """Push every robot's load link with a force [N] for :data:`PUSH_TIME`."""
+        self._push, self._push_left = np.array(force, np.float64), PUSH_TIME
+
+    # -- frames ----------------------------------------------------------------------------------------------------
+
+    def frame(self) -> Frame:
+        """Return the present state."""
+        return self._frame
+
+    def advance(self) -> None:
+        """Run one frame of every group, all at once."""
+        disturbance = self._disturbance()
+        parts = np.split(disturbance, len(self.groups))
+        jobs = list(zip(self.groups, self._runners, parts, strict=True))
+        if self._pool is None:
+            for job in jobs:
+                self._step(*job)
+        else:
+            list(self._pool.map(lambda job: self._step(*job), jobs))
+        self._loaded = bool(disturbance.any())
+        self.time += self.period
+        self._push_left = max(0.0, self._push_left - self.period)
+        self._frame = self._observe(disturbance)
+        self._history.add(self._frame)
+
+    def traces(self, robot: int, joint: int) -> Traces:
+        """Return the recent past of a joint."""
+        return self._history.traces(robot, joint)
+
+    def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
+        """Return the limits of a joint's effort."""
+        limit = float(self.gains[self.groups[robot // self.per_group]]["effort_limit"][joint])
+        return -limit, limit
+
+    def close(self) -> None:
+        """End the runners."""
+        for runner in self._runners:
+            runner.close()
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _step(self, control: str, runner: Runner, disturbance: Float64) -> None:
+        loaded = bool(disturbance.any())
+        if self._changed[control] or (control == "pid" and (loaded or self._loaded)):
+            runner.params = self._params(control, disturbance if loaded else None)
+            self._changed[control] = False
+        runner.step(self.setpoint, feedforward=disturbance if loaded else None)
+
+    def _disturbance(self) -> Float64:
+        """Return the joint efforts (robots, dof) of weight and push on the load link."""
+        force = np.array([0.0, 0.0, -GRAVITY * self.payload])
+        if self._push_left > 0:
+            force = force + self._push
+        if not force.any():
+            return np.zeros(self._frame.qpos.shape)
+        poses = self.kinematics.poses(self._frame.qpos)
+        return np.where(
+            self._frame.ok[:, None], self.kinematics.efforts_of_force(poses, self.load_link, force), 0.0
+        )
+
+    def _observe(self, disturbance: Float64) -> Frame:
+        seen = [runner.observe() for runner in self._runners]
+        qpos, effort, saturated, ok = (
+            np.concatenate([getattr(obs, name) for obs in seen])
+            for name in ("qpos", "effort", "saturated", "ok")
+        )
+        if not ok.all():  # one that diverged stays where it was last seen
+            before = (
+                self._frame.qpos if hasattr(self, "_frame") else np.tile(self.start, (len(self.groups), 1))
+            )
+            qpos = np.where(ok[:, None], qpos, before).astype(np.float32)
+        return Frame(
+            time=self.time,
+            qpos=qpos,
+            setpoint=np.tile(self.setpoint, (len(self.groups), 1)),
+            effort=np.where(ok[:, None], effort - disturbance, 0.0),
+            saturated=np.asarray(saturated.any(1)),
+            ok=ok,
+        )
+
+    def _initial_gains(self, control: str) -> dict[str, Float64]:
+        robot, dof = self.robot, self.robot.dof
+        settings = robot.settings
+        if settings is None:
+            # Without figures of its own a robot is held by gains per unit of inertia: w = 10 rad/s, damped to 1.
+            inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else np.ones(dof)
+            kp, kd = 100 * inertia, 20 * inertia
+            ki = np.zeros(dof)
+        elif control == "drive":
+            kp, kd = np.full(dof, settings.drive_stiffness), np.full(dof, settings.drive_damping)
+            ki = np.zeros(dof)
+        else:
+            kp, ki, kd = settings.kp, settings.ki, settings.kd
+        limit = np.full(dof, np.inf) if control == "drive" else robot.effort_limit
+        values = (kp, ki, kd, np.zeros(dof), limit)
+        return {name: np.array(value, np.float64) for name, value in zip(GAINS, values, strict=True)}
+
+    def _params(self, control: str, disturbance: Float64 | None) -> bp.PIDParams:
+        """Return the group's params.
+
+        The disturbance enters as feedforward, and the limits are moved along with it: so the motor's own effort stays
+        within them, and what it cannot hold it does not hold.
+        """
+        gains = self.gains[control]
+        limit = gains["effort_limit"]
+        shift = 0.0 if disturbance is None or control == "drive" else disturbance
+        return self.robot.params(
+            kp=gains["kp"],
+            ki=gains["ki"],
+            kd=gains["kd"],
+            derivative_filter_time=gains["derivative_filter_time"],
+            effort_min=shift - limit,
+            effort_max=shift + limit,
+        )

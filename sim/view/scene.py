@@ -1,0 +1,200 @@
+"""The robots in the browser: every surface is drawn once and placed many times.
+
+One node of the page holds one surface of all robots, so a frame is two small arrays for each surface, whatever the
+number of robots.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kinematics import Kinematics, Poses
+from ..robot import Robot
+from ..shapes import surfaces
+from .source import Frame
+
+Float64 = NDArray[np.float64]
+
+_GHOST = (70, 130, 255)
+_DIVERGED = np.array([200, 40, 40], np.uint8)
+_TINTS = (np.array([255, 255, 255]), np.array([255, 170, 60]), np.array([90, 200, 160]))
+"""The colour towards which each group's robots lean, so that pid and drive are told apart."""
+_LEAN = 0.35
+_FLOOR = ((236, 239, 243), (221, 226, 233))
+_TILE = 0.5
+"""Edge of a tile of the floor [m]."""
+
+
+class RobotScene:
+    """``groups`` x ``per_group`` robots on a floor of ``server``."""
+
+    def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int) -> None:
+        self._server, self._kinematics = server, Kinematics(robot)
+        self.places = _places(self._kinematics, robot, len(groups), per_group)
+        self._groups = groups
+        count = len(self.places)
+        self._nodes, self._ghosts, self._links, self._colours = [], [], [], []
+        still = np.zeros((count, 3), np.float32), np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+        for index, surface in enumerate(surfaces(robot)):
+            colours = _tinted(surface.rgba, len(groups), per_group)
+            shape = (surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
+            self._links.append(self._kinematics.index(surface.link))
+            self._colours.append(colours)
+            self._nodes.append(
+                server.scene.add_batched_meshes_simple(
+                    f"/robots/{index}",
+                    *shape,
+                    batched_wxyzs=still[1],
+                    batched_positions=still[0],
+                    batched_colors=colours,
+                    opacity=None if surface.rgba[3] >= 1 else surface.rgba[3],
+                    lod="off",
+                )
+            )
+            self._ghosts.append(
+                server.scene.add_batched_meshes_simple(
+                    f"/setpoint/{index}",
+                    *shape,
+                    batched_wxyzs=still[1][:1],
+                    batched_positions=still[0][:1],
+                    batched_colors=_GHOST,
+                    opacity=0.22,
+                    lod="off",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+            )
+        self._ring = self._mark(self._reach(robot))
+        self._ghost_of: tuple[Any, ...] | None = None
+        self._ok = np.ones(count, bool)
+        self._stage(groups, per_group, self._reach(robot))
+
+    def show(self, frame: Frame, selected: int, ghost: bool) -> None:
+        """Place every robot, the ring under the selected one, and (``ghost``) its setpoint."""
+        poses = self._kinematics.poses(frame.qpos)
+        with self._server.atomic():
+            self._place(self._nodes, poses, self.places)
+            if (frame.ok != self._ok).any():
+                self._ok = frame.ok.copy()
+                for node, colours in zip(self._nodes, self._colours, strict=True):
+                    node.batched_colors = np.where(self._ok[:, None], colours, _DIVERGED)
+            wanted = (selected, ghost, frame.setpoint[selected].tobytes())
+            if wanted != self._ghost_of:
+                self._ghost_of = wanted
+                self._ring.position = (*self.places[selected][:2], 0.004)
+                for node in self._ghosts:
+                    node.visible = ghost
+                if ghost:
+                    goal = self._kinematics.poses(frame.setpoint[selected][None])
+                    self._place(self._ghosts, goal, self.places[selected][None])
+
+    def on_click(self, select: Any) -> None:
+        """Call ``select(robot)`` when a robot is clicked."""
+        for node in self._nodes:
+            node.on_click(lambda event: select(int(event.instance_index)))
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _place(self, nodes: list[Any], poses: Poses, places: Float64) -> None:
+        position = (poses.position + places[:, None]).astype(np.float32)
+        wxyz = poses.wxyz.astype(np.float32)
+        for node, link in zip(nodes, self._links, strict=True):
+            node.batched_positions = np.ascontiguousarray(position[:, link])
+            node.batched_wxyzs = np.ascontiguousarray(wxyz[:, link])
+
+    def _reach(self, robot: Robot) -> float:
+        return _reach(self._kinematics, robot)
+
+    def _mark(self, reach: float) -> Any:
+        """Return a flat ring, to lie under the selected robot."""
+        segments, inner, outer = 48, 0.30 * reach, 0.335 * reach
+        angle = 2 * math.pi * np.arange(segments) / segments
+        circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        here = np.arange(segments)
+        following = (here + 1) % segments
+        faces = np.concatenate(
+            [
+                np.stack([here, here + segments, following + segments], 1),
+                np.stack([here, following + segments, following], 1),
+            ]
+        )
+        return self._server.scene.add_mesh_simple(
+            "/selected",
+            np.concatenate([inner * circle, outer * circle]),
+            faces,
+            color=_GHOST,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _stage(self, groups: tuple[str, ...], per_group: int, reach: float) -> None:
+        """Lay the floor, light it, name the groups, and stand the camera where all is seen."""
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        # The environment map costs more than all robots where a browser draws in software.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(enabled=True, cast_shadow=False)
+        scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.6)
+        for index, (vertices, faces) in enumerate(_checkers(self.places, reach)):
+            scene.add_mesh_simple(
+                f"/floor/{index}", vertices, faces, color=_FLOOR[index], flat_shading=True, cast_shadow=False
+            )
+        centre, extent = self.places.mean(0), np.ptp(self.places, axis=0)
+        if len(groups) > 1:
+            for group, places in zip(groups, np.split(self.places, len(groups)), strict=True):
+                front = (places[:, 0].mean(), places[:, 1].min() - 0.9 * reach, 0.02)
+                scene.add_label(f"/groups/{group}", group, position=front)
+        size = max(float(np.hypot(*extent[:2])), 0.0) + 2.4 * reach
+        away = np.array([-0.62, -0.80, 0.52])
+        camera = self._server.initial_camera
+        camera.position = tuple(centre + size * 1.02 * away / np.linalg.norm(away))
+        camera.look_at = (centre[0], centre[1], 0.35 * reach)
+        camera.fov = math.radians(42)
+
+
+def _checkers(places: Float64, reach: float) -> list[tuple[Float64, NDArray[np.int64]]]:
+    """Return the light and the dark tiles of a floor under all robots, each as vertices and faces."""
+    low = np.floor((places.min(0)[:2] - 2.0 * reach) / _TILE).astype(int)
+    high = np.ceil((places.max(0)[:2] + 2.0 * reach) / _TILE).astype(int)
+    tiles = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), axis=-1).reshape(
+        -1, 2
+    )
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    result = []
+    for parity in (0, 1):
+        chosen = tiles[tiles.sum(1) % 2 == parity]
+        flat = _TILE * (chosen[:, None] + corners).reshape(-1, 2)
+        first = 4 * np.arange(len(chosen))[:, None, None]
+        faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+        result.append((np.concatenate([flat, np.zeros((len(flat), 1))], axis=1), faces))
+    return result
+
+
+def _tinted(rgba: tuple[float, ...], groups: int, per_group: int) -> NDArray[np.uint8]:
+    own = 255 * np.array(rgba[:3])
+    rows = [own if group == 0 else own + _LEAN * (_TINTS[group % 3] - own) for group in range(groups)]
+    return np.repeat(np.array(rows), per_group, axis=0).round().astype(np.uint8)
+
+
+def _reach(kinematics: Kinematics, robot: Robot) -> float:
+    """Return how far from its base a robot gets: the 95th percentile over seeded poses, at least 0.3 m."""
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    poses = kinematics.poses(np.random.default_rng(0).uniform(low, high, (200, robot.dof)))
+    return max(0.3, float(np.quantile(np.linalg.norm(poses.position[..., :2], axis=-1).max(1), 0.95)))
+
+
+def _places(kinematics: Kinematics, robot: Robot, groups: int, per_group: int) -> Float64:
+    """Return where each robot stands (robots, 3): every group a block of rows, the blocks side by side."""
+    pitch = 1.5 * _reach(kinematics, robot)
+    columns = max(1, round(math.sqrt(per_group / groups)))
+    index = np.arange(per_group)
+    block = np.stack([index % columns, index // columns, np.zeros(per_group)], axis=1)
+    width = columns + (0.6 if groups > 1 else 0.0)
+    blocks = [block + np.array([group * width, 0.0, 0.0]) for group in range(groups)]
+    places = pitch * np.concatenate(blocks)
+    return np.asarray(places - (places.min(0) + places.max(0)) / 2)
