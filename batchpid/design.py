@@ -83,8 +83,9 @@ def pid_from_inertia(
     damping
         Viscous damping of the joints (joints,) [N m s/rad or N s/m].
     """
-    own, load = np.broadcast_arrays(np.asarray(inertia, np.float64), np.asarray(damping, np.float64))
-    w = 2 * np.pi * np.asarray(bandwidth_hz, np.float64)
+    w, load = 2 * np.pi * np.asarray(bandwidth_hz, np.float64), np.asarray(damping, np.float64)
+    # A joint that is damped beyond zeta by itself needs the stiffness of a heavier one to be as fast.
+    own = np.maximum(inertia, load / (2 * damping_ratio * w))
     kp, full = own * w**2, 2 * damping_ratio * w * own
     return {
         "kp": kp,
@@ -158,8 +159,8 @@ def design_gains(
     inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[
         gain_units
     ]
-    # Per unit of inertia, the joint's own damping counts most where it has least inertia to damp.
-    damping = robot.damping if gain_units == "effort" else robot.damping / own.max(0)
+    # The loop that works with the whole mass matrix makes up for the joints' own damping.
+    damping = {"effort": robot.damping, "inertia": robot.damping / own.max(0), "mass_matrix": 0.0}[gain_units]
     bandwidth = float(bandwidth_hz)
     while True:
         gains = pid_from_inertia(

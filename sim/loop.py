@@ -172,6 +172,7 @@ class _Cell:
         self.pack, self.envs = pack, envs
         self._dt = spec.scene.timestep
         self._scene = replace(spec.scene, build=None)
+        self._damping = np.array([joint.damping for joint in spec.scene.joints])
         self._gravity, self._coriolis = COMPENSATE[spec.compensate]
         self._measurement_rate = spec.measurement_rate
         self._control = spec.control
@@ -363,13 +364,20 @@ class _Cell:
         setpoint_rate: NDArray[np.float64] | None,
         feedforward: NDArray[np.float64] | None,
     ) -> None:
-        """As :meth:`_run_pid`, with gains per unit of inertia; the mass matrix is kept for some substeps."""
+        """As :meth:`_run_pid`, with gains per unit of inertia; the mass matrix is kept for some substeps.
+
+        With the whole matrix M the joints' own viscous damping B is made up for as well. The engine takes it
+        implicitly, (M + dt B) (v+ - v) = dt (u - B v), so u = (M + dt B) a + B v gives exactly v+ = v + dt a.
+        """
         pack, coefficients, state, qpos = self.pack, self._coefficients, self._state, self._qpos
         whole = isinstance(self._params.gain_units, PerMassMatrix)
+        damping = self._damping if whole and self._damping.any() else None
         aux: list[bp.Terms] = []
         for done in range(substeps):
             if done % INERTIA_EVERY == 0:
                 matrix = self._mass_matrix(qpos)
+                if damping is not None:
+                    matrix += self._dt * np.diag(damping)
                 k = (
                     coefficients
                     if whole
@@ -378,7 +386,11 @@ class _Cell:
             passive = self._passive()
             if feedforward is not None:
                 passive = feedforward if passive is None else passive + feedforward
-            qvel = pack.read_qvel() if self._measurement_rate else None
+            qvel = pack.read_qvel() if self._measurement_rate or damping is not None else None
+            if damping is not None:
+                passive = damping * qvel if passive is None else passive + damping * qvel
+            if not self._measurement_rate:
+                qvel = None
             last = done == substeps - 1
             if whole:
                 state, effort, *aux = advance_with_mass_matrix(

@@ -53,11 +53,11 @@ def tutorial_move(robot: Robot) -> Moves:
     return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
 
 
-def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0) -> Moves:
+def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:
     """``count`` seeded moves within the joint limits, free of contact on the straight line.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
-    whole range] of them, by the :data:`KINDS` in turn.
+    whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0) -> 
         ``count`` or ``size`` out of range, or the robot touches itself in nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
-    probe, rng = robot.probe(), np.random.default_rng(seed)
+    probe, rng = robot.probe(ground), np.random.default_rng(seed)
     reach = np.ptp(robot.sample(1000, seed=0), axis=0)
     low = np.maximum(robot.lower + _EDGE * reach, -np.inf)
     high = np.minimum(robot.upper - _EDGE * reach, np.inf)
@@ -85,6 +85,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0) -> 
             fraction[np.arange(robot.dof) != joint] = 0.0
         step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
+        start, target = _with_mimics(robot, start), _with_mimics(robot, target)
         if not probe.touches(start + line * (target - start)).any():
             starts.append(start)
             targets.append(target)
@@ -127,6 +128,16 @@ def smooth_effort(
     qvel = step * (30 * t**2 - 60 * t**3 + 30 * t**4) / duration
     qacc = step * (60 * t - 180 * t**2 + 120 * t**3) / duration**2
     return robot.probe().inverse_dynamics(qpos, qvel, qacc)
+
+
+def _with_mimics(robot: Robot, qpos: Float64) -> Float64:
+    """Return ``qpos`` (dof,) with the joints that mimic others where those put them."""
+    coupled = qpos.copy()
+    for index, joint in enumerate(robot.joints):
+        if joint.mimic is not None and joint.mimic.joint in robot.joint_names:
+            source = qpos[robot.joint_names.index(joint.mimic.joint)]
+            coupled[index] = joint.mimic.multiplier * source + joint.mimic.offset
+    return coupled
 
 
 def _duration(

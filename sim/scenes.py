@@ -103,6 +103,11 @@ class Probe:
                 self._scene.add_ground(0.0, render=False)
         self._dof = self._robot.dof
         self._model = self._robot.create_pinocchio_model()
+        # Links that fixed joints tie together are one body; its number, per link name. The base and the ground are 0.
+        self._body: dict[str, int] = {}
+        for number, link in enumerate(self._robot.links):
+            tied = link.parent is not None and link.joint.type == "fixed"
+            self._body[link.name] = self._body[link.parent.name] if tied else number
 
     def mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
         """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
@@ -119,17 +124,18 @@ class Probe:
         return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
 
     def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
-        """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,), the base left out."""
+        """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,).
+
+        Links that fixed joints tie together do not count, nor the base and what is tied to it with the ground.
+        """
         return np.array([self._touches(row.astype(np.float32), clearance) for row in np.asarray(qpos)])
 
     def _touches(self, qpos: Float32, clearance: float) -> bool:
         self._robot.set_qpos(qpos)
         self._robot.set_qvel(np.zeros_like(qpos))
         self._system.step()
-        static = physx.PhysxRigidStaticComponent
         for contact in self._system.get_contacts():
-            on_ground = any(isinstance(body, static) for body in contact.bodies)
-            if on_ground and any(getattr(body, "is_root", False) for body in contact.bodies):
+            if len({self._body.get(body.entity.name, 0) for body in contact.bodies}) == 1:
                 continue
             if any(point.separation < clearance for point in contact.points):
                 return True
