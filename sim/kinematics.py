@@ -72,12 +72,19 @@ class Kinematics:
         return self.links.index(link)
 
     @property
-    def tip(self) -> int:
-        """The link farthest down a chain of the most joints: of several, the first. It carries the load in a view."""
-        depth = [0] * len(self.links)
+    def tool(self) -> int:
+        """The link at the end of the longest chain of joints, or the hand where that chain ends in fingers."""
+        depth, branches = [0] * len(self.links), [0] * len(self.links)
         for child, step in enumerate(self._steps, start=1):
             depth[child] = depth[step.parent] + (step.dof is not None)
-        return int(np.argmax(depth))
+        for child, step in reversed(list(enumerate(self._steps, start=1))):
+            branches[step.parent] += step.dof is not None or branches[child] > 0
+        link = tip = int(np.argmax(depth))
+        while link > 0 and depth[tip] - depth[link] <= 2:
+            if branches[link] > 1:
+                return link
+            link = self._steps[link - 1].parent
+        return tip
 
     def poses(self, qpos: ArrayLike) -> Poses:
         """Return the link poses at ``qpos`` (..., dof) [rad or m]."""

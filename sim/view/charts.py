@@ -45,7 +45,7 @@ class Charts:
         self._position = chart("position", [*lines("qpos"), _dashed("setpoint", _INK["setpoint"])])
         self._error = chart("error", lines("error"))
         self._effort = chart(
-            "effort", [*lines("effort"), _dashed("limits", _INK["limit"]), _dashed("", _INK["limit"])]
+            "effort", [*lines("effort"), _dashed("least", _INK["limit"]), _dashed("most", _INK["limit"])]
         )
 
     def show(self, env: int, joint: int) -> None:

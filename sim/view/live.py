@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 import batchpid as bp
 
 from ..arguments import choice, integer, number
+from ..control import CONTROLS
 from ..kinematics import Kinematics
-from ..loop import CONTROLS
 from ..robot import Robot
 from ..runner import Runner
 from .source import Frame, History, Traces
 
 Float64 = NDArray[np.float64]
 
+CONTROLS = ("pid", "drive")
 MOST = 64
 """Robots that a view shows at most."""
 REMEMBERED = 8.0
@@ -65,7 +66,7 @@ class Live:
     ) -> None:
         self.robot = robot
         self.groups = tuple(
-            choice("controls", control, [c for c in CONTROLS if c != "effort"]) for control in controls
+            choice("controls", control, CONTROLS) for control in controls
         )
         self.per_group = integer("num_envs", num_envs, 1, MOST // max(1, len(self.groups)))
         self.kinematics = Kinematics(robot)

@@ -21,10 +21,10 @@ Float64 = NDArray[np.float64]
 
 _GHOST = (70, 130, 255)
 _DIVERGED = np.array([200, 40, 40], np.uint8)
-_TINTS = (np.array([255, 255, 255]), np.array([255, 170, 60]), np.array([90, 200, 160]))
+_TINTS = (np.array([255, 255, 255]), np.array([255, 150, 40]), np.array([90, 200, 160]))
 """The colour towards which each group's robots lean, so that pid and drive are told apart."""
-_LEAN = 0.35
-_FLOOR = ((236, 239, 243), (221, 226, 233))
+_LEAN = 0.5
+_FLOOR = ((203, 211, 222), (189, 198, 211))
 _TILE = 0.5
 """Edge of a tile of the floor [m]."""
 
@@ -139,7 +139,7 @@ class RobotScene:
         # The environment map costs more than all robots where a browser draws in software.
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=True, cast_shadow=False)
-        scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.6)
+        scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
         for index, (vertices, faces) in enumerate(_checkers(self.places, reach)):
             scene.add_mesh_simple(
                 f"/floor/{index}", vertices, faces, color=_FLOOR[index], flat_shading=True, cast_shadow=False
@@ -149,10 +149,10 @@ class RobotScene:
             for group, places in zip(groups, np.split(self.places, len(groups)), strict=True):
                 front = (places[:, 0].mean(), places[:, 1].min() - 0.9 * reach, 0.02)
                 scene.add_label(f"/groups/{group}", group, position=front)
-        size = max(float(np.hypot(*extent[:2])), 0.0) + 2.4 * reach
+        size = max(float(np.hypot(*extent[:2])), 0.0) + 2.0 * reach
         away = np.array([-0.62, -0.80, 0.52])
         camera = self._server.initial_camera
-        camera.position = tuple(centre + size * 1.02 * away / np.linalg.norm(away))
+        camera.position = tuple(centre + size * 0.95 * away / np.linalg.norm(away))
         camera.look_at = (centre[0], centre[1], 0.35 * reach)
         camera.fov = math.radians(42)
 
@@ -190,7 +190,7 @@ def _reach(kinematics: Kinematics, robot: Robot) -> float:
 
 def _places(kinematics: Kinematics, robot: Robot, groups: int, per_group: int) -> Float64:
     """Return where each robot stands (robots, 3): every group a block of rows, the blocks side by side."""
-    pitch = 1.5 * _reach(kinematics, robot)
+    pitch = 1.3 * _reach(kinematics, robot)
     columns = max(1, round(math.sqrt(per_group / groups)))
     index = np.arange(per_group)
     block = np.stack([index % columns, index // columns, np.zeros(per_group)], axis=1)

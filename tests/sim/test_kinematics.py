@@ -85,12 +85,16 @@ def test_efforts_of_a_force_are_the_gradient_of_its_work(robot):
             np.testing.assert_allclose(efforts[:, joint], (ahead - behind) @ force / (2 * step), atol=1e-7)
 
 
-def test_the_tip_is_the_end_of_the_longest_chain():
-    assert Kinematics(Robot.load("panda")).links[Kinematics(Robot.load("panda")).tip] == "panda_leftfinger"
-    jaco2 = Kinematics(Robot.load("jaco2"))
-    assert jaco2.links[jaco2.tip] == "j2s7s300_link_finger_tip_1"
+def test_the_tool_is_the_hand_or_the_end_of_the_chain(tmp_path):
+    for robot, tool in (
+        (Robot.load("panda"), "panda_hand"),
+        (Robot.load("jaco2"), "j2s7s300_link_7"),
+        (odd_robot(tmp_path), "mid"),
+    ):
+        kinematics = Kinematics(robot)
+        assert kinematics.links[kinematics.tool] == tool
     with pytest.raises(InvalidArgumentError, match="is unknown"):
-        jaco2.index("elbow")
+        kinematics.index("elbow")
 
 
 angles = st.floats(-7, 7)
