@@ -28,6 +28,7 @@ REMEMBERED = 8.0
 PUSH_TIME = 0.25
 """How long a push lasts [s]."""
 GRAVITY = 9.81
+_LEAST_FILTER = 1e-6  # [s], a thousandth of a sim step and less
 
 GAINS = ("kp", "ki", "kd", "derivative_filter_time", "effort_limit")
 """What can be changed while robots move, each (dof,)."""
@@ -65,9 +66,7 @@ class Live:
         **options: Any,
     ) -> None:
         self.robot = robot
-        self.groups = tuple(
-            choice("controls", control, CONTROLS) for control in controls
-        )
+        self.groups = tuple(choice("controls", control, CONTROLS) for control in controls)
         self.per_group = integer("num_envs", num_envs, 1, MOST // max(1, len(self.groups)))
         self.kinematics = Kinematics(robot)
         timestep = options.get("timestep", 1 / 2000)
@@ -257,7 +256,8 @@ class Live:
             kp=gains["kp"],
             ki=gains["ki"],
             kd=gains["kd"],
-            derivative_filter_time=gains["derivative_filter_time"],
+            # Never off: a filter that comes and goes would change what the law remembers.
+            derivative_filter_time=np.maximum(gains["derivative_filter_time"], _LEAST_FILTER),
             effort_min=shift - limit,
             effort_max=shift + limit,
         )
