@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 
-from .loop import Arrays, Loop, LoopSpec
+from .arrays import Arrays
+from .loop import Loop, LoopSpec
 from .physics import PHYSICS
 from .robot import Robot
 from .runner import Runner

@@ -20,13 +20,15 @@ from batchpid.inertia import check_gain_units
 
 from .arguments import array, choice, flag, integer, number
 from .command import Call, Tick, Worker
+from .control import CONTROLS
 from .faults import ACTIONS, CAUSES, Fault
-from .loop import COMPENSATE, CONTROLS, LoopSpec
+from .loop import COMPENSATE, LoopSpec
 from .physics import PHYSICS, Physics
 from .pool import WorkerPool
 from .robot import Robot
 from .scenes import SceneSpec
 from .snapshot import EnvStates, Snapshot
+from .variation import Variation
 from .worker import ProcessWorker
 
 Float32 = NDArray[np.float32]
@@ -113,6 +115,9 @@ class Runner:
         ``ok`` False for that tick. An env fails when its state is no longer finite, or by ``speed_limit``.
     speed_limit
         Joint speed at which an env fails, one for all joints or (dof,) [rad/s or m/s]; default none.
+    variation
+        How each env's robot differs from the model: :func:`sim.variation.draw_variation`. It is not part of snapshots,
+        so with it there is no recovery and no checkpoint.
     non_finite
         What a NaN or infinity in a setpoint, its rate, a feedforward or a pose to reset to does: ``"raise"`` an
         error, or ``"contain"`` it: the env that it is for fails.
@@ -150,6 +155,7 @@ class Runner:
         pack_size: int = 4,
         on_fault: str = "hold",
         speed_limit: ArrayLike | None = None,
+        variation: Variation | None = None,
         non_finite: str = "raise",
         recover: bool = True,
         checkpoint_steps: int | None = 8000,
@@ -232,8 +238,17 @@ class Runner:
                 first_env=envs.start,
                 on_fault=on_fault,
                 speed_limit=limit,
+                variation=None if variation is None else variation.for_envs(envs),
             )
 
+        if variation is not None:
+            if len(variation.payload) != self.num_envs:
+                raise InvalidArgumentError(
+                    "variation",
+                    f"is for {len(variation.payload)} envs, not {self.num_envs}",
+                    remedy="draw one for each env",
+                )
+            recover, self._checkpoint_steps = False, None
         first_params = self._params
         self._pool = WorkerPool(spec, self.num_envs, count, pack_size, recover=recover, timeout=timeout)
         try:

@@ -1,10 +1,10 @@
 """A pack of scenes in one process, read and written as arrays. The only module that touches SAPIEN.
 
-A pack is M scenes, one robot each, in step with each other, some of them to a PhysX system. All stand at the origin; the shapes of each scene
-carry a collision group of their own, so that scenes never meet. Stepping a pack is bit-identical to stepping
-one system per scene, and a fifth to a third cheaper.
+A pack is M scenes, one robot each, in step with each other, some of them to a PhysX system. All stand at the origin;
+the shapes of each scene carry a collision group of their own, so that scenes never meet. That is bit-identical to one
+system per scene, and a fifth to a third cheaper.
 
-The loop needs nine calls and no more (:class:`Pack`); another gateway to the engine has only these to provide.
+The loop needs a dozen calls and no more (:class:`Pack`); another gateway to the engine has only these to provide.
 """
 
 from __future__ import annotations
@@ -196,6 +196,15 @@ class Pack:
         """One sim step of every scene."""
         for step in self._steps:
             step()
+
+    def alter(self, row: int, link: str, mass: float, friction: float) -> None:
+        """Add ``mass`` [kg] to a link of robot ``row``, and ``friction`` to each of its joints."""
+        robot = self._robots[row]
+        for body in robot.links:
+            if body.name == link:
+                body.set_mass(body.mass + mass)
+        for joint in robot.active_joints:
+            joint.set_friction(joint.friction + friction)
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions [rad or m], a new array."""

@@ -30,8 +30,9 @@ import cloudpickle
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 
+from .arrays import Arrays
 from .liveness import Pulse
-from .loop import Arrays, Loop, LoopSpec
+from .loop import Loop, LoopSpec
 from .shared import SharedArrays
 
 TICK = struct.Struct("<cI??")  # b"T", substeps, use_rate, use_feedforward
