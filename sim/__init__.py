@@ -4,6 +4,7 @@ from .check import Finding
 from .faults import Fault
 from .physics import Physics
 from .pool import RecoveryWarning
+from .recording import Recorder, Recording, read_recording
 from .robot import Robot
 from .runner import FaultWarning, Observation, Rollout, Runner, SetpointWarning
 from .snapshot import Snapshot
@@ -14,10 +15,13 @@ __all__ = [
     "Finding",
     "Observation",
     "Physics",
+    "Recorder",
+    "Recording",
     "RecoveryWarning",
     "Robot",
     "Rollout",
     "Runner",
     "SetpointWarning",
     "Snapshot",
+    "read_recording",
 ]

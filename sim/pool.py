@@ -261,10 +261,18 @@ def _on_purpose(error: Exception) -> bool:
     return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)
 
 
+def packing(num_envs: int, pack_size: int) -> int:
+    """Scenes to a PhysX system: ``pack_size``, or less where that leaves fewer than 8 packs for the workers to share.
+
+    It does not ask for the number of workers, and packs are never cut in two: the last bits of a contact depend on
+    what else its system holds, and so would, otherwise, on the number of workers.
+    """
+    return min(pack_size, max(1, num_envs // 8))
+
+
 def _share(num_envs: int, workers: int, pack_size: int) -> list[slice]:
-    """Contiguous slices of envs, one for each worker, cut where packs end as far as that keeps the load even."""
-    count = max(1, min(workers, num_envs))
+    """Contiguous slices of envs, one for each worker, cut between packs."""
     packs = -(-num_envs // pack_size)
-    unit = pack_size if packs % count == 0 else 1
-    cuts = [min(num_envs, unit * (-(-num_envs // unit) * k // count)) for k in range(count + 1)]
-    return [slice(low, high) for low, high in pairwise(cuts) if high > low]
+    count = max(1, min(workers, packs))
+    cuts = [min(num_envs, pack_size * (packs * k // count)) for k in range(count + 1)]
+    return [slice(low, high) for low, high in pairwise(cuts)]

@@ -24,7 +24,8 @@ from .control import CONTROLS
 from .faults import ACTIONS, CAUSES, Fault
 from .loop import COMPENSATE, LoopSpec
 from .physics import PHYSICS, Physics
-from .pool import WorkerPool
+from .pool import WorkerPool, packing
+from .recording import Recorder
 from .robot import Robot
 from .scenes import SceneSpec
 from .snapshot import EnvStates, Snapshot
@@ -108,7 +109,8 @@ class Runner:
         it asks for are left out, so tutorial code runs as it is. It may return the entities that :meth:`poses` tells
         of. A reset puts what it added back to where it left it.
     pack_size
-        Scenes that share a PhysX system; a matter of speed alone.
+        Scenes that share a PhysX system, at most: a matter of speed. In free motion nothing else depends on it; where
+        a robot touches something at several places at once, the last bits do. 1 gives every env a system of its own.
     on_fault
         What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it was at
         the end of the last tick, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
@@ -178,7 +180,7 @@ class Runner:
         self.compensate = choice("compensate", compensate, COMPENSATE)
         if not isinstance(physics, Physics):
             physics = PHYSICS[choice("physics", physics, PHYSICS)]
-        pack_size = integer("pack_size", pack_size, 1, 65535)
+        pack_size = packing(self.num_envs, integer("pack_size", pack_size, 1, 65535))
         if build is not None and not callable(build):
             raise InvalidArgumentError(
                 "build", "must be a function", value=build, remedy="define build(scene, env)"
@@ -208,6 +210,8 @@ class Runner:
         self._steps = self._since_checkpoint = 0
         self.faults: deque[Fault] = deque(maxlen=10_000)
         """Envs that failed, latest last."""
+        self.recorder: Recorder | None = None
+        """What records every tick; :class:`sim.Recorder` sets it."""
         self._fault_steps = np.full(self.num_envs, -1)
         self.work_seconds = np.zeros(0)
         """Seconds that each worker worked in the last tick."""
@@ -494,6 +498,8 @@ class Runner:
         self._since_checkpoint += substeps
         self.work_seconds = np.array(pool.run(Tick(setpoint, rate, feedforward, substeps)))
         self._note_faults()
+        if self.recorder is not None:
+            self.recorder.append(setpoint)
 
     def _start_from(self, snapshot: Snapshot) -> None:
         self._since_checkpoint = 0

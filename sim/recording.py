@@ -1,0 +1,388 @@
+"""Recordings: every tick of a runner streamed to an HDF5 file, readable whatever ends the program.
+
+A thread writes what was recorded every half second, and sees to it that the file on disk is whole at any moment (HDF5's
+single-writer mode, times last): after a kill at most the last second is missing. The file grows beside its final name,
+as ``NAME.partial``, and takes that name when it is complete; no file of that name is touched before.
+
+Datasets, ticks first: ``time`` [s], ``setpoint``, ``qpos``, ``qvel``, ``effort``, ``saturated`` (ticks, envs, dof) and
+``ok`` (ticks, envs); row k is the state at the end of tick k. What they belong to stands in the attributes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import os
+import platform
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
+
+if TYPE_CHECKING:
+    import h5py
+
+    from .runner import Runner
+
+FORMAT = "batchpid-recording-1"
+_EVERY = 0.5  # seconds from one write to the next
+_BUFFER = 64 << 20  # bytes that may wait to be written
+_CHUNK = 1 << 18  # bytes of a chunk of the file, about
+
+_FIELDS = {
+    "setpoint": np.float64,
+    "qpos": np.float32,
+    "qvel": np.float32,
+    "effort": np.float32,
+    "saturated": np.bool_,
+    "ok": np.bool_,
+}
+
+
+class RecordingError(BatchPIDError, OSError):
+    """A recording cannot be written or read; the message names the file and the cause."""
+
+
+class Recorder:
+    """Records every tick of ``runner`` from now on, until it is closed.
+
+    Parameters
+    ----------
+    path
+        File to write, ending in .h5 or .hdf5.
+    runner
+        What to record.
+    seed
+        Of the run, if it has one; kept with the recording.
+    overwrite
+        Whether an existing file of that name is replaced, at the end, by a complete recording.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is such a file, or the name ends otherwise.
+    MissingDependencyError
+        h5py is not installed.
+    RecordingError
+        The file cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        runner: Runner,
+        *,
+        seed: int | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = check_path(path, overwrite=overwrite)
+        self._overwrite, self._runner = overwrite, runner
+        self.partial = _free_name(self.path)
+        self._wake = threading.Condition()
+        self._rows: list[tuple[Any, ...]] = []
+        self._bytes = 0
+        self._closing = False
+        self._error: Exception | None = None
+        self._file, self._datasets = self._create(seed)
+        self._writer = threading.Thread(target=self._write_rows, name="batchpid-recorder", daemon=True)
+        self._writer.start()
+        runner.recorder = self
+
+    def append(self, setpoint: NDArray[Any]) -> None:
+        """Record the runner's present state, reached under ``setpoint`` (envs, dof). The runner calls it."""
+        runner = self._runner
+        row = (runner.time, np.array(setpoint), *runner.observe())
+        with self._wake:
+            while self._bytes > _BUFFER and self._error is None:
+                self._wake.wait()
+            self._check()
+            self._rows.append(row)
+            self._bytes += sum(part.nbytes for part in row[1:])
+            if len(self._rows) == 1:
+                self._wake.notify_all()
+
+    def close(self, complete: bool = True) -> None:
+        """Write the rest, and give the file its name. May be called again.
+
+        Where the run is not ``complete`` a file of that name stays, and the recording keeps its partial name.
+        """
+        if self._runner.recorder is self:
+            self._runner.recorder = None
+        if not self._writer.is_alive() and self._file is None:
+            return
+        with self._wake:
+            self._closing = True
+            self._wake.notify_all()
+        self._writer.join()
+        with contextlib.suppress(Exception):  # the writer's error, if any, is the one to raise
+            if self._file is not None:
+                self._file.close()
+        self._file = None
+        self._check()
+        self._finish(complete)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(complete=kind is None)
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise RecordingError(
+                f"{self.partial}: cannot be written: {self._error}; what was recorded before can be read"
+            ) from self._error
+
+    def _create(self, seed: int | None) -> tuple[h5py.File, dict[str, h5py.Dataset]]:
+        h5py, runner = _h5py(), self._runner
+        shape = (runner.num_envs, runner.robot.dof)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            file = h5py.File(self.partial, "x", libver="latest")
+        except OSError as error:
+            raise RecordingError(f"{self.partial}: cannot be made: {error}") from error
+        for name, value in _attributes(runner, seed).items():
+            file.attrs[name] = value
+        datasets = {
+            "time": file.create_dataset(
+                "time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan
+            )
+        }
+        for name, dtype in _FIELDS.items():
+            table = shape[:1] if name == "ok" else shape
+            rows = max(1, _CHUNK // (int(np.prod(table)) * np.dtype(dtype).itemsize))
+            datasets[name] = file.create_dataset(
+                name, (0, *table), dtype, maxshape=(None, *table), chunks=(rows, *table)
+            )
+        for name, unit in _units(runner).items():
+            datasets[name].attrs["unit"] = unit
+        file.flush()
+        file.swmr_mode = True
+        return file, datasets
+
+    def _write_rows(self) -> None:
+        """In a thread: write what has come in, every half second."""
+        while True:
+            with self._wake:
+                while not self._rows and not self._closing:
+                    self._wake.wait()
+                closing = self._closing
+                if not closing:
+                    self._wake.wait_for(lambda: self._closing or self._bytes > _BUFFER, _EVERY)
+                    closing = self._closing
+                rows, self._rows, self._bytes = self._rows, [], 0
+                self._wake.notify_all()
+            try:
+                if rows:
+                    self._write(rows)
+            except Exception as error:
+                with self._wake:
+                    self._error = error
+                    self._wake.notify_all()
+                return
+            if closing:
+                return
+
+    def _write(self, rows: list[tuple[Any, ...]]) -> None:
+        done = len(self._datasets["time"])
+        names = ("time", "setpoint", "qpos", "qvel", "effort", "saturated", "ok")
+        columns = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
+        times = columns.pop("time")
+        for name, column in columns.items():
+            dataset = self._datasets[name]
+            dataset.resize(done + len(times), axis=0)
+            dataset[done:] = column
+            dataset.flush()
+        # A reader, or whoever comes after a kill, counts the times: they are there when all else is.
+        dataset = self._datasets["time"]
+        dataset.resize(done + len(times), axis=0)
+        dataset[done:] = times
+        dataset.flush()
+
+    def _finish(self, complete: bool) -> None:
+        faults = [fault._asdict() for fault in self._runner.faults]
+        try:
+            with _h5py().File(self.partial, "r+") as file:
+                file.attrs["complete"] = complete
+                file.attrs["faults"] = json.dumps(faults)
+            with self.partial.open("rb") as whole:
+                os.fsync(whole.fileno())
+            if complete and self._overwrite:
+                self.partial.replace(self.path)
+            else:
+                os.link(self.partial, self.path)  # fails where there is a file by now
+                self.partial.unlink()
+        except FileExistsError:
+            if complete:
+                raise RecordingError(
+                    f"{self.path} was made by someone else meanwhile; the recording is in {self.partial}"
+                ) from None
+        except OSError as error:
+            raise RecordingError(f"{self.partial}: cannot be completed: {error}") from error
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording, read: arrays as in :class:`sim.Rollout`, and what they belong to. See :func:`read_recording`."""
+
+    path: Path
+    time: NDArray[np.float64]
+    setpoint: NDArray[np.float64]
+    qpos: NDArray[np.float32]
+    qvel: NDArray[np.float32]
+    effort: NDArray[np.float32]
+    saturated: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+    attributes: dict[str, Any]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run came to its end."""
+        return bool(self.attributes["complete"])
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return tuple(map(str, self.attributes["joint_names"]))
+
+    @property
+    def params(self) -> bp.PIDParams:
+        """The params at the start of the recording."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "params.json"
+            path.write_text(str(self.attributes["params"]))
+            return bp.load_params(path, self.joint_names)[0]
+
+
+def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording:
+    """Read a recording: complete, cut short by a kill, or one that is still being written.
+
+    Parameters
+    ----------
+    every
+        Take every so-manieth tick.
+
+    Raises
+    ------
+    RecordingError
+        The file is missing, or no recording.
+    """
+    h5py, path = _h5py(), Path(path)
+    if not path.is_file():
+        raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
+    try:
+        try:
+            file = h5py.File(path, "r")
+        except OSError:
+            file = h5py.File(
+                path, "r", swmr=True, libver="latest"
+            )  # someone writes it, or was killed while doing so
+        with file:
+            attributes = dict(file.attrs)
+            if attributes.get("format") != FORMAT:
+                raise ValueError(f"its format is {attributes.get('format')!r}, not {FORMAT!r}")
+            times = file["time"][:]
+            count = int(np.isfinite(times).sum())
+            arrays = {name: file[name][:count:every] for name in _FIELDS}
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise RecordingError(f"{path}: cannot be read as a recording: {error}") from error
+    return Recording(path=path, time=times[:count:every], attributes=attributes, **arrays)
+
+
+def check_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    """Check, before anything runs, that a recording can be called ``path``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        It is the name of a file, or ends otherwise than in .h5 or .hdf5.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidArgumentError(
+            "path", "must be a path", value=path, remedy="pass a file name ending in .h5"
+        )
+    path = Path(path)
+    if path.suffix not in (".h5", ".hdf5"):
+        raise InvalidArgumentError(
+            "path", "unknown file format", value=str(path), remedy="end it in .h5 or .hdf5"
+        )
+    if path.exists() and not overwrite:
+        raise InvalidArgumentError(
+            "path", "exists already", value=str(path), remedy="choose another name, or pass overwrite=True"
+        )
+    return path
+
+
+def _free_name(path: Path) -> Path:
+    """A name beside ``path`` that no file has: what an earlier run left behind is kept."""
+    partial, number = path.with_name(path.name + ".partial"), 1
+    while partial.exists():
+        number += 1
+        partial = path.with_name(f"{path.name}.partial{number}")
+    return partial
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise MissingDependencyError("h5py", "recording to HDF5", "record") from None
+    return h5py
+
+
+def _units(runner: Runner) -> dict[str, list[str]]:
+    joints = runner.robot.joints
+    position, effort = [joint.unit for joint in joints], [joint.effort_unit for joint in joints]
+    return {
+        "time": ["s"],
+        "setpoint": effort if runner.control == "effort" else position,
+        "qpos": position,
+        "qvel": [f"{unit}/s" for unit in position],
+        "effort": effort,
+    }
+
+
+def _attributes(runner: Runner, seed: int | None) -> dict[str, Any]:
+    robot = runner.robot
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "params.json"
+        bp.save_params(path, runner.params, robot.joint_names)
+        params = path.read_text()
+    versions = {"python": platform.python_version()}
+    for package in ("batchpid", "sapien", "numpy", "h5py"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return {
+        "format": FORMAT,
+        "complete": False,
+        "faults": "[]",
+        "robot": robot.name,
+        "urdf": robot.urdf,
+        "joint_names": list(robot.joint_names),
+        "units": [joint.unit for joint in robot.joints],
+        "lower": robot.lower,
+        "upper": robot.upper,
+        "effort_limit": robot.effort_limit,
+        "num_envs": runner.num_envs,
+        "timestep": runner.timestep,
+        "substeps": runner.substeps,
+        "control": runner.control,
+        "compensate": runner.compensate,
+        "dissipation": robot.dissipation,
+        "params": params,
+        "seed": "none" if seed is None else seed,
+        "versions": json.dumps(versions),
+        "begun": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
