@@ -25,7 +25,8 @@ Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Rgba = tuple[float, float, float, float]
 
-_SEGMENTS = 20  # of a circle
+SEGMENTS = 24
+"""Of a circle, where nothing else is said."""
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 
 
@@ -38,8 +39,8 @@ class Surface(NamedTuple):
     faces: Faces
 
 
-def surfaces(robot: Robot) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour.
+def surfaces(robot: Robot, segments: int = SEGMENTS) -> list[Surface]:
+    """Return the surfaces of ``robot``, one for each link and colour; circles have so many ``segments``.
 
     Vertices are not shared across sharp edges, so that averaged normals shade right.
 
@@ -58,20 +59,20 @@ def surfaces(robot: Robot) -> list[Surface]:
     result = []
     for link in original.findall("link"):
         name = link.get("name")
-        shapes = _shapes(link.findall("visual"), robot)
+        shapes = _shapes(link.findall("visual"), robot, segments)
         if not shapes:
-            shapes = _shapes(collisions.get(name, []), robot) or []
+            shapes = _shapes(collisions.get(name, []), robot, segments) or []
         result += _merge(name, [(_colour(element, colours, name), *mesh) for element, mesh in shapes])
     return result
 
 
 def _shapes(
-    elements: list[etree._Element], robot: Robot
+    elements: list[etree._Element], robot: Robot, segments: int
 ) -> list[tuple[etree._Element, tuple[Vertices, Faces]]] | None:
     """Return each element's triangles in the link's frame, or None if one of its files is missing."""
     result = []
     for element in elements:
-        mesh = _triangles(element.find("geometry"), robot)
+        mesh = _triangles(element.find("geometry"), robot, segments)
         if mesh is None:
             return None
         vertices, faces = mesh
@@ -98,14 +99,14 @@ def _merge(link: str, parts: list[tuple[Rgba, Vertices, Faces]]) -> list[Surface
     return merged
 
 
-def _triangles(geometry: etree._Element | None, robot: Robot) -> tuple[Vertices, Faces] | None:
+def _triangles(geometry: etree._Element | None, robot: Robot, segments: int) -> tuple[Vertices, Faces] | None:
     for shape in () if geometry is None else geometry:
         if shape.tag == "box":
             return box(numbers(shape, "size", "0 0 0"))
         if shape.tag == "cylinder":
-            return cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)))
+            return cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)), segments)
         if shape.tag == "sphere":
-            return sphere(float(shape.get("radius", 0)))
+            return sphere(float(shape.get("radius", 0)), segments)
         if shape.tag == "mesh":
             return _file(shape, robot)
     return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -156,36 +157,36 @@ def box(size: NDArray[np.float64]) -> tuple[Vertices, Faces]:
     return np.concatenate(vertices) * np.asarray(size) / 2, np.concatenate(faces)
 
 
-def cylinder(radius: float, length: float) -> tuple[Vertices, Faces]:
+def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> tuple[Vertices, Faces]:
     """Return a cylinder along z about the origin, its caps apart from its side."""
-    angle = 2 * math.pi * np.arange(_SEGMENTS) / _SEGMENTS
-    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(_SEGMENTS)], axis=1)
+    angle = 2 * math.pi * np.arange(segments) / segments
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(segments)], axis=1)
     up = np.array([0.0, 0.0, length / 2])
-    here, following = np.arange(_SEGMENTS), (np.arange(_SEGMENTS) + 1) % _SEGMENTS
-    low, high, bottom, top = (n * _SEGMENTS for n in range(4))
-    centre = 4 * _SEGMENTS
+    here, following = np.arange(segments), (np.arange(segments) + 1) % segments
+    low, high, bottom, top = (n * segments for n in range(4))
+    centre = 4 * segments
     faces = [
         np.stack([low + here, low + following, high + following], axis=1),
         np.stack([low + here, high + following, high + here], axis=1),
-        np.stack([np.full(_SEGMENTS, centre), bottom + following, bottom + here], axis=1),
-        np.stack([np.full(_SEGMENTS, centre + 1), top + here, top + following], axis=1),
+        np.stack([np.full(segments, centre), bottom + following, bottom + here], axis=1),
+        np.stack([np.full(segments, centre + 1), top + here, top + following], axis=1),
     ]
     vertices = [ring - up, ring + up, ring - up, ring + up, -up[None], up[None]]
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def sphere(radius: float) -> tuple[Vertices, Faces]:
+def sphere(radius: float, segments: int = SEGMENTS) -> tuple[Vertices, Faces]:
     """Return a sphere about the origin, of rings of latitude."""
-    rings = _SEGMENTS // 2
+    rings = segments // 2
     polar = math.pi * np.arange(rings + 1) / rings
-    angle = 2 * math.pi * np.arange(_SEGMENTS) / _SEGMENTS
+    angle = 2 * math.pi * np.arange(segments) / segments
     flat = np.sin(polar)[:, None]
-    height = np.repeat(np.cos(polar)[:, None], _SEGMENTS, axis=1)
+    height = np.repeat(np.cos(polar)[:, None], segments, axis=1)
     vertices = radius * np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=-1).reshape(-1, 3)
-    ring, column = np.meshgrid(np.arange(rings), np.arange(_SEGMENTS), indexing="ij")
-    following = (column + 1) % _SEGMENTS
-    a, b = ring * _SEGMENTS + column, ring * _SEGMENTS + following
-    c, d = a + _SEGMENTS, b + _SEGMENTS
+    ring, column = np.meshgrid(np.arange(rings), np.arange(segments), indexing="ij")
+    following = (column + 1) % segments
+    a, b = ring * segments + column, ring * segments + following
+    c, d = a + segments, b + segments
     # At a pole one of the two triangles of a quad has no area.
     faces = np.concatenate(
         [np.stack([a, c, d], -1)[:-1].reshape(-1, 3), np.stack([a, d, b], -1)[1:].reshape(-1, 3)]

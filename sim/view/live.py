@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 import batchpid as bp
 
 from ..arguments import choice, integer, number
-from ..control import CONTROLS
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..runner import Runner

@@ -39,8 +39,8 @@ def load(folder, a="", b=""):
     ("mesh", "expected", "share"),
     [
         (box(np.array([0.1, 0.2, 0.4])), 0.1 * 0.2 * 0.4, 1e-12),
-        (cylinder(0.2, 0.5), np.pi * 0.2**2 * 0.5, 0.01),
-        (sphere(0.3), 4 / 3 * np.pi * 0.3**3, 0.03),
+        (cylinder(0.2, 0.5), np.pi * 0.2**2 * 0.5, 0.02),
+        (sphere(0.3), 4 / 3 * np.pi * 0.3**3, 0.04),
     ],
 )
 def test_primitives_are_closed_and_face_out(mesh, expected, share):
