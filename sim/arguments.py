@@ -74,7 +74,7 @@ def array(
             remedy=f"pass an array of shape {shape}",
         ) from None
     try:
-        result = np.broadcast_to(result, shape)
+        result = result if result.shape == shape else np.broadcast_to(result, shape)
     except ValueError:
         raise InvalidArgumentError(
             argument,

@@ -17,13 +17,12 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from batchpid.errors import BatchPIDError, WorkerError
 
+from .arrays import Arrays
 from .command import Command, Start, Tick, Worker
 from .loop import LoopSpec
+from .shared import SharedArrays
 from .worker import LocalWorker, ProcessWorker, WorkerLost
 
 _LOOK = 0.1  # seconds between two looks at workers that do not answer
@@ -82,9 +81,13 @@ class WorkerPool:
         self._warning: str | None = None
         self.recoveries = 0
         """How many lost workers were replaced."""
+        dof = len(spec(slice(0, num_envs)).scene.joints)
+        self._shared = SharedArrays(Arrays.layout(num_envs, dof))
+        self.arrays = Arrays(**self._shared.arrays)
+        """What goes in and out, over all envs; each worker has its rows of it."""
         try:
             for index, envs in enumerate(_share(num_envs, count, pack_size)):
-                seat = _Seat(spec(envs), index, envs, self._kind(spec(envs), index))
+                seat = _Seat(spec(envs), index, envs, self._kind(spec(envs), index, self._shared))
                 self._seats.append(seat)
                 self._welcome(seat)
             self._finish()
@@ -147,15 +150,12 @@ class WorkerPool:
         if self._recover:
             self._journal = [command]
 
-    def gather(self, name: str, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """One of the loops' arrays over all envs."""
-        return np.concatenate([getattr(seat.worker.arrays, name) for seat in self._seats], out=out)
-
     def close(self) -> None:
         """End all workers; those amid a command at once."""
         seats, self._seats = self._seats, []
         for seat in seats:
             self._dismiss(seat, patience=0.0 if seat.queue else 5.0)
+        self._shared.close()
 
     # -- one command, until every worker has done it ---------------------------------------------------------------
 
@@ -236,7 +236,7 @@ class WorkerPool:
             seat.cause, seat.lost = str(error), time.monotonic()
         current = seat.queue[-1]
         self._dismiss(seat, patience=0.0)
-        seat.worker = self._kind(seat.spec, seat.index)
+        seat.worker = self._kind(seat.spec, seat.index, self._shared)
         self._welcome(seat)
         if not isinstance(current, Start):
             seat.queue.extend(self._journal)

@@ -73,6 +73,10 @@ class Rollout(NamedTuple):
     saturated: Bool
     ok: Bool
 
+    def envs(self, envs: slice | Any) -> Rollout:
+        """The rollout of some envs (a slice or an index array)."""
+        return Rollout(self.time, *(field[:, envs] for field in self[1:]))
+
 
 class Runner:
     """N robots in N headless SAPIEN scenes under explicit PID, drive or effort control.
@@ -172,6 +176,7 @@ class Runner:
                 remedy="load one with Robot.load('panda') or a URDF path",
             )
         self.robot = robot
+        self._lower, self._upper = robot.lower - 1e-6, robot.upper + 1e-6
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         count = len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024)
         self.timestep = number("timestep", timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000")
@@ -376,13 +381,13 @@ class Runner:
                 self.substeps,
             )
             for name in Observation._fields:
-                pool.gather(name, getattr(result, name)[tick])
+                getattr(result, name)[tick] = getattr(pool.arrays, name)
         return result
 
     def observe(self) -> Observation:
         """State of every env now, as fresh arrays."""
         pool = self._open()
-        return Observation(*(pool.gather(name) for name in Observation._fields))
+        return Observation(*(getattr(pool.arrays, name).copy() for name in Observation._fields))
 
     def poses(self) -> Float32:
         """Poses now of the entities that ``build`` returned, (envs, entities, 7): x, y, z [m], quaternion w, x, y, z.
@@ -507,10 +512,10 @@ class Runner:
 
     def _note_faults(self) -> None:
         """Add what failed since the last look to :attr:`faults`; warn of the first."""
-        if all(worker.arrays.ok.all() for worker in self._workers):
+        arrays = self._open().arrays
+        if arrays.ok.all():
             return
-        pool = self._open()
-        steps, joints, causes = (pool.gather(f"fault_{name}") for name in ("step", "joint", "cause"))
+        steps, joints, causes = arrays.fault_step.copy(), arrays.fault_joint, arrays.fault_cause
         for env in np.flatnonzero((steps >= 0) & (steps != self._fault_steps)).tolist():
             step = int(steps[env])
             joint, cause = self.robot.joint_names[joints[env]], CAUSES[causes[env]]
@@ -604,7 +609,7 @@ class Runner:
     def _warn_limits(self, argument: str, positions: NDArray[np.float64]) -> None:
         """Warn once for each joint whose ``positions`` (..., dof) leave its limits."""
         robot = self.robot
-        outside = (positions < robot.lower - 1e-6) | (positions > robot.upper + 1e-6)
+        outside = (positions < self._lower) | (positions > self._upper)
         if not outside.any():
             return
         for index in np.flatnonzero(outside.reshape(-1, robot.dof).any(0)):

@@ -48,10 +48,9 @@ class WorkerLost(WorkerError):
 class LocalWorker:
     """The loop in this process, behind the same calls as a worker process."""
 
-    def __init__(self, spec: LoopSpec, index: int) -> None:
+    def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
         self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        self._shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)))
-        self.arrays = Arrays(**self._shared.arrays)
+        self.arrays = Arrays(**shared.arrays).rows(slice(self.envs.start, self.envs.stop))
         self._loop = Loop(spec, self.arrays)
         self._result: Any = None
 
@@ -70,7 +69,6 @@ class LocalWorker:
     def close(self, patience: float = 0.0) -> None:
         """Free the scenes."""
         self._loop.close()
-        self._shared.close()
 
 
 class ProcessWorker:
@@ -79,15 +77,14 @@ class ProcessWorker:
     The first result, None, comes unasked, when the loop is built.
     """
 
-    def __init__(self, spec: LoopSpec, index: int) -> None:
+    def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
         self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        message = _pickle(spec)
+        message = _pickle((spec, len(shared.arrays["ok"])))
         self._owner = os.getpid()
-        self._shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)))
-        self.arrays = Arrays(**self._shared.arrays)
+        self.arrays = Arrays(**shared.arrays).rows(slice(self.envs.start, self.envs.stop))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         ours, theirs = socket.socketpair()
-        descriptors = (theirs.fileno(), self._shared.fd, self._trace)
+        descriptors = (theirs.fileno(), shared.fd, self._trace)
         with theirs:
             self._process = subprocess.Popen(
                 [
@@ -174,7 +171,6 @@ class ProcessWorker:
             except subprocess.TimeoutExpired:
                 self._process.kill()
             self._process.wait()
-        self._shared.close()
         if self._trace >= 0:
             os.close(self._trace)
             self._trace = -1
@@ -225,8 +221,10 @@ def main() -> None:
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     connection = Connection(channel)
     try:
-        spec: LoopSpec = connection.recv()
-        _serve(connection, spec, memory)
+        spec, num_envs = connection.recv()
+        layout = Arrays.layout(num_envs, len(spec.scene.joints))
+        arrays = Arrays(**SharedArrays(layout, memory).arrays)
+        _serve(connection, spec, arrays.rows(slice(spec.first_env, spec.first_env + spec.num_envs)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent closed, or died
     os._exit(0)  # nothing is left to save, and the engine's own end can take long
@@ -245,10 +243,9 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _serve(connection: Connection, spec: LoopSpec, memory: int) -> None:
-    shared = SharedArrays(Arrays.layout(spec.num_envs, len(spec.scene.joints)), memory)
+def _serve(connection: Connection, spec: LoopSpec, arrays: Arrays) -> None:
     try:
-        loop = Loop(spec, Arrays(**shared.arrays))
+        loop = Loop(spec, arrays)
     except Exception as error:
         connection.send((None, _portable(error)))
         return
@@ -272,8 +269,8 @@ def _serve(connection: Connection, spec: LoopSpec, memory: int) -> None:
             connection.send((None, _portable(error)))
 
 
-def _pickle(spec: LoopSpec) -> bytes:
-    """The spec as bytes; cloudpickle takes along the user's function where the worker cannot import it by name."""
+def _pickle(spec: tuple[LoopSpec, int]) -> bytes:
+    """The spec and the number of all envs; cloudpickle takes along a function that the worker cannot import."""
     try:
         return cloudpickle.dumps(spec)
     except Exception as error:
