@@ -8,7 +8,7 @@ from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.law import advance, init, reset, step, track
 from batchpid.params import PIDParams, make_params
-from batchpid.serialization import load_params, save_params
+from batchpid.serialization import load_about, load_params, save_params
 from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
 
@@ -26,6 +26,7 @@ __all__ = [
     "discretise",
     "drive_target",
     "init",
+    "load_about",
     "load_params",
     "make_params",
     "presets",

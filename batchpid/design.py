@@ -44,8 +44,6 @@ BACK_OFF = 0.8
 class Designable(Protocol):
     """What :func:`design_gains` asks of a robot; :class:`sim.Robot` is one."""
 
-    joint_names: Any
-
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
 

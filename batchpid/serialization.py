@@ -19,7 +19,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +49,19 @@ OFF = {
     "continuous": False,
 }
 """The options of a joint, and the value that is off."""
-HEAD = ("format", "dtype", *CHOICES, "joints")
+HEAD = ("format", "about", "dtype", *CHOICES, "joints")
 
 
-def save_params(path: str | os.PathLike[str], params: PIDParams, joint_names: Sequence[str]) -> None:
+def save_params(
+    path: str | os.PathLike[str],
+    params: PIDParams,
+    joint_names: Sequence[str],
+    about: Mapping[str, Any] | None = None,
+) -> None:
     """Write ``params`` to ``path`` (.yaml, .yml or .json); an existing file is replaced as a whole or not at all.
+
+    ``about`` is kept beside them for :func:`load_about`: plain numbers, strings, lists and mappings, e.g. where the
+    params come from.
 
     Raises
     ------
@@ -69,7 +77,10 @@ def save_params(path: str | os.PathLike[str], params: PIDParams, joint_names: Se
             remedy="name every joint of the params once",
         )
     options = params.options()
-    document: dict[str, Any] = {"format": FORMAT, "dtype": str(options.pop("dtype"))}
+    document: dict[str, Any] = {"format": FORMAT}
+    if about:
+        document["about"] = json.loads(json.dumps(dict(about)))
+    document["dtype"] = str(options.pop("dtype"))
     document |= {name: options.pop(name) for name in CHOICES}
     document["joints"] = {
         name: {key: _plain(column[:, joint]) for key, column in options.items()}
@@ -103,12 +114,7 @@ def load_params(
         If there is no such file.
     """
     path = Path(path)
-    parse = _parse_yaml if _is_yaml(path) else _parse_json
-    try:
-        document = parse(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        said = " ".join(str(error).split())[:300] or type(error).__name__
-        raise InvalidArgumentError(str(path), f"cannot be read: {said}", remedy="correct the file") from None
+    document = _parsed(path)
     joints = _checked(path, document)
     names = list(joints)
     if joint_names is not None:
@@ -133,6 +139,29 @@ def load_params(
             env=error.env,
             value=error.value,
         ) from None
+
+
+def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return what :func:`save_params` kept beside the params in a file; empty if nothing.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As :func:`load_params`.
+    """
+    path = Path(path)
+    document = _parsed(path)
+    _checked(path, document)
+    return dict(document.get("about", {}))
+
+
+def _parsed(path: Path) -> Any:
+    parse = _parse_yaml if _is_yaml(path) else _parse_json
+    try:
+        return parse(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        said = " ".join(str(error).split())[:300] or type(error).__name__
+        raise InvalidArgumentError(str(path), f"cannot be read: {said}", remedy="correct the file") from None
 
 
 def _plain(column: Any) -> Any:
@@ -173,6 +202,10 @@ def _checked(path: Path, document: Any) -> dict[str, dict[str, Any]]:
             raise InvalidArgumentError(
                 f"{path}: {key}", "is no known key", remedy=f"choose from {', '.join(HEAD)}"
             )
+    if not isinstance(document.get("about", {}), dict):
+        raise InvalidArgumentError(
+            f"{path}: about", "is no mapping", remedy="name what is told, or leave it out"
+        )
     if document.get("dtype", "float64") not in ("float32", "float64"):
         raise InvalidArgumentError(f"{path}: dtype", "is unknown", remedy="choose from float32, float64")
     joints = document.get("joints")

@@ -257,6 +257,29 @@ class Robot:
 
         return probe(SceneSpec(self.urdf, self.srdf, self.joints, 1e-3, PHYSICS["fast"], ground=ground))
 
+    def tuned(self) -> dict[str, Any]:
+        """Options of :class:`sim.Runner` with which a bundled robot settles: tuned params, and what they need.
+
+        ``Runner(robot, 64, **robot.tuned())``. See docs/choosing-gains.md.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not bundled.
+        """
+        path = self.path.with_name(f"{self.path.stem}.tuned.yaml")
+        if self.settings is None or not path.is_file():
+            raise InvalidArgumentError(
+                "robot",
+                f"{self.name!r} carries no tuned gains",
+                remedy="use batchpid.design_gains(robot), or make some with: batchpid tune",
+            )
+        params, _ = bp.load_params(path, self.joint_names)
+        return {
+            "params": params,
+            "measurement_rate": bool(bp.load_about(path).get("measurement_rate", False)),
+        }
+
     def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
         """Entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""
         rows = np.atleast_2d(np.asarray(qpos, np.float64))

@@ -24,6 +24,8 @@ COMMANDS = {
         "N of any robot follow a setpoint; what happened goes to a file",
     ),
     "bench": ("batchpid.cli.bench:Bench", "the closed loop beside the tutorial's loop and the bare engine"),
+    "tune": ("batchpid.cli.tune:Tune", "gains that settle, for any robot, found on the real scenes"),
+    "compare": ("batchpid.cli.compare:Compare", "sets of gains on the same moves: a table and a picture"),
     "inspect": ("batchpid.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
     "view": ("batchpid.cli.view:View", "robots in the browser, live: sliders, charts, pushes and payloads"),
 }

@@ -1,0 +1,74 @@
+"""``batchpid compare``: sets of gains on the same moves, a table and a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Gain sets on the same seeded moves: settling, overshoot, final error and chatter of each."""
+
+    gains: Annotated[tuple[str, ...], tyro.conf.Positional] = ("tuned", "tutorial", "drive")
+    """Params files, or: tutorial, tuned, designed, drive, drive:STIFFNESS,DAMPING."""
+    robot: str = "panda"
+    """A bundled robot, or the path of a URDF."""
+    moves: int = 20
+    """Random moves, beside the tutorial's."""
+    seed: int = 1
+    """Of the moves."""
+    seconds: float = 2.0
+    """Simulated time of each move [s]."""
+    workers: int | None = None
+    """Processes; 0: this one. Default: one for each available core."""
+    physics: Literal["accurate", "fast"] = "accurate"
+    """Solver settings."""
+    variation: bool = False
+    """Payload, friction, coarse sensors and late efforts, drawn for each move."""
+    picture: Path | None = None
+    """The first two sets on the first move: .png or .svg."""
+
+    def run(self) -> None:
+        """Run it."""
+        from batchpid import plots
+        from batchpid.cli.gainsets import gain_set, trial_table
+        from batchpid.cli.progress import bar
+        from batchpid.errors import InvalidArgumentError
+        from sim import Robot
+        from sim.moves import random_moves, tutorial_move
+        from sim.trial import try_gains
+        from sim.variation import draw_variation
+
+        if self.picture is not None:
+            plots.check_path(self.picture)
+            if len(self.gains) < 2:
+                raise InvalidArgumentError("gains", "is one set", remedy="name two for a picture")
+        robot = Robot.load(self.robot)
+        sets = [gain_set(robot, name) for name in self.gains]
+        moves = tutorial_move(robot) + random_moves(robot, self.moves, self.seed)
+        drawn = draw_variation(robot, len(moves.start), self.seed) if self.variation else None
+        trials = [
+            try_gains(
+                robot,
+                name=each.name,
+                moves=moves,
+                seconds=self.seconds,
+                workers=self.workers,
+                physics=self.physics,
+                variation=drawn,
+                **each.options,
+            )
+            for each in bar("comparing", unit="set")(sets)
+        ]
+        print(f"{robot.name}: {len(moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
+        print(trial_table(robot, trials))
+        if self.picture is not None:
+            first, second = (
+                plots.Traces.of(trial.rollout.envs(slice(0, 1)), robot, trial.name) for trial in trials[:2]
+            )
+            title = f"{robot.name}, {moves.names[0]} move"
+            print(f"\npicture: {plots.save(plots.comparison(first, second, title=title), self.picture)}")

@@ -1,0 +1,143 @@
+"""Robots that differ from the model, env by env: payload, joint friction, coarse sensors, late efforts.
+
+Compensation and mass matrix stay those of the unloaded robot, because a controller does not know what it will carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import InvalidArgumentError
+
+from .kinematics import Kinematics
+from .robot import Robot
+from .scenes import Pack, Probe, SceneSpec
+
+if TYPE_CHECKING:
+    from sapien.wrapper.articulation_builder import ArticulationBuilder
+
+Float64 = NDArray[np.float64]
+GRAVITY = 9.81
+SPARE = 0.5
+"""Share of what the effort limits leave beside the robot's own weight that a payload may take."""
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """How each env's robot differs: ``payload`` [kg] and ``friction`` (PhysX's coefficient), both (envs,).
+
+    The payload is added to the mass of ``link``. ``resolution`` [rad or m] is the position sensor's step, 0 for none;
+    ``late`` delays every effort by one sim step.
+    """
+
+    payload: Float64
+    friction: Float64
+    link: str
+    resolution: float = 0.0
+    late: bool = False
+
+    def for_envs(self, envs: slice | Any) -> Variation:
+        """The variation of some envs (a slice or an index array)."""
+        return Variation(self.payload[envs], self.friction[envs], self.link, self.resolution, self.late)
+
+
+def draw_variation(
+    robot: Robot,
+    envs: int,
+    seed: int = 0,
+    *,
+    payload: float = 2.0,
+    friction: float = 0.1,
+    resolution: float = 2 * np.pi / 2**18,
+    late: bool = True,
+) -> Variation:
+    """Draw payloads from 0 to ``payload`` [kg], or to what the robot carries, and friction from 0 to ``friction``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A negative number.
+    """
+    for name, value in (("payload", payload), ("friction", friction), ("resolution", resolution)):
+        if not 0 <= value < np.inf:
+            raise InvalidArgumentError(name, "must be finite and >= 0", value=value, remedy="use 0 for none")
+    rng = np.random.default_rng(seed)
+    kinematics = Kinematics(robot)
+    return Variation(
+        payload=rng.uniform(0, min(payload, capacity(robot)), envs),
+        friction=rng.uniform(0, friction, envs),
+        link=kinematics.links[kinematics.tool],
+        resolution=resolution,
+        late=late,
+    )
+
+
+def capacity(robot: Robot) -> float:
+    """Payload [kg] that the robot holds in 95 % of seeded poses with half of the effort its own weight leaves."""
+    kinematics, qpos = Kinematics(robot), robot.sample(200, seed=0)
+    still = np.zeros_like(qpos)
+    own = np.abs(robot.probe().inverse_dynamics(qpos, still, still))
+    per_kg = np.abs(kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        carried = np.where(per_kg > 1e-9, SPARE * (robot.effort_limit - own) / per_kg, np.inf)
+    return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))
+
+
+class VariedPack(Pack):
+    """A pack whose robots differ from the model by ``variation``, one entry for each of its scenes."""
+
+    def __init__(
+        self,
+        builder: ArticulationBuilder,
+        spec: SceneSpec,
+        size: int,
+        first_env: int,
+        system_size: int,
+        variation: Variation,
+        model: Probe,
+    ) -> None:
+        self._late: NDArray[Any] | None = None
+        self._resolution = 0.0
+        super().__init__(builder, spec, size, first_env, system_size)
+        for row, (payload, friction) in enumerate(zip(variation.payload, variation.friction, strict=True)):
+            self.alter(row, variation.link, float(payload), float(friction))
+        self._resolution, self._model = variation.resolution, model
+        if variation.late:
+            self._late = np.zeros((size, self.dof))
+
+    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+        """Joint positions as the sensors give them."""
+        qpos = super().read_qpos(dtype)
+        return (
+            qpos
+            if self._resolution == 0
+            else (np.rint(qpos / self._resolution) * self._resolution).astype(dtype)
+        )
+
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+        """What the model of the unloaded robot says at the measured positions."""
+        qpos, still = self.read_qpos(), np.zeros((self.size, self.dof))
+        qvel = self.read_qvel() if coriolis else still
+        force = self._model.inverse_dynamics(qpos, qvel, still)
+        if coriolis and not gravity:
+            force = force - self._model.inverse_dynamics(qpos, still, still)
+        return force.astype(dtype)
+
+    def write_qf(self, effort: NDArray[Any]) -> None:
+        """Apply efforts, or those of the step before where they are late."""
+        if self._late is None:
+            super().write_qf(effort)
+        else:
+            late, self._late = self._late, np.array(effort, np.float64)
+            super().write_qf(late)
+
+    def write_state(self, rows: Sequence[int], *state: Any) -> None:
+        """Place robots; no effort of theirs is pending."""
+        super().write_state(rows, *state)
+        if self._late is not None:
+            self._late[list(rows)] = 0.0
