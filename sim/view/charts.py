@@ -12,7 +12,7 @@ _INK = {"setpoint": "#4a82ff", "limit": "#b6bcc6"}
 _COLOURS = ("#15803d", "#d97706", "#7c3aed")
 """The first group's curve, the second's, ..."""
 WINDOW = 8.0
-"""Length of the time axis [s]."""
+"""How far back the time axis goes [s]: it counts from now."""
 
 
 class Charts:
@@ -21,7 +21,7 @@ class Charts:
     def __init__(self, gui: Any, source: Source) -> None:
         self._source = source
         names = source.groups if len(source.groups) > 1 else ("",)
-        still = np.array([0.0, 1.0])
+        still = np.array([-WINDOW, 0.0])
 
         def chart(title: str, series: list[dict[str, Any]]) -> Any:
             data = tuple(still for _ in range(len(series) + 1))
@@ -29,7 +29,9 @@ class Charts:
                 data,
                 ({"label": "s"}, *series),
                 title=title,
-                scales={"x": {"time": False}},
+                scales={
+                    "x": {"time": False, "range": (-WINDOW, 0.0)}
+                },  # a range of its own would drift in viser 1.1
                 legend={"show": True},
                 height=168,
                 axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
@@ -61,6 +63,7 @@ class Charts:
         force = "N" if unit == "m" else "N m"
         name = source.robot.joint_names[joint]
         keep = [tuple(column[recent] for column in trace) for trace in traces]
+        ago = keep[0][0] - keep[0][0][-1]
         low, high = source.effort_limits(robots[0], joint)
         limits = tuple(
             np.full(int(recent.sum()), bound if np.isfinite(bound) else np.nan) for bound in (low, high)
@@ -72,7 +75,7 @@ class Charts:
         ):
             if chart.title != title:
                 chart.title = title
-            chart.data = (keep[0][0], *columns)
+            chart.data = (ago, *columns)
 
 
 def _dashed(label: str, colour: str) -> dict[str, Any]:

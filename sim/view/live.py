@@ -151,8 +151,8 @@ class Live:
     # -- frames ----------------------------------------------------------------------------------------------------
 
     def frame(self) -> Frame:
-        """Return the present state."""
-        return self._frame
+        """Return the present state, with the setpoints as they are wished for now."""
+        return self._frame._replace(setpoint=np.tile(self.setpoint, (len(self.groups), 1)))
 
     def advance(self) -> None:
         """Run one frame of every group, all at once."""

@@ -152,7 +152,7 @@ class RobotScene:
         size = max(float(np.hypot(*extent[:2])), 0.0) + 2.0 * reach
         away = np.array([-0.62, -0.80, 0.52])
         camera = self._server.initial_camera
-        camera.position = tuple(centre + size * 0.95 * away / np.linalg.norm(away))
+        camera.position = tuple(centre + size * 1.06 * away / np.linalg.norm(away))
         camera.look_at = (centre[0], centre[1], 0.35 * reach)
         camera.fov = math.radians(42)
 

@@ -15,9 +15,9 @@ from batchpid.errors import MissingDependencyError
 from .charts import Charts
 from .panel import Panel
 from .scene import RobotScene
-from .source import Source
+from .source import Frame, Source
 
-CHARTS_EVERY = 3
+CHARTS_EVERY = 5
 """Frames from one drawing of the charts to the next."""
 STATUS_EVERY = 15
 
@@ -57,6 +57,8 @@ class View:
         self._scene.on_click(self.panel.select)
         self.rate, self.factor = 0.0, 0.0
         self._stop = False
+        self._shown: tuple[Any, ...] = ()
+        self._settled = False
 
     def run(self, seconds: float | None = None) -> None:
         """Serve the page; for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
@@ -103,13 +105,25 @@ class View:
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
-    def _show(self, frame: Any, count: int) -> None:
+    def _show(self, frame: Frame, count: int) -> None:
+        """Send what has changed; charts and status only now and then while the robots move."""
         panel = self.panel
-        self._scene.show(frame, panel.env, panel.ghost)
-        if count % CHARTS_EVERY == 0:
+        wanted = (
+            frame.qpos.tobytes(),
+            frame.setpoint.tobytes(),
+            frame.time,
+            panel.env,
+            panel.joint,
+            panel.ghost,
+        )
+        still = wanted == self._shown
+        if not still:
+            self._scene.show(frame, panel.env, panel.ghost)
+        if (not still and count % CHARTS_EVERY == 0) or (still and not self._settled):
             self._charts.show(panel.env, panel.joint)
-        if count % STATUS_EVERY == 0:
+        if (not still and count % STATUS_EVERY == 0) or (still and not self._settled):
             panel.tell(frame, self.factor, self.rate)
+        self._shown, self._settled = wanted, still
 
     def _measure(self, laps: deque[tuple[float, float]]) -> None:
         (first, start), (last, end) = laps[0], laps[-1]
