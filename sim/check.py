@@ -19,6 +19,7 @@ import batchpid as bp
 
 from .arguments import array, choice, number
 from .physics import DISSIPATION
+from .stability import stability
 from .urdf import Joint, mimic_works
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 SEVERITIES = ("error", "warning", "note")
 """Will not do what is asked; probably does something else than meant; good to know."""
+
+NEAR_BOUND = 0.5
+"""Share of the stability range from which on gains are told of: the range shrinks in lighter poses."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,11 @@ def check(
     findings = [*_links(robot), *_joints(robot), *_base(robot), *_poses(robot, "start pose", start)]
     if setpoint is not None:
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
+    findings += _touching(robot, start)
     if params is not None:
         findings += _params(robot, params, control)
+        if control == "pid":
+            findings += _stability(robot, params, start, timestep)
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
@@ -211,6 +218,44 @@ def _poses(robot: Robot, what: str, qpos: NDArray[np.float64]) -> Iterator[Findi
             "out-of-limits",
             f"{what} {value:g} {joint.unit} is outside [{joint.lower:g}, {joint.upper:g}]: {effect}",
             "move it inside",
+            joint=joint.name,
+        )
+
+
+def _touching(robot: Robot, start: NDArray[np.float64]) -> Iterator[Finding]:
+    if robot.probe().touches(start[None])[0]:
+        yield Finding(
+            "warning",
+            "touching",
+            "links overlap, or dip into the ground, at the start pose: SAPIEN pushes them apart",
+            "start elsewhere, correct the collision shapes, or disable the pair in an .srdf beside the URDF",
+        )
+
+
+def _stability(
+    robot: Robot, params: bp.PIDParams, start: NDArray[np.float64], timestep: float
+) -> Iterator[Finding]:
+    report = stability(robot, params, start, timestep)
+    if report.robot < NEAR_BOUND:
+        return
+    unstable = report.robot >= 1
+    severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
+    effect = "it diverges, alternating from step to step" if unstable else "it may diverge in other poses"
+    yield Finding(
+        severity,
+        code,
+        f"the sampled PID loop is at {report.robot:.2g} times its stability bound at the start pose: {effect}",
+        f"take at most {0.5 / report.robot:.1g} times these gains, a derivative_filter_time, or gain_units='inertia'",
+    )
+    for index in np.flatnonzero(report.ratio >= NEAR_BOUND):
+        joint = robot.joints[index]
+        yield Finding(
+            severity,
+            code,
+            f"kd*dt/I = {report.kd_dt[index]:.3g}, kp*dt^2/I = {report.kp_dt2[index]:.2g} at its inertia of "
+            f"{report.inertia[index]:.2g} {'kg' if joint.type == 'prismatic' else 'kg m^2'}: "
+            f"{report.ratio[index]:.2g} times the bound that it has by itself",
+            f"take at most {0.5 / report.ratio[index]:.1g} times its kd and kp",
             joint=joint.name,
         )
 

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
+from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
 import assets
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 
+from .arguments import choice, flag
 from .check import Finding, check
+from .hostile_xml import parse_xml
 from .physics import DISSIPATION, PHYSICS
 from .urdf import Joint, Link, read_urdf
 
@@ -103,10 +106,17 @@ class Robot:
             ("missing_meshes", missing_meshes, ("error", "skip")),
             ("dissipation", dissipation, tuple(DISSIPATION)),
         ):
-            if value not in known:
-                raise InvalidArgumentError(
-                    argument, "unknown option", value=value, remedy=f"use one of {known}"
-                )
+            choice(argument, value, known)
+        if not isinstance(package_dirs, list | tuple) or not all(
+            isinstance(folder, str | Path) for folder in package_dirs
+        ):
+            raise InvalidArgumentError(
+                "package_dirs",
+                "must be folders",
+                value=package_dirs,
+                remedy="pass a list of paths",
+            )
+        fixed_base = flag("fixed_base", fixed_base)
         path = _find(name_or_path)
         urdf = read_urdf(path, package_dirs=tuple(map(Path, package_dirs)), missing_meshes=missing_meshes)
         joints = tuple(joint for joint in urdf.joints if joint.moves)
@@ -120,7 +130,7 @@ class Robot:
             name=urdf.name,
             path=path,
             urdf=urdf.text,
-            srdf=srdf.read_text() if srdf.is_file() else None,
+            srdf=etree.tostring(parse_xml(srdf), encoding="unicode") if srdf.is_file() else None,
             joints=joints,
             all_joints=urdf.joints,
             links=urdf.links,
@@ -299,7 +309,7 @@ def _find(name_or_path: str | Path) -> Path:
     if str(name_or_path) in Robot.bundled():
         return bundled
     path = Path(name_or_path).expanduser()
-    if path.is_file():
+    if "\0" not in str(path) and path.is_file():
         return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
 
+from .hostile_xml import parse_xml
 from .kinematics import numbers
 from .robot import Robot
 from .rotations import from_rpy, rotate
-from .urdf import find_mesh, parse_xml
+from .urdf import find_mesh
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]

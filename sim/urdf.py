@@ -12,9 +12,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from lxml import etree
 
-from batchpid.errors import RobotError, RobotNotFoundError
+from batchpid.errors import RobotError
+
+from .hostile_xml import number, numbers, parse_xml
+
+_SIZES = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+}
+# Attributes of the collision shapes that SAPIEN knows, and how many numbers each has.
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""
@@ -142,27 +153,6 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     )
 
 
-def parse_xml(path: Path) -> etree._Element:
-    """The root element of a description, which may come from a stranger."""
-    if not path.is_file():
-        raise RobotNotFoundError(f"no URDF file at {path}; check the path")
-    # A description may come from a stranger: no entities, no DTD, no network, no oversized trees.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True)
-    try:
-        tree = etree.parse(str(path), parser)
-    except etree.XMLSyntaxError as error:
-        raise RobotError(
-            f"{path}: not well-formed XML: {error.msg}; correct the file at that line"
-        ) from error
-    except OSError as error:
-        raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
-    if tree.docinfo.internalDTD is not None:
-        raise RobotError(
-            f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines"
-        )
-    return tree.getroot()
-
-
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
     """Make mesh paths absolute; drop the shapes whose file is missing and return their names."""
     missing = []
@@ -193,18 +183,6 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     return None
 
 
-def _number(element: etree._Element, key: str, default: float, where: str) -> float:
-    text = element.get(key)
-    if text is None:
-        return default
-    try:
-        return float(text)
-    except ValueError:
-        raise RobotError(
-            f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF"
-        ) from None
-
-
 def _read_joint(element: etree._Element, path: Path) -> Joint:
     name = element.get("name", "")
     where = f"{path}: joint {name!r}"
@@ -217,14 +195,18 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     parent, child = element.find("parent"), element.find("child")
     if parent is None or child is None or not parent.get("link") or not child.get("link"):
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
+    _check_origin(element, where)
+    axis = element.find("axis")
+    if axis is not None and math.hypot(*numbers(axis, "xyz", 3, where)) < 1e-3:
+        raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
     limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
     limits: dict[str, float] = {}
     if limit is not None:
-        limits["effort_limit"] = _number(limit, "effort", math.inf, where)
-        limits["velocity_limit"] = _number(limit, "velocity", math.inf, where)
+        limits["effort_limit"] = number(limit, "effort", math.inf, where)
+        limits["velocity_limit"] = number(limit, "velocity", math.inf, where)
         if kind in ("revolute", "prismatic"):
-            limits["lower"] = _number(limit, "lower", 0.0, where)
-            limits["upper"] = _number(limit, "upper", 0.0, where)
+            limits["lower"] = number(limit, "lower", 0.0, where)
+            limits["upper"] = number(limit, "upper", 0.0, where)
     elif kind in ("revolute", "prismatic"):
         raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
     if any(math.isnan(value) for value in limits.values()):
@@ -237,7 +219,7 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
     passive: dict[str, float] = {}
     if dynamics is not None:
-        passive = {key: _number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
+        passive = {key: number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
         if any(not 0 <= value < math.inf for value in passive.values()):
             raise RobotError(
                 f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF"
@@ -251,8 +233,8 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         if mimic is None
         else Mimic(
             mimic.get("joint", ""),
-            _number(mimic, "multiplier", 1.0, where),
-            _number(mimic, "offset", 0.0, where),
+            number(mimic, "multiplier", 1.0, where),
+            number(mimic, "offset", 0.0, where),
         ),
         **limits,
         **passive,
@@ -289,20 +271,41 @@ def _keep_working_mimics(root: etree._Element, joints: Sequence[Joint], path: Pa
 
 def _read_link(element: etree._Element, path: Path) -> Link:
     name = element.get("name", "")
+    where = f"{path}: link {name!r}"
     mass = element.find("inertial/mass")
-    value = None if mass is None else _number(mass, "value", 0.0, f"{path}: link {name!r}")
+    value = None if mass is None else number(mass, "value", 0.0, where)
     if value is not None and not 0 <= value < math.inf:
-        raise RobotError(f"{path}: link {name!r}: mass {value} must be finite and >= 0; correct the URDF")
+        raise RobotError(f"{where}: mass {value} must be finite and >= 0; correct the URDF")
     inertia = element.find("inertial/inertia")
     inertial = False
     if inertia is not None:
-        diagonal = [_number(inertia, key, 0.0, f"{path}: link {name!r}") for key in ("ixx", "iyy", "izz")]
-        if any(not 0 <= moment < math.inf for moment in diagonal):
+        xx, yy, zz, xy, xz, yz = (
+            number(inertia, key, 0.0, where) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        )
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if tensor.any() and (not np.isfinite(tensor).all() or np.linalg.eigvalsh(tensor)[0] <= 0):
             raise RobotError(
-                f"{path}: link {name!r}: moments of inertia {diagonal} must be >= 0; correct the URDF"
+                f"{where}: no body has the inertia {dict(inertia.attrib)}, whose principal moments are not all > 0; "
+                "correct the URDF"
             )
-        inertial = bool(value) and any(float(moment) != 0 for moment in inertia.attrib.values())
+        inertial = bool(value) and bool(tensor.any())
+    for part in element.findall("inertial") + element.findall("collision"):
+        _check_origin(part, where)
+    for shape in element.iterfind("collision/geometry/*"):
+        for key, count in _SIZES.get(shape.tag, {}).items():
+            if min(numbers(shape, key, count, where)) <= 0:
+                raise RobotError(
+                    f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF"
+                )
     return Link(name, value, len(element.findall("collision")), inertial)
+
+
+def _check_origin(element: etree._Element, where: str) -> None:
+    origin = element.find("origin")
+    if origin is not None:
+        for key in ("xyz", "rpy"):
+            if origin.get(key) is not None:
+                numbers(origin, key, 3, where)
 
 
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:

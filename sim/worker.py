@@ -39,6 +39,7 @@ TICK = struct.Struct("<cI??")  # b"T", substeps, use_rate, use_feedforward
 DONE = struct.Struct("<cd")  # b"D", seconds of work
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+_STOP_LIMIT = 0.7  # seconds: whoever goes on after Ctrl-Z continues all processes at once
 
 
 class WorkerLost(WorkerError):
@@ -151,11 +152,12 @@ class ProcessWorker:
         Raises
         ------
         WorkerLost
-            It has been stopped or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``.
+            It has been stopped, or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``.
         """
         now = time.monotonic()
-        if (idle := self._pulse.idle(now)) > idle_limit:
-            state = "stopped" if self._pulse.stopped else "asleep"
+        idle, stopped = self._pulse.idle(now), self._pulse.stopped
+        if idle > (_STOP_LIMIT if stopped else idle_limit):
+            state = "stopped" if stopped else "asleep"
             raise self._lost(f"is stuck: {state} for {idle:.1f} s amid a request")
         if now - self._began > limit:
             raise self._lost(

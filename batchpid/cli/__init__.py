@@ -27,6 +27,7 @@ COMMANDS = {
     "tune": ("batchpid.cli.tune:Tune", "gains that settle, for any robot, found on the real scenes"),
     "compare": ("batchpid.cli.compare:Compare", "sets of gains on the same moves: a table and a picture"),
     "inspect": ("batchpid.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
+    "plot": ("batchpid.cli.plot:Plot", "a picture of a recording, or of two side by side"),
     "view": ("batchpid.cli.view:View", "robots in the browser, live: sliders, charts, pushes and payloads"),
 }
 
