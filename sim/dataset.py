@@ -9,6 +9,7 @@ import numpy as np
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
+from .recording import read_recording
 from .robot import Robot
 from .runner import Rollout
 
@@ -35,14 +36,25 @@ class Recorded(NamedTuple):
 
 
 def read_rollout(path: str | Path) -> Recorded:
-    """Read what ``batchpid rollout --out FILE.npz`` wrote.
+    """Read what ``batchpid rollout --out FILE`` or a :class:`sim.Recorder` wrote: .npz, .h5 or .hdf5.
 
     Raises
     ------
     InvalidArgumentError
         The file is not there, or holds something else.
+    RecordingError
+        So does the .h5 file.
     """
     path = Path(path)
+    if path.suffix in (".h5", ".hdf5") or ".partial" in path.suffix:
+        found = read_recording(path)
+        rollout = Rollout(*(getattr(found, name) for name in Rollout._fields))
+        return Recorded(
+            rollout,
+            str(found.attributes["robot"]),
+            found.joint_names,
+            tuple(map(str, found.attributes["units"])),
+        )
     if not path.is_file():
         raise InvalidArgumentError("path", "is no file", value=str(path), remedy="check the spelling")
     try:

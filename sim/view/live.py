@@ -27,9 +27,11 @@ REMEMBERED = 8.0
 PUSH_TIME = 0.25
 """How long a push lasts [s]."""
 GRAVITY = 9.81
-_LEAST_FILTER = 1e-6  # [s], a thousandth of a sim step and less
+# An option that comes and goes would change what the law remembers: the filter and the weight are never quite off.
+_LEAST_FILTER = 1e-6  # [s]
+_MOST_WEIGHT = 1 - 1e-9
 
-GAINS = ("kp", "ki", "kd", "derivative_filter_time", "effort_limit")
+GAINS = ("kp", "ki", "kd", "derivative_filter_time", "setpoint_weight", "effort_limit")
 """What can be changed while robots move, each (dof,)."""
 
 
@@ -74,11 +76,15 @@ class Live:
         cores = len(os.sched_getaffinity(0)) if workers is None else workers
         share = 0 if cores == 0 else max(1, cores // len(self.groups))
         self._random = np.random.default_rng(seed)
+        self._changed: dict[str, bool] = {}
         low, high = robot.lower, robot.upper
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
         self.start = np.clip(robot.start + offsets, low, high)
         self._low, self._high = np.maximum(low, -np.pi), np.minimum(high, np.pi)
-        self.gains = {control: self._initial_gains(control) for control in self.groups}
+        self._sets = {control: self._gain_sets(control) for control in self.groups}
+        self.gains: dict[str, dict[str, Float64]] = {}
+        for control in self.groups:
+            self.take_gains(control, self.gain_sets(control)[0])
         self._changed = dict.fromkeys(self.groups, False)
         self.setpoint = np.tile(robot.start, (self.per_group, 1))
         self.payload = 0.0
@@ -139,10 +145,28 @@ class Live:
         self.gains[control][choice("gain", gain, GAINS)][joint] = value
         self._changed[control] = True
 
-    def restore_gains(self) -> None:
-        """Return to the gains of the beginning."""
-        self.gains = {control: self._initial_gains(control) for control in self.groups}
-        self._changed = dict.fromkeys(self.groups, True)
+    def gain_sets(self, control: str) -> tuple[str, ...]:
+        """Return the names of the sets that :meth:`take_gains` knows; the first is in force at the start."""
+        return tuple(self._sets[control])
+
+    def take_gains(self, control: str, name: str) -> None:
+        """Give every joint of a group the gains of a named set."""
+        chosen = self._sets[control][choice("name", name, self._sets[control])]
+        self.gains[control] = {gain: value.copy() for gain, value in chosen.items()}
+        self._changed[control] = True
+
+    def gain_range(self, control: str, gain: str, joint: int) -> tuple[float, float]:
+        """Return a gain of a joint, and up to where it is worth changing."""
+        value = float(self.gains[control][gain][joint])
+        known = [float(gains[gain][joint]) for gains in self._sets[control].values()]
+        if gain == "setpoint_weight":
+            return value, 1.0
+        if gain == "derivative_filter_time":
+            return value, max(0.02, *known)
+        if gain == "effort_limit":
+            limit = float(self.robot.effort_limit[joint])
+            return min(value, 1e3), min(limit, 1e3)
+        return value, 4 * max(known) or float(self.gains[control]["kp"][joint]) or 1.0
 
     def push(self, force: tuple[float, float, float]) -> None:
         """Push every robot's load link with a force [N] for :data:`PUSH_TIME`."""
@@ -225,22 +249,33 @@ class Live:
             ok=ok,
         )
 
-    def _initial_gains(self, control: str) -> dict[str, Float64]:
-        robot, dof = self.robot, self.robot.dof
-        settings = robot.settings
-        if settings is None:
-            # Without figures of its own a robot is held by gains per unit of inertia: w = 10 rad/s, damped to 1.
-            inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else np.ones(dof)
-            kp, kd = 100 * inertia, 20 * inertia
-            ki = np.zeros(dof)
-        elif control == "drive":
-            kp, kd = np.full(dof, settings.drive_stiffness), np.full(dof, settings.drive_damping)
-            ki = np.zeros(dof)
-        else:
-            kp, ki, kd = settings.kp, settings.ki, settings.kd
-        limit = np.full(dof, np.inf) if control == "drive" else robot.effort_limit
-        values = (kp, ki, kd, np.zeros(dof), limit)
-        return {name: np.array(value, np.float64) for name, value in zip(GAINS, values, strict=True)}
+    def _gain_sets(self, control: str) -> dict[str, dict[str, Float64]]:
+        """Return named gains: those designed from the robot's inertia, and the tutorial's for a robot that has them."""
+        robot, settings = self.robot, self.robot.settings
+        limit = np.full(robot.dof, np.inf) if control == "drive" else robot.effort_limit
+        plain = {"ki": 0.0, "derivative_filter_time": 0.0, "setpoint_weight": 1.0, "effort_limit": limit}
+        sets: dict[str, dict[str, Any]] = {}
+        if control == "pid" and robot.fixed_base:
+            designed = bp.design_gains(robot)
+            sets["designed"] = plain | {gain: getattr(designed, gain) for gain in GAINS[:5]}
+        if settings is not None:
+            if control == "drive":
+                sets["tutorial"] = plain | {"kp": settings.drive_stiffness, "kd": settings.drive_damping}
+            else:
+                sets["tutorial"] = plain | {"kp": settings.kp, "ki": settings.ki, "kd": settings.kd}
+        if not sets:
+            inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else 1.0
+            sets["first"] = plain | {"kp": 100 * inertia, "kd": 20 * inertia}  # 10 rad/s, critically damped
+        shape = (robot.dof,)
+        return {
+            name: {
+                gain: np.array(
+                    np.broadcast_to(np.asarray(1.0 if value is None else value).squeeze(), shape), np.float64
+                )
+                for gain, value in gains.items()
+            }
+            for name, gains in sets.items()
+        }
 
     def _params(self, control: str, disturbance: Float64 | None) -> bp.PIDParams:
         """Return the group's params.
@@ -255,8 +290,9 @@ class Live:
             kp=gains["kp"],
             ki=gains["ki"],
             kd=gains["kd"],
-            # Never off: a filter that comes and goes would change what the law remembers.
             derivative_filter_time=np.maximum(gains["derivative_filter_time"], _LEAST_FILTER),
+            setpoint_weight=np.minimum(gains["setpoint_weight"], _MOST_WEIGHT),
+            weight_origin="start",
             effort_min=shift - limit,
             effort_max=shift + limit,
         )

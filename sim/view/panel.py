@@ -171,33 +171,30 @@ class Panel:
         def change(gain: str, factor: float, value: float) -> None:
             live.tune(group(), gain, self.joint, value / factor)
 
-        peak = {
-            name: max(float(np.max(live.gains[c][name])) for c in live.groups) for name in ("kp", "ki", "kd")
-        }
-        for gain, label, high, factor in (
-            ("kp", "kp", 4 * max(peak["kp"], 25.0), 1.0),
-            ("ki", "ki", 10 * max(peak["ki"], 5.0), 1.0),
-            ("kd", "kd", 4 * max(peak["kd"], 2.5), 1.0),
-            ("derivative_filter_time", "filter [ms]", 20.0, 1e3),
+        for gain, label, factor in (
+            ("kp", "kp", 1.0),
+            ("ki", "ki", 1.0),
+            ("kd", "kd", 1.0),
+            ("derivative_filter_time", "filter [ms]", 1e3),
+            ("setpoint_weight", "setpoint weight", 1.0),
+            ("effort_limit", "effort limit", 1.0),
         ):
-            slider = gui.add_slider(label, 0.0, high, _step(high), 0.0)
+            slider = gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)
             rows[gain] = (slider, factor)
             self._on(slider, partial(change, gain, factor))
-        limits = live.robot.effort_limit
-        most = float(np.max(limits, where=np.isfinite(limits), initial=1.0))
-        limit = gui.add_slider("effort limit", 0.0, most, _step(most), most)
-        rows["effort_limit"] = (limit, 1.0)
-        self._on(limit, partial(change, "effort_limit", 1.0))
-        back = gui.add_button("Back to the first gains")
+        names = tuple(dict.fromkeys(name for each in live.groups for name in live.gain_sets(each)))
+        back = gui.add_button_group("All joints to", names)
 
         def show(_: Any = None) -> None:
             for gain, (slider, factor) in rows.items():
-                value = factor * float(live.gains[group()][gain][self.joint])
-                slider.value = float(np.clip(value, slider.min, slider.max))
+                value, top = (factor * number for number in live.gain_range(group(), gain, self.joint))
+                slider.max, slider.step = max(value, top), _step(top)
+                slider.value = value
 
-        def restore(_: Any) -> None:
-            live.restore_gains()
-            show()
+        def restore(name: str) -> None:
+            if name in live.gain_sets(group()):
+                live.take_gains(group(), name)
+                show()
 
         self._on(back, restore)
         for chooser in (self._joint, control):

@@ -58,3 +58,19 @@ def test_what_is_no_rollout_is_named(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(InvalidArgumentError, match="cannot be read as a rollout"):
         read_rollout(tmp_path / "other.npz")
+
+
+def test_a_recording_opens_too(tmp_path, panda):
+    pytest.importorskip("h5py")
+    pytest.importorskip("xarray")
+    from sim import Recorder
+
+    robot, _ = panda
+    path = tmp_path / "run.h5"
+    with Runner(robot, 2, workers=0) as runner, Recorder(path, runner):
+        for _ in range(3):
+            obs = runner.step(robot.settings.target)
+    data = open_dataset(path)
+    assert dict(data.sizes) == {"time": 3, "env": 2, "joint": 9}
+    np.testing.assert_array_equal(data.qpos[-1], obs.qpos)
+    assert data.attrs["robot"] == "panda"

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner
 from sim.runner import FaultWarning
 from sim.view import Live, Playback
 from sim.view.panel import short_names
 
-STIFF = {"kp": 600.0, "ki": 900.0, "kd": 50.0, "derivative_filter_time": 2e-3}
+STIFF = {"kp": 600.0, "ki": 900.0, "kd": 50.0, "derivative_filter_time": 2e-3, "setpoint_weight": 1.0}
 
 
 @pytest.fixture
@@ -114,7 +115,7 @@ def test_divergence_shows_and_a_reset_heals(live):
     assert not frame.ok.all()
     assert np.isfinite(frame.qpos).all()
     assert np.isfinite(frame.effort).all()
-    live.restore_gains()
+    live.take_gains("pid", "designed")
     live.reset()
     assert run(live, 0.1).ok.all()
 
@@ -127,6 +128,23 @@ def test_any_urdf_gets_gains_of_its_inertia(tmp_path):
     live.go_to(pose)
     assert np.abs(run(live, 1.0).qpos - pose)[:, :7].max() < 0.1
     live.close()
+
+
+def test_sets_of_gains_are_the_designed_and_the_tutorials(live):
+    assert live.gain_sets("pid") == ("designed", "tutorial")
+    live.take_gains("pid", "tutorial")
+    np.testing.assert_array_equal(live.gains["pid"]["kp"], live.robot.settings.kp)
+    value, top = live.gain_range("pid", "kp", 0)
+    assert value == 40.0
+    assert top > 4 * value
+    live.take_gains("pid", "designed")
+    designed = bp.design_gains(live.robot)
+    params = live._params("pid", None)
+    np.testing.assert_allclose(params.kd, designed.kd)
+    np.testing.assert_allclose(params.setpoint_weight, designed.setpoint_weight)
+    assert params.weight_origin == designed.weight_origin
+    live.go_to(live.robot.settings.target)
+    assert np.abs(run(live, 2.5).qpos - live.robot.settings.target)[:, :7].max() < 0.02
 
 
 def test_bad_wishes_are_named():
