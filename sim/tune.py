@@ -4,12 +4,12 @@ Every candidate runs every move in an env of its own, so a generation is one rol
 taken as the mean over moves plus the worst move, of::
 
     w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot O / 5 %
-        + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
+        + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
 
-A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; TV the total
-variation of the effort and TV_smooth that of the smooth motion that takes a second; S the share of time in
-saturation. N. Hansen, "The CMA evolution strategy: a tutorial" (arXiv:1604.00772); the search itself is the package
-``cmaes``.
+A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; E the error left
+at the end; TV the total variation of the effort and TV_smooth that of the smooth motion that takes a second; S the
+share of time in saturation. N. Hansen, "The CMA evolution strategy: a tutorial" (arXiv:1604.00772); the search itself
+is the package ``cmaes``.
 
 A search is a function of its seed: the number of workers does not enter, and its history replays it. To resume, the
 costs in the history are told to a fresh search of the same seed, which then goes on as if it had never stopped.
@@ -46,7 +46,7 @@ from .variation import draw_variation
 Float64 = NDArray[np.float64]
 SHARED = ("kp", "ki", "kd", "setpoint_weight", "derivative_filter_time")
 """What the search scales for all joints together; with ``per_joint`` each joint's inertia as well."""
-SPREAD = 0.35
+SPREAD = 0.25
 """First standard deviation of the search, in log space."""
 SAFE_RATIO = 0.8
 """Share of the stability range beyond which a candidate pays."""
@@ -64,6 +64,8 @@ class Weights:
     """Of the settling time in seconds."""
     overshoot: float = 1.0
     """Of the overshoot, in units of 5 %."""
+    final: float = 0.3
+    """Of the error left at the end, as log(1 + error / settling band's least width)."""
     chatter: float = 0.3
     """Of the effort's variation beyond that of the smooth motion."""
     saturation: float = 0.3
@@ -88,7 +90,7 @@ def tune(
     robot: Robot,
     *,
     seed: int = 0,
-    generations: int = 12,
+    generations: int = 16,
     population: int = 8,
     seconds: float = 1.2,
     gain_units: str = "mass_matrix",
@@ -287,6 +289,7 @@ class _Search:
             w.itae * part(m.itae) / self._size
             + w.settling * np.minimum(part(m.settling_time), 1.5 * horizon)
             + w.overshoot * part(m.peak_deviation) / self._size / 0.05
+            + w.final * np.log1p(part(m.steady_state_error) / self._band)
             + w.chatter * np.maximum(part(m.effort_variation) / self._smooth - 1, 0)
             + w.saturation * part(m.saturation_share)
         ).mean(2)

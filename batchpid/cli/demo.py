@@ -28,8 +28,8 @@ class Demo:
     """Processes that step them; 0: this one."""
     seconds: float = 2.0
     """Simulated time [s]."""
-    gains: Literal["tutorial"] = "tutorial"
-    """Which gains: SAPIEN's tutorial's."""
+    gains: Literal["tuned", "tutorial"] = "tuned"
+    """Which gains: those that batchpid tune found, or SAPIEN's tutorial's, as they are."""
     seed: int = 0
     """Of the start poses."""
     out: Path = Path("out/demo.png")
@@ -55,12 +55,19 @@ class Demo:
             )
         seconds = duration(self.seconds)
         start = start_poses(robot, self.num_envs, SPREAD, self.seed)
+        options = robot.tuned() if self.gains == "tuned" else {"params": robot.params()}
+        whose = "tuned gains" if self.gains == "tuned" else "the tutorial's gains"
         with Runner(
-            robot, self.num_envs, workers=self.workers, timestep=1 / settings.rate_hz, substeps=SUBSTEPS
+            robot,
+            self.num_envs,
+            workers=self.workers,
+            timestep=1 / settings.rate_hz,
+            substeps=SUBSTEPS,
+            **options,
         ) as runner:
             print(
                 f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
-                f"PID and passive force at {settings.rate_hz:g} Hz, the tutorial's gains",
+                f"PID and passive force at {settings.rate_hz:g} Hz, {whose}",
                 flush=True,
             )
             run = follow(runner, settings.target, start, seconds, "simulating")
@@ -75,6 +82,6 @@ class Demo:
             plots.Traces.of(run.rollout, robot),
             mark=0,
             title=f"{self.num_envs} {robot.name}s under one batch PID at {settings.rate_hz:g} Hz: "
-            f"the tutorial's gains, env 0 from the tutorial's pose",
+            f"{whose}, env 0 from the tutorial's pose",
         )
         print(f"\npicture: {plots.save(figure, out)}")

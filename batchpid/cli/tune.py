@@ -18,7 +18,7 @@ class Tune:
 
     robot: Annotated[str, tyro.conf.Positional] = "panda"
     """A bundled robot, or the path of a URDF."""
-    generations: int = 12
+    generations: int = 16
     """How often the population is tried."""
     population: int = 8
     """Candidates tried at once."""
@@ -36,6 +36,8 @@ class Tune:
     """Weight of the settling time."""
     overshoot: float = 1.0
     """Weight of the overshoot."""
+    final: float = 0.3
+    """Weight of the error left at the end."""
     chatter: float = 0.3
     """Weight of the effort's variation beyond the smooth move's."""
     saturation: float = 0.3
@@ -82,7 +84,9 @@ class Tune:
             seconds=self.seconds,
             gain_units=self.gain_units,
             per_joint=self.per_joint,
-            weights=Weights(self.itae, self.settling, self.overshoot, self.chatter, self.saturation),
+            weights=Weights(
+                self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation
+            ),
             variation=self.variation,
             workers=self.workers,
             time_limit=self.time_limit,
