@@ -54,6 +54,12 @@ class Cell:
             self._control = make_control(self._kind, scene, params, size, rate)
             self._control.state, self._control.saturated = old.state, old.saturated
         self._control.set_params(self.pack, params)
+        if self._control.state is not None:
+            # The new params may need more of a state than the old ones, or less.
+            both = zip(bp.init(params, self._qpos), self._control.state, strict=True)
+            self._control.state = bp.PIDState(
+                *(new if new is None or old is None else old for new, old in both)
+            )
 
     def reset(
         self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], steps: int

@@ -76,7 +76,7 @@ class Containment:
         self.flagged |= failed
         self._failed |= failed
         if self.holds:
-            self.held_qpos[new] = held[new]
+            self.held_qpos[new] = np.where(np.isfinite(held), held, self.home_qpos)[new]
             self.stopped |= failed
 
     def take_failed(self) -> Bool:

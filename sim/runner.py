@@ -116,8 +116,8 @@ class Runner:
         Scenes that share a PhysX system, at most: a matter of speed. In free motion nothing else depends on it; where
         a robot touches something at several places at once, the last bits do. 1 gives every env a system of its own.
     on_fault
-        What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it was at
-        the end of the last tick, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
+        What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it last
+        was sound, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
         ``ok`` False for that tick. An env fails when its state is no longer finite, or by ``speed_limit``.
     speed_limit
         Joint speed at which an env fails, one for all joints or (dof,) [rad/s or m/s]; default none.
@@ -250,6 +250,7 @@ class Runner:
                 variation=None if variation is None else variation.for_envs(envs),
             )
 
+        self._varies = variation is not None
         if variation is not None:
             if len(variation.payload) != self.num_envs:
                 raise InvalidArgumentError(
@@ -424,7 +425,9 @@ class Runner:
 
         It is a barrier: this runner, too, goes on from it as from a restored one, so that both give the same bytes.
         """
-        states = EnvStates.join(self._open().run(Call("snapshot")))
+        pool = self._open()
+        self._refuse_variation()
+        states = EnvStates.join(pool.run(Call("snapshot")))
         snapshot = Snapshot(self._about, self._steps, self._params, states)
         self._start_from(snapshot)
         return snapshot
@@ -438,6 +441,7 @@ class Runner:
             It is of another robot, number of envs, timestep, control, ...
         """
         pool = self._open()
+        self._refuse_variation()
         if not isinstance(snapshot, Snapshot):
             raise InvalidArgumentError(
                 "snapshot", "is none", value=type(snapshot).__name__, remedy="take one with runner.snapshot()"
@@ -505,6 +509,12 @@ class Runner:
         self._note_faults()
         if self.recorder is not None:
             self.recorder.append(setpoint)
+
+    def _refuse_variation(self) -> None:
+        if self._varies:
+            raise InvalidArgumentError(
+                "variation", "is not part of snapshots", remedy="make the runner without variation="
+            )
 
     def _start_from(self, snapshot: Snapshot) -> None:
         self._since_checkpoint = 0
@@ -612,12 +622,15 @@ class Runner:
         outside = (positions < self._lower) | (positions > self._upper)
         if not outside.any():
             return
+        if self._contains:  # what is not finite is told of as a fault
+            positions = np.where(np.isfinite(positions), positions, np.nan)
+            outside &= np.isfinite(positions)
         for index in np.flatnonzero(outside.reshape(-1, robot.dof).any(0)):
             if (argument, int(index)) in self._warned:
                 continue
             self._warned.add((argument, int(index)))
             joint, column = robot.joints[index], positions[..., index]
-            worst = column.flat[np.argmax(np.maximum(joint.lower - column, column - joint.upper))]
+            worst = column.flat[np.nanargmax(np.maximum(joint.lower - column, column - joint.upper))]
             warnings.warn(
                 f"{argument} of joint {joint.name!r} is {worst:g} {joint.unit}, outside its limits "
                 f"[{joint.lower:g}, {joint.upper:g}]: the joint cannot reach it; move it inside",

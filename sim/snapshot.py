@@ -3,7 +3,7 @@
 A snapshot is a barrier. The engine keeps more than positions and velocities: contact caches, warm starts, and the order
 in which it solves contacts, all of which depend on its past and can be neither read nor written. So whoever goes on
 from a snapshot, in the process that took it or in another, goes on with a new world in that state, and gets the same
-bytes. In free motion the barrier changes none of them; in contact it may change the last bits.
+bytes. The barrier itself changes the last bits.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Snapshot:
             The file is missing, or no snapshot of this version.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 tables = {name: file[name] for name in file.files}
             head = json.loads(str(tables.pop("head")))
             if head["format"] != _FORMAT:

@@ -1,0 +1,186 @@
+"""A run restored from a snapshot, in a new process too, gives the same bytes as the run that went on from it."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner, Snapshot
+
+ROBOTS = {name: Robot.load(name) for name in ("panda", "jaco2")}
+N = 5
+
+
+def commands(robot, ticks, seed=0):
+    """Setpoints that shake the robot: with the jaco2's light fingers that means contact, many at a time."""
+    noise = np.random.default_rng(seed).uniform(-0.5, 0.5, (ticks, N, robot.dof))
+    return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
+
+
+def params(robot, **options):
+    options = {
+        "derivative_filter_time": 2e-3,
+        "anti_windup": "back_calculation",
+        "setpoint_weight": 0.7,
+    } | options
+    return robot.params(**options)
+
+
+def same(first, second):
+    for name, ours, theirs in zip(first._fields, first, second, strict=True):
+        np.testing.assert_array_equal(ours, theirs, name)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_restored_in_place_and_in_another_runner(name, control, workers, tmp_path):
+    robot = ROBOTS[name]
+    table = commands(robot, 40) if control != "effort" else 5 * (commands(robot, 40) - robot.settings.target)
+    chosen = params(robot) if control == "pid" else None
+    with Runner(robot, N, workers=workers, control=control, params=chosen) as runner:
+        runner.rollout(table[:20])
+        snapshot = runner.snapshot()
+        went_on = runner.rollout(table[20:])
+        runner.restore(snapshot)
+        same(went_on, runner.rollout(table[20:]))
+    snapshot.save(tmp_path / "at20.npz")
+    for carried in (Snapshot.load(tmp_path / "at20.npz"), pickle.loads(pickle.dumps(snapshot))):
+        with Runner(robot, N, workers=0, control=control, params=chosen) as other:
+            other.rollout(table[:3])
+            other.restore(carried)
+            same(went_on, other.rollout(table[20:]))
+            assert other.time == pytest.approx(went_on.time[-1])
+
+
+def test_in_a_new_process(tmp_path):
+    robot = ROBOTS["jaco2"]
+    table = commands(robot, 20)
+    with Runner(robot, N, workers=0, params=params(robot)) as runner:
+        runner.rollout(table[:10])
+        runner.snapshot().save(tmp_path / "s.npz")
+        went_on = runner.rollout(table[10:])
+    np.save(tmp_path / "table.npy", table[10:])
+    program = (
+        "import sys, numpy as np; from sim import *; folder = sys.argv[1] + '/'; robot = Robot.load('jaco2')\n"
+        f"with Runner(robot, {N}, workers=0) as runner:\n"
+        "    runner.restore(Snapshot.load(folder + 's.npz'))\n"
+        "    np.save(folder + 'qpos.npy', runner.rollout(np.load(folder + 'table.npy')).qpos)\n"
+    )
+    environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PATH": ""}
+    subprocess.run([sys.executable, "-W", "ignore", "-c", program, tmp_path], check=True, env=environment)
+    np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
+
+
+def test_in_free_motion_the_barrier_changes_the_last_bits_alone():
+    robot = ROBOTS["panda"]
+    middle = (robot.lower + robot.upper) / 2
+    results = []
+    for checkpoint_steps in (None, 40):
+        with Runner(robot, 2, workers=0, checkpoint_steps=checkpoint_steps, ground=False) as runner:
+            runner.reset(qpos=middle)
+            results.append(runner.rollout(np.broadcast_to(middle + 0.01, (20, robot.dof))))
+    np.testing.assert_allclose(results[0].qpos, results[1].qpos, rtol=0, atol=1e-7)
+    assert np.abs(results[0].qpos[-1] - middle).max() > 1e-3
+
+
+def test_checkpoints_are_the_same_for_any_number_of_workers():
+    robot = ROBOTS["jaco2"]
+    table = commands(robot, 30)
+    results = []
+    for workers in (0, 1, 2):
+        with Runner(robot, N, workers=workers, checkpoint_steps=100) as runner:
+            results.append(runner.rollout(table))
+    same(results[0], results[1])
+    same(results[0], results[2])
+
+
+def test_it_holds_faults_params_and_content():
+    sapien = pytest.importorskip("sapien")
+    robot = ROBOTS["panda"]
+
+    def box(scene, env):
+        builder = scene.create_actor_builder()
+        builder.add_box_collision(half_size=[0.05, 0.05, 0.05])
+        actor = builder.build(name="box")
+        actor.set_pose(sapien.Pose([0.6, 0.1 * env, 0.3 + 0.05 * env]))
+        return [actor]
+
+    table = commands(robot, 30)
+    table[5, 2] = np.nan
+    options = {"workers": 0, "non_finite": "contain", "build": box}
+    with Runner(robot, N, **options) as runner:
+        with pytest.warns(UserWarning, match="env 2"):
+            runner.rollout(table[:15])
+        runner.params = params(robot, kp=30.0)
+        snapshot, poses = runner.snapshot(), runner.poses()
+        went_on, end = runner.rollout(table[15:]), runner.poses()
+    assert not went_on.ok[:, 2].any()
+    assert not np.array_equal(poses, end)
+    with Runner(robot, N, **options) as other:
+        other.restore(snapshot)
+        np.testing.assert_array_equal(other.poses(), poses)
+        np.testing.assert_array_equal(other.params.kp, 30.0)
+        assert not other.faults
+        same(went_on, other.rollout(table[15:]))
+        np.testing.assert_array_equal(other.poses(), end)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 4}, "num_envs 5, not 4"),
+        ({"timestep": 1e-3}, "timestep"),
+        ({"control": "drive"}, "control 'pid', not 'drive'"),
+        ({"compensate": "none"}, "compensate"),
+        ({"physics": "fast"}, "physics"),
+        ({"ground": False}, "ground"),
+        ({"robot": ROBOTS["jaco2"]}, "robot 'panda', not 'jaco2'"),
+    ],
+)
+def test_a_snapshot_of_another_kind_of_runner_is_refused(options, message):
+    base = {"robot": ROBOTS["panda"], "num_envs": N, "workers": 0}
+    with Runner(**base) as runner:
+        snapshot = runner.snapshot()
+    with Runner(**(base | options)) as other:
+        before = other.observe()
+        with pytest.raises(InvalidArgumentError, match=message):
+            other.restore(snapshot)
+        same(before, other.observe())
+        with pytest.raises(InvalidArgumentError, match="snapshot: is none"):
+            other.restore(before)
+
+
+def test_files_that_are_no_snapshot(tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (tmp_path.joinpath("ran").touch, ())
+
+    with Runner(ROBOTS["panda"], 1, workers=0) as runner:
+        runner.snapshot().save(tmp_path / "good.npz")
+        whole = (tmp_path / "good.npz").read_bytes()
+    contents = {
+        "empty": b"",
+        "text": b"hello",
+        "cut short": whole[: len(whole) // 2],
+        "pickle": pickle.dumps(Evil()),
+    }
+    for name, content in contents.items():
+        (tmp_path / "bad.npz").write_bytes(content)
+        with pytest.raises(InvalidArgumentError, match="cannot be read as a snapshot"):
+            Snapshot.load(tmp_path / "bad.npz")
+            pytest.fail(name)
+    np.savez(tmp_path / "bad.npz", head=np.array([Evil()], dtype=object))
+    with pytest.raises(InvalidArgumentError, match="cannot be read"):
+        Snapshot.load(tmp_path / "bad.npz")
+    np.savez(tmp_path / "bad.npz", other=np.zeros(3))
+    with pytest.raises(InvalidArgumentError, match="cannot be read"):
+        Snapshot.load(tmp_path / "bad.npz")
+    with pytest.raises(InvalidArgumentError, match="cannot be read"):
+        Snapshot.load(tmp_path / "missing.npz")
+    assert not (tmp_path / "ran").exists()
