@@ -11,6 +11,8 @@ from .source import Source
 _INK = {"setpoint": "#4a82ff", "limit": "#b6bcc6"}
 _COLOURS = ("#15803d", "#d97706", "#7c3aed")
 """The first group's curve, the second's, ..."""
+_NEAR = 4.0
+"""A limit is drawn once it is less than so many times the effort."""
 WINDOW = 8.0
 """How far back the time axis goes [s]: it counts from now."""
 
@@ -64,9 +66,10 @@ class Charts:
         name = source.robot.joint_names[joint]
         keep = [tuple(column[recent] for column in trace) for trace in traces]
         ago = keep[0][0] - keep[0][0][-1]
-        low, high = source.effort_limits(robots[0], joint)
-        limits = tuple(
-            np.full(int(recent.sum()), bound if np.isfinite(bound) else np.nan) for bound in (low, high)
+        bounds = source.effort_limits(robots[0], joint)
+        peak = max(float(np.abs(trace[3]).max()) for trace in keep)
+        limits = tuple(  # far limits would flatten the curve
+            np.full(len(ago), bound if abs(bound) < _NEAR * peak else np.nan) for bound in bounds
         )
         for chart, title, columns in (
             (self._position, f"{name} [{unit}]", (*(trace[1] for trace in keep), keep[0][2])),

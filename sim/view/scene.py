@@ -147,12 +147,12 @@ class RobotScene:
         centre, extent = self.places.mean(0), np.ptp(self.places, axis=0)
         if len(groups) > 1:
             for group, places in zip(groups, np.split(self.places, len(groups)), strict=True):
-                front = (places[:, 0].mean(), places[:, 1].min() - 0.9 * reach, 0.02)
-                scene.add_label(f"/groups/{group}", group, position=front)
+                above = (places[:, 0].mean(), places[:, 1].mean(), 1.9 * reach)
+                scene.add_label(f"/groups/{group}", group, position=above)
         size = max(float(np.hypot(*extent[:2])), 0.0) + 2.0 * reach
         away = np.array([-0.62, -0.80, 0.52])
         camera = self._server.initial_camera
-        camera.position = tuple(centre + size * 1.06 * away / np.linalg.norm(away))
+        camera.position = tuple(centre + size * 1.16 * away / np.linalg.norm(away))
         camera.look_at = (centre[0], centre[1], 0.35 * reach)
         camera.fov = math.radians(42)
 

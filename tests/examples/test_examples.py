@@ -72,3 +72,17 @@ def test_a_profile_is_easier_to_follow_than_a_step(run):
     worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " rad " in row}
     assert set(worst) >= {"trapezoidal", "minimum jerk", "step"}
     assert worst["minimum jerk"] < worst["trapezoidal"] < 0.1 < worst["step"]
+
+
+def test_the_integral_removes_what_an_uncompensated_drive_keeps(run, tmp_path):
+    out = tmp_path / "errors.png"
+    text = run("steady_state.py", "--seconds", "5", "--out", str(out))
+    errors = {
+        row[:32].strip(): [float(e) for e in row[32:].split()]
+        for row in text.splitlines()
+        if "compensat" in row
+    }
+    assert max(errors["drive (20, 5), no compensation"]) > 0.3
+    assert max(errors["PID, no compensation"]) < 5e-3
+    assert max(errors["PID, compensated"]) < 5e-3
+    assert out.stat().st_size > 10_000

@@ -1,0 +1,107 @@
+"""Every code block of README and docs runs.
+
+Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
+which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf`` and ``gains.yaml``; what would take
+minutes or wait for a person is cut short or only parsed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import shutil
+import warnings
+from pathlib import Path
+
+import pytest
+
+import batchpid as bp
+from batchpid.cli import COMMANDS, _load, main
+from sim import Robot
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md")])
+BLOCK = re.compile(
+    r"(?:<!-- needs: (?P<needs>[\w, ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL
+)
+SHORTER = {
+    # command: flags that make it short
+    "demo": ["--num-envs", "4", "--seconds", "0.2"],
+    "rollout": ["--num-envs", "2", "--seconds", "0.2"],
+    "view": ["--seconds", "1", "--port", "8765"],
+}
+ONLY_PARSED = ("bench", "tune", "compare", "render")
+
+
+def blocks(page: Path, *languages: str) -> list[re.Match]:
+    return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
+
+
+def missing(match: re.Match) -> list[str]:
+    needed = re.findall(r"\w+", match["needs"] or "")
+    return [name for name in needed if importlib.util.find_spec(name) is None]
+
+
+def test_every_block_is_of_a_kind_that_is_run():
+    for page in PAGES:
+        for match in BLOCK.finditer(page.read_text()):
+            assert match["language"] in ("python", "sh", "text"), f"{page.name}: {match[0][:60]}"
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name
+)
+def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    namespace: dict = {"__name__": "__main__"}
+    for match in blocks(page, "python"):
+        if missing(match):
+            continue
+        line = page.read_text()[: match.start("code")].count("\n")
+        exec(compile("\n" * line + match["code"], page, "exec"), namespace)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=lambda page: page.name)
+def test_commands_run(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    panda = Robot.load("panda")
+    shutil.copy(panda.path, "arm.urdf")
+    bp.save_params("gains.yaml", panda.params(), panda.joint_names)
+    for match in blocks(page, "sh"):
+        for line in match["code"].splitlines():
+            words = shlex.split(line, comments=True)
+            if words:
+                run(words)
+
+
+def run(words: list[str]) -> None:
+    program, *rest = words
+    if program == "make":
+        assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), words
+    elif program == "pip":
+        assert rest[0] == "install"
+        extras = re.findall(r"\[(.*?)\]", rest[-1])
+        project = (ROOT / "pyproject.toml").read_text()
+        assert all(
+            re.search(rf"^{name} = \[", project, re.MULTILINE) for part in extras for name in part.split(",")
+        )
+    elif program == "python":
+        assert (ROOT / rest[0]).is_file(), words
+    else:
+        assert program == "batchpid", words
+        command(*rest)
+
+
+def command(name: str, *flags: str) -> None:
+    import tyro
+
+    assert name in COMMANDS
+    if name in ONLY_PARSED:
+        tyro.cli(_load(name), args=list(flags))
+        return
+    if name == "view" and importlib.util.find_spec("viser") is None:
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a robot has to warn of is not the page's fault
+        assert main([name, *flags, *SHORTER.get(name, [])]) in (0, None)
