@@ -15,8 +15,8 @@ from .scenes import Pack, SceneSpec, probe
 
 Float64 = NDArray[np.float64]
 
-INERTIA_EVERY = 5
-"""Sim steps after which a mass matrix counts as old within a tick."""
+INERTIA_EVERY = 4
+"""Sim steps for which a mass matrix is kept within a tick."""
 
 
 class Control:
@@ -104,7 +104,9 @@ class InertiaPIDControl(PIDControl):
     ) -> Float64 | None:
         """Advance the law by one sim step."""
         if step % INERTIA_EVERY == 0:
-            self._matrix = self._mass_matrix(qpos)
+            # Where the robot will be half-way through these steps: old and new pose are off by half as much.
+            ahead = 0.5 * (INERTIA_EVERY - 1) * self.dt
+            self._matrix = self._mass_matrix(qpos + ahead * pack.read_qvel())
             if self._damping is not None:
                 self._matrix += self.dt * np.diag(self._damping)
         qvel = pack.read_qvel() if self._measurement_rate or self._damping is not None else None
@@ -113,7 +115,7 @@ class InertiaPIDControl(PIDControl):
             feedforward = viscous if feedforward is None else feedforward + viscous
         rates = (qvel if self._measurement_rate else None, self._setpoint_rate)
         if self._whole:
-            self.state, effort, terms = advance_with_mass_matrix(
+            self.state, effort, *aux = advance_with_mass_matrix(
                 self._coefficients,
                 self.state,
                 self._setpoint,
@@ -121,15 +123,16 @@ class InertiaPIDControl(PIDControl):
                 self._matrix,
                 *rates,
                 feedforward,
-                aux=True,
+                aux=last,
             )
         else:
             diagonal = np.diagonal(self._matrix, axis1=1, axis2=2)
             coefficients = per_inertia(self._coefficients, diagonal)
-            self.state, effort, terms = bp.advance(
-                coefficients, self.state, self._setpoint, qpos, *rates, feedforward, aux=True
+            self.state, effort, *aux = bp.advance(
+                coefficients, self.state, self._setpoint, qpos, *rates, feedforward, aux=last
             )
-        self.saturated = terms.saturated
+        if last:
+            self.saturated = aux[0].saturated
         return effort
 
 

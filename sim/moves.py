@@ -27,6 +27,7 @@ KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
 _LINE = 24
 _EDGE = 0.02
+_NEARBY = 0.3
 
 
 class Moves(NamedTuple):
@@ -46,11 +47,16 @@ class Moves(NamedTuple):
         )
 
 
-def tutorial_move(robot: Robot) -> Moves:
-    """The move of the robot's bundled settings; no move for other robots."""
+def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
+    """The move of the robot's bundled settings, and ``nearby`` more that start within 0.3 rad; none for other robots."""
     if robot.settings is None:
         return Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
-    return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
+    start, target = robot.settings.start, robot.settings.target
+    spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
+    shift = np.random.default_rng(seed).uniform(-spread, spread, (nearby, robot.dof))
+    starts = np.clip(np.concatenate([start[None], start + shift]), robot.lower, robot.upper)
+    names = ("tutorial", *("near the tutorial's" for _ in range(nearby)))
+    return Moves(starts, np.tile(target, (1 + nearby, 1)), names)
 
 
 def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:

@@ -90,7 +90,7 @@ def tune(
     robot: Robot,
     *,
     seed: int = 0,
-    generations: int = 16,
+    generations: int = 12,
     population: int = 8,
     seconds: float = 1.2,
     gain_units: str = "mass_matrix",
@@ -122,7 +122,7 @@ def tune(
     weights
         Of the cost.
     moves
-        Default: the tutorial's move, where there is one, and four random ones, one of each kind.
+        Default: the tutorial's, where there is one, two that start near it, and four random ones, one of each kind.
     variation
         Draw payload and friction for each move (:mod:`sim.variation`), the same for all candidates.
     measurement_rate
@@ -157,7 +157,7 @@ def tune(
     number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
     if moves is None:
-        moves = tutorial_move(robot) + random_moves(robot, 4, seed)
+        moves = tutorial_move(robot, 2, seed) + random_moves(robot, 4, seed)
     search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
     settings = {
         "robot": robot.name,
