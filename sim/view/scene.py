@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..kinematics import Kinematics, Poses
 from ..robot import Robot
 from ..shapes import surfaces
+from ..staging import FIELD_OF_VIEW, stage
 from .source import Frame
 
 Float64 = NDArray[np.float64]
@@ -34,7 +35,8 @@ class RobotScene:
 
     def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int) -> None:
         self._server, self._kinematics = server, Kinematics(robot)
-        self.places = _places(self._kinematics, robot, len(groups), per_group)
+        self._stage = stage(self._kinematics, robot, len(groups), per_group)
+        self.places = self._stage.places
         self._groups = groups
         count = len(self.places)
         self._nodes, self._ghosts, self._links, self._colours = [], [], [], []
@@ -68,10 +70,10 @@ class RobotScene:
                     receive_shadow=False,
                 )
             )
-        self._ring = self._mark(self._reach(robot))
+        self._ring = self._mark(self._stage.reach)
         self._ghost_of: tuple[Any, ...] | None = None
         self._ok = np.ones(count, bool)
-        self._stage(groups, per_group, self._reach(robot))
+        self._furnish(groups)
 
     def show(self, frame: Frame, selected: int, ghost: bool) -> None:
         """Place every robot, the ring under the selected one, and (``ghost``) its setpoint."""
@@ -106,9 +108,6 @@ class RobotScene:
             node.batched_positions = np.ascontiguousarray(position[:, link])
             node.batched_wxyzs = np.ascontiguousarray(wxyz[:, link])
 
-    def _reach(self, robot: Robot) -> float:
-        return _reach(self._kinematics, robot)
-
     def _mark(self, reach: float) -> Any:
         """Return a flat ring, to lie under the selected robot."""
         segments, inner, outer = 48, 0.30 * reach, 0.335 * reach
@@ -132,8 +131,9 @@ class RobotScene:
             receive_shadow=False,
         )
 
-    def _stage(self, groups: tuple[str, ...], per_group: int, reach: float) -> None:
+    def _furnish(self, groups: tuple[str, ...]) -> None:
         """Lay the floor, light it, name the groups, and stand the camera where all is seen."""
+        reach = self._stage.reach
         scene = self._server.scene
         scene.set_up_direction("+z")
         # The environment map costs more than all robots where a browser draws in software.
@@ -144,17 +144,13 @@ class RobotScene:
             scene.add_mesh_simple(
                 f"/floor/{index}", vertices, faces, color=_FLOOR[index], flat_shading=True, cast_shadow=False
             )
-        centre, extent = self.places.mean(0), np.ptp(self.places, axis=0)
         if len(groups) > 1:
             for group, places in zip(groups, np.split(self.places, len(groups)), strict=True):
                 above = (places[:, 0].mean(), places[:, 1].mean(), 1.9 * reach)
                 scene.add_label(f"/groups/{group}", group, position=above)
-        size = max(float(np.hypot(*extent[:2])), 0.0) + 2.0 * reach
-        away = np.array([-0.62, -0.80, 0.52])
         camera = self._server.initial_camera
-        camera.position = tuple(centre + size * 1.16 * away / np.linalg.norm(away))
-        camera.look_at = (centre[0], centre[1], 0.35 * reach)
-        camera.fov = math.radians(42)
+        camera.position, camera.look_at = tuple(self._stage.eye), tuple(self._stage.at)
+        camera.fov = FIELD_OF_VIEW
 
 
 def _segments(robots: int) -> int:
@@ -184,22 +180,3 @@ def _tinted(rgba: tuple[float, ...], groups: int, per_group: int) -> NDArray[np.
     own = 255 * np.array(rgba[:3])
     rows = [own if group == 0 else own + _LEAN * (_TINTS[group % 3] - own) for group in range(groups)]
     return np.repeat(np.array(rows), per_group, axis=0).round().astype(np.uint8)
-
-
-def _reach(kinematics: Kinematics, robot: Robot) -> float:
-    """Return how far from its base a robot gets: the 95th percentile over seeded poses, at least 0.3 m."""
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    poses = kinematics.poses(np.random.default_rng(0).uniform(low, high, (200, robot.dof)))
-    return max(0.3, float(np.quantile(np.linalg.norm(poses.position[..., :2], axis=-1).max(1), 0.95)))
-
-
-def _places(kinematics: Kinematics, robot: Robot, groups: int, per_group: int) -> Float64:
-    """Return where each robot stands (robots, 3): every group a block of rows, the blocks side by side."""
-    pitch = 1.3 * _reach(kinematics, robot)
-    columns = max(1, round(math.sqrt(per_group / groups)))
-    index = np.arange(per_group)
-    block = np.stack([index % columns, index // columns, np.zeros(per_group)], axis=1)
-    width = columns + (0.6 if groups > 1 else 0.0)
-    blocks = [block + np.array([group * width, 0.0, 0.0]) for group in range(groups)]
-    places = pitch * np.concatenate(blocks)
-    return np.asarray(places - (places.min(0) + places.max(0)) / 2)
