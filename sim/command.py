@@ -35,6 +35,10 @@ class Start(Command):
     def send(self, worker: Worker, envs: slice) -> None:
         """Do nothing."""
 
+    def limit(self, envs: int) -> float:
+        """Seconds that it takes at the very most: mostly imports, from a disk that may be slow."""
+        return 60.0 + super().limit(envs)
+
 
 @dataclass(frozen=True)
 class Call(Command):

@@ -166,7 +166,7 @@ class WorkerPool:
         while busy := [seat for seat in self._seats if seat.queue]:
             for seat in busy:
                 if seat.phase == "torn":
-                    self._lose(seat, WorkerLost(f"worker {seat.index} was interrupted amid a message"))
+                    self._lose(seat, WorkerLost(""))  # by Ctrl-C: nothing to warn of
                 if seat.phase == "idle":
                     self._attempt(seat, self._send, errors)
             answered = self._answered(busy)
@@ -202,7 +202,10 @@ class WorkerPool:
         seat.queue.popleft()
         if not seat.queue and seat.losses:
             self.recoveries += 1
-            self._warning = f"{seat.cause}; brought back in {time.monotonic() - seat.lost:.1f} s by replay"
+            if seat.cause:
+                self._warning = (
+                    f"{seat.cause}; brought back in {time.monotonic() - seat.lost:.1f} s by replay"
+                )
             seat.losses = 0
 
     def _look(self, seat: _Seat) -> None:
@@ -224,7 +227,8 @@ class WorkerPool:
         """Put a new worker in the place of one that is lost, with all it has to do to catch up."""
         if not self._recover:
             raise WorkerLost(
-                f"{error}; its envs are lost, because recovery is off: pass recover=True"
+                f"{str(error) or f'worker {seat.index} was interrupted'}; its envs are lost, because recovery is off: "
+                "pass recover=True"
             ) from error
         seat.losses += 1
         if seat.losses >= _LIVES:

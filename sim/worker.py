@@ -199,7 +199,7 @@ class ProcessWorker:
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGUSR1)  # it writes its stack, unless it is stopped
             time.sleep(0.05)
-        trace = os.pread(self._trace, 100_000, 0).decode(errors="replace").strip()
+        trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
         return WorkerLost(f"{self._name()} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
 
 
@@ -218,8 +218,8 @@ def main() -> None:
     # The parent handles Ctrl-C and closes the socket; the worker must not die half-way through a tick.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent, channel, memory, trace = map(int, sys.argv[2:])
-    faulthandler.enable(trace)
-    faulthandler.register(signal.SIGUSR1, trace)
+    faulthandler.enable(trace, all_threads=False)
+    faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     connection = Connection(channel)
     try:

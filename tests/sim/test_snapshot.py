@@ -170,11 +170,10 @@ def test_files_that_are_no_snapshot(tmp_path):
         "cut short": whole[: len(whole) // 2],
         "pickle": pickle.dumps(Evil()),
     }
-    for name, content in contents.items():
+    for content in contents.values():
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(InvalidArgumentError, match="cannot be read as a snapshot"):
             Snapshot.load(tmp_path / "bad.npz")
-            pytest.fail(name)
     np.savez(tmp_path / "bad.npz", head=np.array([Evil()], dtype=object))
     with pytest.raises(InvalidArgumentError, match="cannot be read"):
         Snapshot.load(tmp_path / "bad.npz")
