@@ -97,7 +97,7 @@ def command(name: str, *flags: str) -> None:
     import tyro
 
     assert name in COMMANDS
-    if name in ONLY_PARSED:
+    if name in ONLY_PARSED or "--viewer" in flags:
         tyro.cli(_load(name), args=list(flags))
         return
     if name == "view" and importlib.util.find_spec("viser") is None:

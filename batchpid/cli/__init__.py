@@ -29,6 +29,7 @@ COMMANDS = {
     "inspect": ("batchpid.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
     "plot": ("batchpid.cli.plot:Plot", "a picture of a recording, or of two side by side"),
     "view": ("batchpid.cli.view:View", "robots in the browser, live: sliders, charts, pushes and payloads"),
+    "render": ("batchpid.cli.render:Render", "a film of a recorded run, by SAPIEN's renderer where it works"),
 }
 
 

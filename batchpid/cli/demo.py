@@ -34,6 +34,8 @@ class Demo:
     """Of the start poses."""
     out: Path = Path("out/demo.png")
     """The picture: .png or .svg."""
+    viewer: bool = False
+    """Play it in SAPIEN's window at the end, up to 16 robots. Needs a display and a Vulkan device."""
 
     def run(self) -> None:
         """Run it."""
@@ -44,6 +46,10 @@ class Demo:
         from sim import Robot, Runner
 
         out = plots.check_path(self.out)
+        if self.viewer:
+            from sim.render import check_renderer, window
+
+            check_renderer()
         robot = Robot.load(self.robot)
         settings = robot.settings
         if settings is None:
@@ -85,3 +91,5 @@ class Demo:
             f"{whose}, env 0 from the tutorial's pose",
         )
         print(f"\npicture: {plots.save(figure, out)}")
+        if self.viewer:
+            window(run.rollout.envs(slice(0, 16)), robot)
