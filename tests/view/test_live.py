@@ -5,8 +5,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner
-from sim.runner import FaultWarning
+from sim import FaultWarning, Robot, Runner
 from sim.view import Live, Playback
 from sim.view.panel import short_names
 
