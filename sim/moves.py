@@ -48,7 +48,7 @@ class Moves(NamedTuple):
 
 
 def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
-    """The move of the robot's bundled settings, and ``nearby`` more that start within 0.3 rad; none for other robots."""
+    """The move of a bundled robot's settings, and ``nearby`` more that start within 0.3 rad; none for other robots."""
     if robot.settings is None:
         return Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
     start, target = robot.settings.start, robot.settings.target
