@@ -37,9 +37,10 @@ from batchpid.metrics import step_metrics
 from batchpid.stability import stability_bound
 
 from .arguments import integer, number
+from .limits import SetpointWarning
 from .moves import Moves, random_moves, smooth_effort, tutorial_move
 from .robot import Robot
-from .runner import Runner, SetpointWarning
+from .runner import Runner
 from .trial import SUBSTEPS, absolute_band
 from .variation import draw_variation
 
@@ -64,7 +65,7 @@ class Weights:
     """Of the settling time in seconds."""
     overshoot: float = 1.0
     """Of the overshoot, in units of 5 %."""
-    final: float = 0.3
+    final: float = 1.0
     """Of the error left at the end, as log(1 + error / settling band's least width)."""
     chatter: float = 0.3
     """Of the effort's variation beyond that of the smooth motion."""
@@ -92,7 +93,7 @@ def tune(
     seed: int = 0,
     generations: int = 12,
     population: int = 8,
-    seconds: float = 1.2,
+    seconds: float = 1.5,
     gain_units: str = "mass_matrix",
     per_joint: bool = False,
     weights: Weights | None = None,
@@ -122,7 +123,7 @@ def tune(
     weights
         Of the cost.
     moves
-        Default: the tutorial's, where there is one, two that start near it, and four random ones, one of each kind.
+        Default: the tutorial's, where there is one, one that starts near it, and four random ones, one of each kind.
     variation
         Draw payload and friction for each move (:mod:`sim.variation`), the same for all candidates.
     measurement_rate
@@ -152,12 +153,12 @@ def tune(
     seed = integer("seed", seed, 0, 2**31 - 1)
     generations, population = (
         integer("generations", generations, 1, 100_000),
-        integer("population", population, 2, 1000),
+        integer("population", population, 4, 1000),
     )
     number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
     if moves is None:
-        moves = tutorial_move(robot, 2, seed) + random_moves(robot, 4, seed)
+        moves = tutorial_move(robot, 1, seed) + random_moves(robot, 4, seed)
     search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
     settings = {
         "robot": robot.name,

@@ -24,7 +24,7 @@ class Tune:
     """Candidates tried at once."""
     seed: int = 0
     """Of the search and its moves. The result does not depend on the number of workers."""
-    seconds: float = 1.2
+    seconds: float = 1.5
     """Simulated time of each move [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
     """What the gains are per: with the mass matrix all joints respond alike; effort gains serve any controller."""
@@ -36,7 +36,7 @@ class Tune:
     """Weight of the settling time."""
     overshoot: float = 1.0
     """Weight of the overshoot."""
-    final: float = 0.3
+    final: float = 1.0
     """Weight of the error left at the end."""
     chatter: float = 0.3
     """Weight of the effort's variation beyond the smooth move's."""
