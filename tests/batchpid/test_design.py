@@ -1,0 +1,121 @@
+"""Designed gains: the equations, the poles, and the stability bound, on robots made of arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.design import FILTER_SHARE, FILTER_STEPS, pid_from_inertia
+from batchpid.errors import InvalidArgumentError
+from batchpid.metrics import step_metrics
+from batchpid.stability import spectral_radius, stability_bound
+
+DT = 1 / 2000
+
+
+class Chain:
+    """A robot of constant mass matrices, one per pose."""
+
+    def __init__(self, mass, damping=None):
+        self.mass = mass
+        self.damping = np.zeros(mass.shape[1]) if damping is None else damping
+
+    def mass_matrix(self, qpos):
+        return self.mass[np.arange(len(qpos)) % len(self.mass)]
+
+    def sample(self, count, seed=0):
+        return np.zeros((count, self.mass.shape[1]))
+
+    def params(self, **options):
+        return bp.make_params(self.mass.shape[1], **options)
+
+
+def random_chain(seed, joints=4, poses=5):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(poses, joints, joints)) + 1.0
+    scale = 10.0 ** rng.uniform(-2, 0, joints)
+    return Chain(scale[:, None] * (a @ a.transpose(0, 2, 1) + 0.05 * np.eye(joints)) * scale)
+
+
+@given(
+    inertia=st.floats(1e-6, 1e3),
+    hertz=st.floats(0.1, 20),
+    zeta=st.floats(0.2, 2),
+    ti=st.none() | st.floats(0.05, 5),
+)
+def test_gains_are_the_textbooks(inertia, hertz, zeta, ti):
+    w = 2 * np.pi * hertz
+    gains = pid_from_inertia([inertia], hertz, zeta, integral_time=ti)
+    np.testing.assert_allclose(gains["kp"], inertia * w**2)
+    np.testing.assert_allclose(gains["kd"], 2 * zeta * w * inertia)
+    np.testing.assert_allclose(gains["ki"], gains["kp"] / (3 * np.sqrt(3) / w if ti is None else ti))
+
+
+def test_the_three_poles_coincide_by_default():
+    gains = pid_from_inertia([2.0], 3.0)
+    w = 2 * np.pi * 3.0
+    poles = np.roots([2.0, gains["kd"][0], gains["kp"][0], gains["ki"][0]])
+    np.testing.assert_allclose(poles, -w / np.sqrt(3), rtol=1e-4)
+
+
+def test_own_damping_counts_towards_the_damping():
+    w = 2 * np.pi * 2.0
+    free, damped, stuck = (pid_from_inertia([1.0], 2.0, 1.0, damping=[c]) for c in (0.0, w, 10 * w))
+    np.testing.assert_allclose(damped["kd"], free["kd"] - w)
+    np.testing.assert_allclose(damped["kp"], free["kp"])
+    assert stuck["kd"] > 0  # never none at all
+    assert stuck["kp"] == pytest.approx(5 * free["kp"])  # stiff enough for what its damping holds back
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**31), units=st.sampled_from(["effort", "inertia", "mass_matrix"]))
+def test_designed_gains_are_stable_at_every_pose(seed, units):
+    robot = random_chain(seed)
+    params = bp.design_gains(robot, gain_units=units)
+    tau, kp, ki, kd = (leaf[0] for leaf in (params.derivative_filter_time, params.kp, params.ki, params.kd))
+    mass, scale = robot.mass, 1.0
+    if units == "mass_matrix":
+        mass = np.eye(4)[None]
+    elif units == "inertia":
+        scale = np.diagonal(mass, axis1=1, axis2=2)
+    assert stability_bound(mass, kp * scale, kd * scale, DT, filter_time=tau).ratio.max() <= 0.5 + 1e-9
+    assert (spectral_radius(mass, kp * scale, ki * scale, kd * scale, DT, filter_time=tau) < 1).all()
+    w = np.sqrt(kp / (np.diagonal(robot.mass, axis1=1, axis2=2).max(0) if units == "effort" else 1.0))
+    assert (tau <= np.maximum(FILTER_SHARE / w, FILTER_STEPS * DT) * 1.01).all()
+
+
+def test_a_step_settles_as_said_without_overshoot():
+    robot = Chain(np.diag([0.01, 3.0])[None])
+    params = bp.design_gains(robot, 2.0, gain_units="effort")
+    q, v = np.zeros((1, 2)), np.zeros((1, 2))
+    state, course = bp.init(params, q), []
+    for _ in range(4000):
+        state, effort = bp.step(params, state, np.ones((1, 2)), q, DT)
+        v = v + DT * effort / np.diag(robot.mass[0])
+        q = q + DT * v
+        course.append(q)
+    m = step_metrics(DT * np.arange(1, 4001), [1.0, 1.0], np.array(course), start=[0.0, 0.0])
+    assert (m.settling_time < 2 / 2.0 + 0.05).all()
+    assert (m.overshoot < 1e-3).all()
+    assert (m.steady_state_error < 1e-3).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("bandwidth_hz", {"bandwidth_hz": 0.0}),
+        ("damping_ratio", {"damping_ratio": -1.0}),
+        ("margin", {"margin": 1.5}),
+        ("dt", {"dt": 0.0}),
+        ("gain_units", {"gain_units": "torque"}),
+        ("mass_matrix", {}),
+    ],
+)
+def test_bad_arguments_are_named(name, options):
+    robot = Chain(-np.eye(2)[None]) if not options else random_chain(0)
+    with pytest.raises(InvalidArgumentError) as caught:
+        bp.design_gains(robot, **options)
+    assert caught.value.argument == name
