@@ -94,7 +94,7 @@ def pid_from_inertia(
 
 def design_gains(
     robot: Designable,
-    bandwidth_hz: float = 2.25,
+    bandwidth_hz: float = 3.0,
     damping_ratio: float = DAMPING_RATIO,
     *,
     integral_time: float | None = None,

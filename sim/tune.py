@@ -47,6 +47,8 @@ from .variation import draw_variation
 Float64 = NDArray[np.float64]
 SHARED = ("kp", "ki", "kd", "setpoint_weight", "derivative_filter_time")
 """What the search scales for all joints together; with ``per_joint`` each joint's inertia as well."""
+START_HZ = 2.25
+"""Bandwidth of the designed gains that a search begins with: a step settles in 0.9 s."""
 SPREAD = 0.25
 """First standard deviation of the search, in log space."""
 SAFE_RATIO = 0.8
@@ -233,7 +235,7 @@ class _Search:
         self, robot: Robot, gain_units: str, per_joint: bool, moves: Moves, seconds: float, weights: Weights
     ) -> None:
         self.robot, self.moves, self.seconds, self.weights = robot, moves, seconds, weights
-        self.designed = bp.design_gains(robot, gain_units=gain_units)
+        self.designed = bp.design_gains(robot, START_HZ, gain_units=gain_units)
         self.dimension = len(SHARED) + (robot.dof if per_joint else 0)
         self._band = absolute_band(robot)
         smooth = [

@@ -197,7 +197,7 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
     _check_origin(element, where)
     axis = element.find("axis")
-    if axis is not None and math.hypot(*numbers(axis, "xyz", 3, where)) < 1e-3:
+    if kind != "fixed" and axis is not None and math.hypot(*numbers(axis, "xyz", 3, where)) < 1e-3:
         raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
     limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
     limits: dict[str, float] = {}

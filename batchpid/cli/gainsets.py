@@ -33,13 +33,14 @@ def gain_set(robot: Robot, name: str) -> GainSet:
     """
     from batchpid import design_gains, load_about, load_params
     from batchpid.errors import InvalidArgumentError
+    from sim.tune import START_HZ
 
     if name == "tutorial":
         return GainSet(name, {"params": robot.params()})
     if name == "tuned":
         return GainSet(name, robot.tuned())
     if name == "designed":
-        params = design_gains(robot, gain_units="mass_matrix")
+        params = design_gains(robot, START_HZ, gain_units="mass_matrix")
         return GainSet(name, {"params": params, "measurement_rate": True})
     if name.partition(":")[0] == "drive":
         try:
