@@ -1,12 +1,14 @@
 """The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control."""
 
 from .check import Finding
-from .faults import Fault
+from .faults import Fault, FaultWarning
+from .limits import SetpointWarning
+from .observation import Observation, Rollout
 from .physics import Physics
 from .pool import RecoveryWarning
 from .recording import Recorder, Recording, read_recording
 from .robot import Robot
-from .runner import FaultWarning, Observation, Rollout, Runner, SetpointWarning
+from .runner import Runner
 from .snapshot import Snapshot
 
 __all__ = [

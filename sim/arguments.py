@@ -92,3 +92,31 @@ def array(
             remedy="pass finite numbers",
         )
     return result
+
+
+def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) -> NDArray[np.float64]:
+    """``value`` as one positive number per joint (dof,)."""
+    speeds = array(argument, value, (1, len(joint_names)), joint_names)[0]
+    if (speeds <= 0).any():
+        index = int(np.argmax(speeds <= 0))
+        raise InvalidArgumentError(
+            argument,
+            "must be > 0",
+            joint=joint_names[index],
+            value=float(speeds[index]),
+            remedy="leave it out for none",
+        )
+    return speeds
+
+
+def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:
+    """``value`` as bools, one for each env (envs,)."""
+    mask = np.asarray(value)
+    if mask.dtype != np.bool_ or mask.shape != (num_envs,):
+        raise InvalidArgumentError(
+            argument,
+            f"must be bool of shape ({num_envs},)",
+            value=(mask.dtype.name, mask.shape),
+            remedy="use e.g. mask = ~obs.ok",
+        )
+    return mask

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.inertia import advance_with_mass_matrix, per_inertia
+from batchpid.errors import InvalidArgumentError
+from batchpid.inertia import advance_with_mass_matrix, check_gain_units, per_inertia
 from batchpid.markers import PerMassMatrix
 
+from .robot import Robot
 from .scenes import Pack, SceneSpec, probe
 
 Float64 = NDArray[np.float64]
@@ -209,3 +211,50 @@ def make_control(
         "effort": EffortControl,
     }
     return kinds[name](scene, params, size, measurement_rate)
+
+
+def default_params(robot: Robot, control: str) -> bp.PIDParams:
+    """Return what ``robot`` carries for that control: its drive's gains, its PID's, or just its effort limits."""
+    settings = robot.settings
+    if control == "effort":
+        return robot.params(kp=0.0, ki=0.0, kd=0.0)
+    if control == "drive" and settings is not None:
+        return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
+    return robot.params()
+
+
+def check_params(params: bp.PIDParams, robot: Robot, num_envs: int, control: str) -> bp.PIDParams:
+    """Return ``params`` if they fit the robot, the number of envs and the control.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not.
+    """
+    if not isinstance(params, bp.PIDParams):
+        raise InvalidArgumentError(
+            "params",
+            "must be PIDParams",
+            value=params,
+            remedy="build them with robot.params() or make_params()",
+        )
+    if params.gain_units is not None and control != "pid":
+        raise InvalidArgumentError(
+            "gain_units",
+            f"have no meaning under control {control!r}",
+            remedy="use control 'pid', or params with gain_units 'effort'",
+        )
+    check_gain_units(params)
+    if params.joints != robot.dof:
+        raise InvalidArgumentError(
+            "params",
+            f"hold {params.joints} joints, robot {robot.name!r} has {robot.dof}",
+            remedy=f"give one gain for each of {', '.join(robot.joint_names)}",
+        )
+    if params.num_envs not in (1, num_envs):
+        raise InvalidArgumentError(
+            "params",
+            f"hold {params.num_envs} envs, the runner has {num_envs}",
+            remedy="give one row, or one row per env",
+        )
+    return params

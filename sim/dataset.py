@@ -9,9 +9,9 @@ import numpy as np
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
+from .observation import Rollout
 from .recording import read_recording
 from .robot import Robot
-from .runner import Rollout
 
 if TYPE_CHECKING:
     import xarray

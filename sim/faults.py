@@ -7,10 +7,15 @@ time and to put that env back to where it can be simulated.
 from __future__ import annotations
 
 import math
+import warnings
+from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .arrays import Arrays
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel")
 """What can fail: the state is not finite, a joint is too fast, or what the caller gave is not finite."""
@@ -42,6 +47,46 @@ class Fault(NamedTuple):
         }.get(self.cause, f"the {self.cause} given for it is not finite")
         done = "held until it is reset" if self.action == "hold" else "reset"
         return f"env {self.env}, joint {self.joint!r}: {what}, at step {self.step} ({self.time:g} s); {done}"
+
+
+class FaultWarning(UserWarning):
+    """An env failed: its state is no longer finite, or a joint is too fast."""
+
+
+class FaultLog:
+    """The faults of a runner's envs, as they are seen tick by tick; the first is worth a warning."""
+
+    def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
+        self.faults: deque[Fault] = deque(maxlen=10_000)
+        self._joint_names, self._timestep, self._action = joint_names, timestep, action
+        self._steps = np.full(num_envs, -1)
+        self._warned = False
+
+    def forget(self, mask: Bool) -> None:
+        """Envs ``mask`` (envs,) start over."""
+        self._steps[mask] = -1
+
+    def restore(self, steps: NDArray[Any]) -> None:
+        """Take these steps (envs,) of the envs' last faults as known."""
+        self._steps = steps.copy()
+
+    def note(self, arrays: Arrays, stacklevel: int = 4) -> None:
+        """Add what failed since the last look."""
+        if arrays.ok.all():
+            return
+        steps = arrays.fault_step.copy()
+        for env in np.flatnonzero((steps >= 0) & (steps != self._steps)).tolist():
+            step = int(steps[env])
+            joint, cause = self._joint_names[arrays.fault_joint[env]], CAUSES[arrays.fault_cause[env]]
+            self.faults.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
+        self._steps = steps
+        if self.faults and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"{self.faults[0]}; see runner.faults for more, of which there is no further warning",
+                FaultWarning,
+                stacklevel=stacklevel,
+            )
 
 
 class Containment:

@@ -22,8 +22,8 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from .arguments import integer, number
 from .content import sapien
 from .kinematics import Kinematics
+from .observation import Rollout
 from .robot import Robot
-from .runner import Rollout
 from .staging import FIELD_OF_VIEW, Stage, stage
 
 MOST = 64

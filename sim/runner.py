@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import astuple
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.inertia import check_gain_units
 
-from .arguments import array, choice, flag, integer, number
+from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number
 from .command import Call, Tick, Worker
-from .control import CONTROLS
-from .faults import ACTIONS, CAUSES, Fault
+from .control import CONTROLS, check_params, default_params
+from .faults import ACTIONS, Fault, FaultLog
+from .limits import LimitWatch
 from .loop import COMPENSATE, LoopSpec
+from .observation import Observation, Rollout
 from .physics import PHYSICS, Physics
 from .pool import WorkerPool, packing
 from .recording import Recorder
@@ -34,48 +34,6 @@ from .worker import ProcessWorker
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
-
-
-class SetpointWarning(UserWarning):
-    """A setpoint or start pose lies outside a joint's limits."""
-
-
-class FaultWarning(UserWarning):
-    """An env failed: its state is no longer finite, or a joint is too fast."""
-
-
-class Observation(NamedTuple):
-    """State of every env after a tick. (envs, dof) in the robot's joint order, ``ok`` (envs,).
-
-    ``qpos`` [rad or m], ``qvel`` [rad/s or m/s]; ``effort`` [N m or N] and ``saturated`` as applied in the last
-    substep (under control "drive" the effort is the qf beside the drive, which PhysX keeps to itself).
-    ``ok`` is False for an env that failed in this tick, or is held since it did: see :attr:`Runner.faults`.
-    """
-
-    qpos: Float32
-    qvel: Float32
-    effort: Float32
-    saturated: Bool
-    ok: Bool
-
-
-class Rollout(NamedTuple):
-    """Observations of a rollout, stacked: (ticks, envs, dof), ``ok`` (ticks, envs), ``time`` (ticks,) [s].
-
-    Row k is the state at the end of tick k, at ``time[k]``.
-    """
-
-    time: NDArray[np.float64]
-    setpoint: NDArray[np.float64]
-    qpos: Float32
-    qvel: Float32
-    effort: Float32
-    saturated: Bool
-    ok: Bool
-
-    def envs(self, envs: slice | Any) -> Rollout:
-        """The rollout of some envs (a slice or an index array)."""
-        return Rollout(self.time, *(field[:, envs] for field in self[1:]))
 
 
 class Runner:
@@ -176,7 +134,7 @@ class Runner:
                 remedy="load one with Robot.load('panda') or a URDF path",
             )
         self.robot = robot
-        self._lower, self._upper = robot.lower - 1e-6, robot.upper + 1e-6
+        self._limits = LimitWatch(robot)
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         count = len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024)
         self.timestep = number("timestep", timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000")
@@ -191,7 +149,7 @@ class Runner:
                 "build", "must be a function", value=build, remedy="define build(scene, env)"
             )
         self._on_fault = choice("on_fault", on_fault, ACTIONS)
-        limit = None if speed_limit is None else self._check_speed_limit(speed_limit)
+        limit = None if speed_limit is None else joint_speeds("speed_limit", speed_limit, robot.joint_names)
         self._contains = choice("non_finite", non_finite, ("raise", "contain")) == "contain"
         self._checkpoint_steps = (
             None if checkpoint_steps is None else integer("checkpoint_steps", checkpoint_steps, 1, 10**9)
@@ -199,7 +157,12 @@ class Runner:
         measurement_rate = flag("measurement_rate", measurement_rate)
         recover = flag("recover", recover)
         timeout = number("timeout", timeout, 1e-3, 1e9, "seconds")
-        self._params = self._check_params(self._default_params() if params is None else params)
+        self._params = check_params(
+            default_params(robot, self.control) if params is None else params,
+            robot,
+            self.num_envs,
+            self.control,
+        )
         scene = SceneSpec(
             urdf=robot.urdf,
             srdf=robot.srdf,
@@ -211,13 +174,10 @@ class Runner:
             fixed_base=robot.fixed_base,
             build=build,
         )
-        self._warned: set[tuple[str, int]] = set()
         self._steps = self._since_checkpoint = 0
-        self.faults: deque[Fault] = deque(maxlen=10_000)
-        """Envs that failed, latest last."""
+        self._faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, on_fault)
         self.recorder: Recorder | None = None
         """What records every tick; :class:`sim.Recorder` sets it."""
-        self._fault_steps = np.full(self.num_envs, -1)
         self.work_seconds = np.zeros(0)
         """Seconds that each worker worked in the last tick."""
         self._about = {
@@ -285,11 +245,11 @@ class Runner:
         start = self.robot.start if qpos is None else qpos
         position = self._rows("qpos", start)
         velocity = self._rows("qvel", 0.0 if qvel is None else qvel)
-        chosen = np.ones(self.num_envs, bool) if mask is None else self._check_mask(mask)
-        self._warn_limits("qpos", position[chosen])
+        chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        self._limits.check("qpos", position[chosen])
         pool.run(Call("reset", (chosen, position, velocity)))
-        self._fault_steps[chosen] = -1
-        self._note_faults()
+        self._faults.forget(chosen)
+        self._faults.note(pool.arrays)
         return self.observe()
 
     def step(
@@ -319,7 +279,7 @@ class Runner:
         rate = None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate)
         extra = None if feedforward is None else self._rows("feedforward", feedforward)
         if self.control != "effort":
-            self._warn_limits("setpoint", target)
+            self._limits.check("setpoint", target)
         self._tick(target, rate, extra, count)
         return self.observe()
 
@@ -364,7 +324,7 @@ class Runner:
         rates, extras = over_time("setpoint_rates", setpoint_rates), over_time("feedforwards", feedforwards)
         assert targets is not None
         if self.control != "effort":
-            self._warn_limits("setpoint", targets)
+            self._limits.check("setpoint", targets)
         result = Rollout(
             time=(self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep,
             setpoint=np.array(targets),
@@ -416,7 +376,7 @@ class Runner:
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
         pool = self._open()
-        params = self._check_params(params)
+        params = check_params(params, self.robot, self.num_envs, self.control)
         pool.run(Call("set_params", (params,)))
         self._params = params
 
@@ -447,12 +407,17 @@ class Runner:
                 "snapshot", "is none", value=type(snapshot).__name__, remedy="take one with runner.snapshot()"
             )
         snapshot.check(self._about)
-        self._check_params(snapshot.params)
+        check_params(snapshot.params, self.robot, self.num_envs, self.control)
         pool.run(Call("restore", (snapshot,)))
         self._steps, self._params = snapshot.steps, snapshot.params
-        self._fault_steps = snapshot.states.containment["step"].copy()
+        self._faults.restore(snapshot.states.containment["step"])
         self._start_from(snapshot)
         return self.observe()
+
+    @property
+    def faults(self) -> deque[Fault]:
+        """Envs that failed, latest last: the last ten thousand."""
+        return self._faults.faults
 
     @property
     def time(self) -> float:
@@ -506,7 +471,7 @@ class Runner:
         self._steps += substeps
         self._since_checkpoint += substeps
         self.work_seconds = np.array(pool.run(Tick(setpoint, rate, feedforward, substeps)))
-        self._note_faults()
+        self._faults.note(pool.arrays)
         if self.recorder is not None:
             self.recorder.append(setpoint)
 
@@ -519,25 +484,6 @@ class Runner:
     def _start_from(self, snapshot: Snapshot) -> None:
         self._since_checkpoint = 0
         self._open().start_from(Call("restore", (snapshot,)))
-
-    def _note_faults(self) -> None:
-        """Add what failed since the last look to :attr:`faults`; warn of the first."""
-        arrays = self._open().arrays
-        if arrays.ok.all():
-            return
-        steps, joints, causes = arrays.fault_step.copy(), arrays.fault_joint, arrays.fault_cause
-        for env in np.flatnonzero((steps >= 0) & (steps != self._fault_steps)).tolist():
-            step = int(steps[env])
-            joint, cause = self.robot.joint_names[joints[env]], CAUSES[causes[env]]
-            self.faults.append(Fault(env, step, step * self.timestep, joint, cause, self._on_fault))
-        self._fault_steps = steps
-        if self.faults and ("fault", 0) not in self._warned:
-            self._warned.add(("fault", 0))
-            warnings.warn(
-                f"{self.faults[0]}; see runner.faults for more, of which there is no further warning",
-                FaultWarning,
-                stacklevel=4,
-            )
 
     @property
     def _workers(self) -> list[Worker]:
@@ -552,88 +498,3 @@ class Runner:
     def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
         shape = (self.num_envs, self.robot.dof) if shape is None else shape
         return array(name, value, shape, self.robot.joint_names, finite=not self._contains)
-
-    def _check_speed_limit(self, value: ArrayLike) -> NDArray[np.float64]:
-        limit = array("speed_limit", value, (1, self.robot.dof), self.robot.joint_names)[0]
-        if (limit <= 0).any():
-            index = int(np.argmax(limit <= 0))
-            raise InvalidArgumentError(
-                "speed_limit",
-                "must be > 0",
-                joint=self.robot.joint_names[index],
-                value=float(limit[index]),
-                remedy="leave it out for none",
-            )
-        return limit
-
-    def _default_params(self) -> bp.PIDParams:
-        settings = self.robot.settings
-        if self.control == "effort":
-            return self.robot.params(kp=0.0, ki=0.0, kd=0.0)
-        if self.control == "drive" and settings is not None:
-            return self.robot.params(
-                kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
-            )
-        return self.robot.params()
-
-    def _check_params(self, params: bp.PIDParams) -> bp.PIDParams:
-        if not isinstance(params, bp.PIDParams):
-            raise InvalidArgumentError(
-                "params",
-                "must be PIDParams",
-                value=params,
-                remedy="build them with robot.params() or make_params()",
-            )
-        if params.gain_units is not None and self.control != "pid":
-            raise InvalidArgumentError(
-                "gain_units",
-                f"have no meaning under control {self.control!r}",
-                remedy="use control 'pid', or params with gain_units 'effort'",
-            )
-        check_gain_units(params)
-        if params.joints != self.robot.dof:
-            raise InvalidArgumentError(
-                "params",
-                f"hold {params.joints} joints, robot {self.robot.name!r} has {self.robot.dof}",
-                remedy=f"give one gain for each of {', '.join(self.robot.joint_names)}",
-            )
-        if params.num_envs not in (1, self.num_envs):
-            raise InvalidArgumentError(
-                "params",
-                f"hold {params.num_envs} envs, the runner has {self.num_envs}",
-                remedy="give one row, or one row per env",
-            )
-        return params
-
-    def _check_mask(self, mask: ArrayLike) -> Bool:
-        chosen = np.asarray(mask)
-        if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
-            raise InvalidArgumentError(
-                "mask",
-                f"must be bool of shape ({self.num_envs},)",
-                value=(chosen.dtype.name, chosen.shape),
-                remedy="use e.g. mask = ~obs.ok",
-            )
-        return chosen
-
-    def _warn_limits(self, argument: str, positions: NDArray[np.float64]) -> None:
-        """Warn once for each joint whose ``positions`` (..., dof) leave its limits."""
-        robot = self.robot
-        outside = (positions < self._lower) | (positions > self._upper)
-        if not outside.any():
-            return
-        if self._contains:  # what is not finite is told of as a fault
-            positions = np.where(np.isfinite(positions), positions, np.nan)
-            outside &= np.isfinite(positions)
-        for index in np.flatnonzero(outside.reshape(-1, robot.dof).any(0)):
-            if (argument, int(index)) in self._warned:
-                continue
-            self._warned.add((argument, int(index)))
-            joint, column = robot.joints[index], positions[..., index]
-            worst = column.flat[np.nanargmax(np.maximum(joint.lower - column, column - joint.upper))]
-            warnings.warn(
-                f"{argument} of joint {joint.name!r} is {worst:g} {joint.unit}, outside its limits "
-                f"[{joint.lower:g}, {joint.upper:g}]: the joint cannot reach it; move it inside",
-                SetpointWarning,
-                stacklevel=3,
-            )

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.metrics import StepMetrics, step_metrics
 
+from .limits import SetpointWarning
 from .moves import Moves, fastest, smooth_effort
+from .observation import Rollout
 from .robot import Robot
-from .runner import Rollout, Runner, SetpointWarning
+from .runner import Runner
 
 Float64 = NDArray[np.float64]
 SUBSTEPS = 5

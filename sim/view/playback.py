@@ -7,7 +7,7 @@ import numpy as np
 from batchpid.errors import InvalidArgumentError
 
 from ..robot import Robot
-from ..runner import Rollout
+from ..observation import Rollout
 from .source import Frame, Traces
 
 
