@@ -50,6 +50,7 @@ class Plot:
 def _read(path: Path, every: int) -> Any:
     import numpy as np
 
+    from batchpid.errors import InvalidArgumentError
     from batchpid.plots import Traces
     from sim import read_recording
 
@@ -60,6 +61,12 @@ def _read(path: Path, every: int) -> Any:
         f"{path}{ends}: robot {about['robot']}, {about['num_envs']} envs, {len(run.time)} ticks up to "
         f"{run.time[-1] if len(run.time) else 0:g} s, {int((~run.ok[-1:]).sum())} envs failed at the end"
     )
+    if not len(run.time):
+        raise InvalidArgumentError(
+            "recording",
+            f"{path} holds no tick",
+            remedy="its run was cut short in its first second: run it again",
+        )
     alive = run.ok[..., None]
     return Traces(
         time=run.time,

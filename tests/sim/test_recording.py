@@ -242,7 +242,7 @@ def test_plot_draws_whole_and_cut_recordings(tmp_path, capsys):
     for name in ("a.h5", "b.h5"):
         with make() as runner, Recorder(tmp_path / name, runner):
             runner.rollout(table(20))
-    kill_after(0.7, str(tmp_path / "c.h5"))
+    kill_after(1.7, str(tmp_path / "c.h5"))
     assert main(["plot", str(tmp_path / "a.h5")]) == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
     picture = tmp_path / "both.svg"
@@ -252,5 +252,9 @@ def test_plot_draws_whole_and_cut_recordings(tmp_path, capsys):
     assert main(["plot", str(tmp_path / "c.h5.partial"), "--kind", "efforts", "--every", "3"]) == 0
     assert (tmp_path / "c.png").exists()
     assert "cut short" in capsys.readouterr().out
+    with make() as runner, Recorder(tmp_path / "empty.h5", runner):
+        pass
+    assert main(["plot", str(tmp_path / "empty.h5")]) == 2
+    assert "holds no tick" in capsys.readouterr().err
     assert main(["plot", str(tmp_path / "none.h5")]) == 2
     assert "no such file" in capsys.readouterr().err
