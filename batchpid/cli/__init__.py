@@ -62,10 +62,10 @@ def _run(name: str, arguments: list[str]) -> int:
 
     from batchpid.errors import BatchPIDError
 
-    command: Command = tyro.cli(_load(name), prog=f"batchpid {name}", args=arguments)
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
+            command: Command = tyro.cli(_load(name), prog=f"batchpid {name}", args=arguments)
             status = command.run()
             sys.stdout.flush()
         except BatchPIDError as error:
