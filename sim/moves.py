@@ -48,15 +48,22 @@ class Moves(NamedTuple):
 
 
 def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
-    """The move of a bundled robot's settings, and ``nearby`` more that start within 0.3 rad; none for other robots."""
+    """The move of a bundled robot's settings; none for other robots.
+
+    And ``nearby`` more, the hardest for its effort limits of 64 seeded ones that start within 0.3 rad [or m].
+    """
     if robot.settings is None:
         return Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
     start, target = robot.settings.start, robot.settings.target
     spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
-    shift = np.random.default_rng(seed).uniform(-spread, spread, (nearby, robot.dof))
-    starts = np.clip(np.concatenate([start[None], start + shift]), robot.lower, robot.upper)
-    names = ("tutorial", *("near the tutorial's" for _ in range(nearby)))
-    return Moves(starts, np.tile(target, (1 + nearby, 1)), names)
+    move = Moves(start[None], target[None], ("tutorial",))
+    if nearby == 0:
+        return move
+    shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
+    starts = np.clip(start + shift, robot.lower, robot.upper)
+    others = Moves(starts, np.tile(target, (64, 1)), ("near the tutorial's",) * 64)
+    hardest = np.argsort(fastest(robot, others))[::-1][:nearby]
+    return move + Moves(others.start[hardest], others.target[hardest], others.names[:nearby])
 
 
 def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:

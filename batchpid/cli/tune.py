@@ -68,6 +68,7 @@ class Tune:
         from sim.moves import random_moves, tutorial_move
         from sim.trial import arm_joints, try_gains
         from sim.tune import Weights, tune
+        from sim.variation import draw_variation
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = Path(f"out/{robot.path.stem}.tuned.yaml") if self.out is None else self.out
@@ -96,6 +97,7 @@ class Tune:
         )
         print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
         moves = tutorial_move(robot) + random_moves(robot, 20, self.seed + 1)
+        drawn = draw_variation(robot, len(moves.start), self.seed + 1) if self.variation else None
         trials = [
             try_gains(
                 robot,
@@ -105,6 +107,7 @@ class Tune:
                 workers=self.workers,
                 measurement_rate=True,
                 physics=self.physics,
+                variation=drawn,
             )
             for name, params in bar("judging", unit="set")(
                 [("designed", found.start_params), ("tuned", found.params)]
