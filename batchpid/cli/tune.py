@@ -64,6 +64,7 @@ class Tune:
         from batchpid import plots, save_params
         from batchpid.cli.gainsets import trial_table
         from batchpid.cli.progress import bar
+        from batchpid.errors import InvalidArgumentError
         from sim import Robot
         from sim.moves import random_moves, tutorial_move
         from sim.trial import arm_joints, try_gains
@@ -72,6 +73,10 @@ class Tune:
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = Path(f"out/{robot.path.stem}.tuned.yaml") if self.out is None else self.out
+        if out.suffix not in (".yaml", ".yml", ".json"):
+            raise InvalidArgumentError(
+                "out", "unknown file format", value=str(out), remedy="end it in .yaml or .json"
+            )
         picture = plots.check_path(out.with_suffix(".png") if self.picture is None else self.picture)
         out.parent.mkdir(parents=True, exist_ok=True)
         history = out.with_suffix(".search.json")
@@ -131,9 +136,9 @@ class Tune:
         save_params(out, found.params, robot.joint_names, about)
         history.unlink(missing_ok=True)
         before, after = (plots.Traces.of(t.rollout.envs(slice(0, 1)), robot, t.name) for t in trials)
-        drawn = plots.save(
+        image = plots.save(
             plots.comparison(before, after, title=f"{robot.name}, {moves.names[0]} move"), picture
         )
-        print(f"\nwritten: {out}\npicture: {drawn}")
+        print(f"\nwritten: {out}\npicture: {image}")
         for text in trials[1].shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {text}")
