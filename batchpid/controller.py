@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -55,7 +55,7 @@ class BatchPID:
         terms: bool = False,
         joint_names: Sequence[str] | None = None,
     ) -> None:
-        if backend not in BACKENDS:
+        if not isinstance(backend, str) or backend not in BACKENDS:
             raise InvalidArgumentError(
                 "backend", "is unknown", value=backend, remedy=f"choose from {', '.join(BACKENDS)}"
             )
@@ -63,7 +63,11 @@ class BatchPID:
             raise InvalidArgumentError(
                 "num_envs", "is not a whole number >= 1", value=num_envs, remedy="give the number of envs"
             )
-        if isinstance(dt, bool) or not isinstance(dt, int | float | np.floating) or not 0 < dt < math.inf:
+        if (
+            isinstance(dt, bool)
+            or not isinstance(dt, int | float | np.floating)
+            or not 0 < dt <= sys.float_info.max
+        ):
             raise InvalidArgumentError(
                 "dt", "is not positive and finite", value=dt, remedy="give seconds > 0"
             )
@@ -166,7 +170,12 @@ class BatchPID:
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
         """Start the envs of ``mask`` (envs,) bool, or all, anew from ``measurement`` (envs, joints)."""
         y = self._measurement(measurement)
-        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        try:
+            mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidArgumentError(
+                "mask", f"is no array: {error}", remedy="give one bool per env"
+            ) from None
         if mask.dtype != bool or mask.shape != (self.num_envs,):
             raise InvalidArgumentError(
                 "mask",
@@ -204,8 +213,16 @@ class BatchPID:
             self._state = PIDState(*(new if new is None or old is None else old for new, old in kept))
         return self._state
 
+    def _numbers(self, name: str, value: Any) -> Any:
+        try:
+            return self._engine.array(value)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InvalidArgumentError(
+                name, f"cannot be read as an array of numbers: {error}", remedy="give an array of numbers"
+            ) from None
+
     def _measurement(self, value: Any) -> Any:
-        array = self._engine.array(value)
+        array = self._numbers("measurement", value)
         if array.shape != self._shape:
             raise InvalidArgumentError(
                 "measurement", f"has shape {array.shape}, not {self._shape}", remedy="give (num_envs, joints)"
@@ -213,7 +230,7 @@ class BatchPID:
         return array
 
     def _array(self, name: str, value: Any) -> Any:
-        array = self._engine.array(value)
+        array = self._numbers(name, value)
         if array.shape == self._shape:
             return array
         envs, joints = self._shape

@@ -22,6 +22,10 @@ class LeafBuilder:
             raise InvalidArgumentError(
                 "joints", "is not a whole number >= 1", value=joints, remedy="give the number of joints"
             )
+        if joint_names is not None and not isinstance(joint_names, list | tuple):
+            raise InvalidArgumentError(
+                "joint_names", "is no list of names", value=joint_names, remedy="name every joint once"
+            )
         if joint_names is not None and len(joint_names) != joints:
             raise InvalidArgumentError(
                 "joint_names",
@@ -48,7 +52,7 @@ class LeafBuilder:
             if array.dtype.kind not in "iuf":
                 raise TypeError
             array = array.astype(self.dtype)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError, OverflowError):
             raise InvalidArgumentError(
                 name, "is not made of real numbers", value=value, remedy="give numbers"
             ) from None
@@ -104,7 +108,10 @@ class LeafBuilder:
         """Return a mask of 1.0 and 0.0, None where it is False everywhere."""
         if value is None:
             return None
-        array = np.asarray(value)
+        try:
+            array = np.asarray(value)
+        except (TypeError, ValueError, RuntimeError):
+            array = np.zeros(0)  # no bools either
         if array.dtype.kind != "b":
             raise InvalidArgumentError(name, "is not made of bools", value=value, remedy="give True or False")
         array = self._canonical(name, array)
@@ -112,7 +119,13 @@ class LeafBuilder:
 
     def strategies(self, value: Any) -> tuple[Any, Any, Any]:
         """Return the masks of clamp, conditional and back-calculation, each None where no joint has it."""
-        array = self._canonical("anti_windup", np.asarray(value, dtype=object))
+        try:
+            array = np.asarray(value, dtype=object)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidArgumentError(
+                "anti_windup", f"is no array: {error}", remedy=f"choose from {', '.join(ANTI_WINDUP)}"
+            ) from None
+        array = self._canonical("anti_windup", array)
         for env, joint in np.ndindex(array.shape):
             if not isinstance(array[env, joint], str) or array[env, joint] not in ANTI_WINDUP:
                 raise InvalidArgumentError(

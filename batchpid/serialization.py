@@ -113,11 +113,20 @@ def load_params(
     FileNotFoundError
         If there is no such file.
     """
+    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
+        raise InvalidArgumentError("path", "is no path", value=path, remedy="give the file's name")
     path = Path(path)
     document = _parsed(path)
     joints = _checked(path, document)
     names = list(joints)
     if joint_names is not None:
+        if isinstance(joint_names, str) or not isinstance(joint_names, Sequence):
+            raise InvalidArgumentError(
+                "joint_names",
+                "is no list of names",
+                value=joint_names,
+                remedy="name the joints in the order wanted",
+            )
         names = [str(name) for name in joint_names]
         if sorted(names) != sorted(joints):
             missing, unknown = sorted(set(names) - set(joints)), sorted(set(joints) - set(names))

@@ -70,7 +70,7 @@ def stability_bound(
     InvalidArgumentError
         A shape that does not fit, or a mass matrix that is not positive definite.
     """
-    m, p, c, tau, b = _columns(mass_matrix, kp, kd, filter_time, damping)
+    m, p, c, tau, b = _columns(mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
     inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
@@ -93,9 +93,10 @@ def spectral_radius(
     The exact one-step matrix of the law, output first, and the plant, on the state (q, q - q', I, d). Arguments
     as :func:`stability_bound`, with ``ki`` [N m/(rad s) or N/(m s)] as kp. Where ki is 0 its pole at 1 is left out.
     """
-    m, p, c, tau, b = _columns(mass_matrix, kp, kd, filter_time, damping)
+    m, p, i, c, tau, b = _columns(
+        mass_matrix, dt, kp=kp, ki=ki, kd=kd, filter_time=filter_time, damping=damping
+    )
     shape = m.shape[:-1]
-    i = np.broadcast_to(np.asarray(ki, np.float64), shape)
     one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
 
     def diagonal(values: Float64) -> Float64:
@@ -119,8 +120,24 @@ def spectral_radius(
     return np.abs(np.linalg.eigvals(matrix)).max(-1)
 
 
-def _columns(mass_matrix: ArrayLike, *columns: ArrayLike) -> tuple[Any, ...]:
-    m = np.asarray(mass_matrix, np.float64)
+def _numbers(name: str, value: ArrayLike) -> Any:
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf":
+            raise TypeError(f"its dtype is {array.dtype}")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidArgumentError(name, f"is no array of numbers: {error}", remedy="give numbers") from None
+    return array.astype(np.float64)
+
+
+def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Any, ...]:
+    if (
+        isinstance(dt, bool)
+        or not isinstance(dt, int | float | np.number)
+        or not 0 < dt <= np.finfo(float).max
+    ):
+        raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
+    m = _numbers("mass_matrix", mass_matrix)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
         raise InvalidArgumentError(
             "mass_matrix", "is not square", value=m.shape, remedy="pass (joints, joints), or a stack of such"
@@ -131,11 +148,17 @@ def _columns(mass_matrix: ArrayLike, *columns: ArrayLike) -> tuple[Any, ...]:
             "is not positive definite",
             remedy="check the masses and inertias of the robot's links",
         )
-    try:
-        return (m, *(np.broadcast_to(np.asarray(column, np.float64), m.shape[:-1]) for column in columns))
-    except ValueError as error:
-        raise InvalidArgumentError(
-            "kp, kd, filter_time, damping",
-            f"do not broadcast to {m.shape[:-1]}: {error}",
-            remedy="give one value, or one per joint",
-        ) from None
+    spread = []
+    for name, value in columns.items():
+        column = _numbers(name, value)
+        if not np.isfinite(column).all() or (column < 0).any():
+            raise InvalidArgumentError(name, "is not finite and >= 0", value=value, remedy="correct it")
+        try:
+            spread.append(np.broadcast_to(column, m.shape[:-1]))
+        except ValueError as error:
+            raise InvalidArgumentError(
+                name,
+                f"does not broadcast to {m.shape[:-1]}: {error}",
+                remedy="give one value, or one per joint",
+            ) from None
+    return (m, *spread)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -27,11 +26,11 @@ def number(argument: str, value: Any, low: float, high: float, unit: str) -> flo
     """``value`` as a finite float within [low, high]."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
         raise InvalidArgumentError(argument, "must be a number", value=value, remedy=f"pass a float ({unit})")
-    if not math.isfinite(value) or not low <= value <= high:
+    if not low <= value <= high:  # NaN is in no range
         raise InvalidArgumentError(
             argument,
             "out of range",
-            value=float(value),
+            value=value,
             remedy=f"use a number from {low:g} to {high:g} ({unit})",
         )
     return float(value)
@@ -53,6 +52,20 @@ def flag(argument: str, value: Any) -> bool:
     return bool(value)
 
 
+def read_array(argument: str, value: ArrayLike, kinds: str = "iuf") -> NDArray[Any]:
+    """``value`` as an array of a dtype whose kind is one of ``kinds``, of any shape."""
+    try:
+        result = np.asarray(value)
+        if result.dtype.kind not in kinds:
+            raise TypeError(f"its dtype is {result.dtype}")
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        what = "bools" if kinds == "b" else "numbers"
+        raise InvalidArgumentError(
+            argument, f"cannot be read as an array of {what}: {error}", remedy=f"pass an array of {what}"
+        ) from None
+    return result
+
+
 def array(
     argument: str,
     value: ArrayLike,
@@ -65,15 +78,10 @@ def array(
 
     A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
     """
+    result = read_array(argument, value).astype(np.float64, copy=False)
     try:
-        result = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidArgumentError(
-            argument,
-            f"cannot be read as an array of numbers: {error}",
-            remedy=f"pass an array of shape {shape}",
-        ) from None
-    try:
+        if result.ndim and result.shape[-1] != shape[-1]:
+            raise ValueError  # one number for all joints is a scalar, and not an array of one
         result = result if result.shape == shape else np.broadcast_to(result, shape)
     except ValueError:
         raise InvalidArgumentError(
@@ -94,6 +102,24 @@ def array(
     return result
 
 
+def within(
+    argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]
+) -> NDArray[np.float64]:
+    """``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN counts as near."""
+    beyond = np.abs(rows) > far
+    if beyond.any():
+        *_, env, joint = (int(index) for index in np.argwhere(beyond)[0])
+        raise InvalidArgumentError(
+            argument,
+            f"is beyond +-{far:g}",
+            joint=joint_names[joint],
+            env=env,
+            value=float(rows[beyond][0]),
+            remedy="give what a robot can have",
+        )
+    return rows
+
+
 def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) -> NDArray[np.float64]:
     """``value`` as one positive number per joint (dof,)."""
     speeds = array(argument, value, (1, len(joint_names)), joint_names)[0]
@@ -111,12 +137,11 @@ def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) ->
 
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:
     """``value`` as bools, one for each env (envs,)."""
-    mask = np.asarray(value)
-    if mask.dtype != np.bool_ or mask.shape != (num_envs,):
+    mask = read_array(argument, value, "b")
+    if mask.shape != (num_envs,):
         raise InvalidArgumentError(
             argument,
-            f"must be bool of shape ({num_envs},)",
-            value=(mask.dtype.name, mask.shape),
+            f"has shape {mask.shape}, needs ({num_envs},)",
             remedy="use e.g. mask = ~obs.ok",
         )
     return mask

@@ -80,9 +80,10 @@ class Cell:
         self._steps, watch.flagged = steps, watch.stopped.copy()
         if watch.stopped.any() or not finite(*command):
             command = self._admit(command)
-        self._run(substeps, *command)
-        if not finite(self._qpos, self.pack.read_qvel()):
-            self._contain(self._qpos, substeps)
+        with np.errstate(all="ignore"):  # what overflows or is not finite becomes a fault
+            self._run(substeps, *command)
+            if not finite(self._qpos, self.pack.read_qvel()):
+                self._contain(self._qpos, substeps)
 
     def observe(self, rows: Arrays) -> None:
         """Write what the caller is to see into these envs' rows."""

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
 
-from .arguments import array, choice, number
+from .arguments import array, choice, number, within
 from .physics import DISSIPATION
 from .stability import stability
 from .urdf import Joint, mimic_works
@@ -70,12 +71,23 @@ def check(
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names
-    start = robot.start if qpos is None else array("qpos", qpos, (1, robot.dof), names)[0]
+    start = (
+        robot.start
+        if qpos is None
+        else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
+    )
     findings = [*_links(robot), *_joints(robot), *_base(robot), *_poses(robot, "start pose", start)]
     if setpoint is not None:
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
     findings += _touching(robot, start)
     if params is not None:
+        if not isinstance(params, bp.PIDParams) or params.joints != robot.dof:
+            raise InvalidArgumentError(
+                "params",
+                f"must be PIDParams of {robot.dof} joints",
+                value=type(params).__name__ if not isinstance(params, bp.PIDParams) else params.joints,
+                remedy="build them with robot.params()",
+            )
         findings += _params(robot, params, control)
         if control == "pid":
             findings += _stability(robot, params, start, timestep)

@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 
+from .arguments import integer
+
 if TYPE_CHECKING:
     import h5py
 
@@ -85,6 +87,10 @@ class Recorder:
         seed: int | None = None,
         overwrite: bool = False,
     ) -> None:
+        if not hasattr(runner, "recorder"):
+            raise InvalidArgumentError(
+                "runner", "must be a Runner", value=type(runner).__name__, remedy="pass the runner to record"
+            )
         self.path = check_path(path, overwrite=overwrite)
         self._overwrite, self._runner = overwrite, runner
         self.partial = _free_name(self.path)
@@ -279,8 +285,15 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording
     RecordingError
         The file is missing, or no recording.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidArgumentError("path", "must be a path", value=path, remedy="pass the file's name")
+    every = integer("every", every, 1, 10**9)
     h5py, path = _h5py(), Path(path)
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except (OSError, ValueError) as error:  # no name that a file can have
+        raise RecordingError(f"{path}: cannot be read: {error}") from error
+    if not found:
         raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
     try:
         try:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
 
-from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number
+from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
 from .command import Call, Tick, Worker
 from .control import CONTROLS, check_params, default_params
 from .faults import ACTIONS, Fault, FaultLog
@@ -34,6 +34,8 @@ from .worker import ProcessWorker
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
+
+_FAR = 1e6  # rad or m, and per second
 
 
 class Runner:
@@ -212,6 +214,10 @@ class Runner:
 
         self._varies = variation is not None
         if variation is not None:
+            if not isinstance(variation, Variation):
+                raise InvalidArgumentError(
+                    "variation", "is none", value=variation, remedy="draw one with draw_variation"
+                )
             if len(variation.payload) != self.num_envs:
                 raise InvalidArgumentError(
                     "variation",
@@ -243,8 +249,8 @@ class Runner:
         """
         pool = self._open()
         start = self.robot.start if qpos is None else qpos
-        position = self._rows("qpos", start)
-        velocity = self._rows("qvel", 0.0 if qvel is None else qvel)
+        position = self._within("qpos", self._rows("qpos", start))
+        velocity = self._within("qvel", self._rows("qvel", 0.0 if qvel is None else qvel))
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
         self._limits.check("qpos", position[chosen])
         pool.run(Call("reset", (chosen, position, velocity)))
@@ -303,7 +309,7 @@ class Runner:
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
         pool = self._open()
-        table = np.asarray(setpoints)
+        table = read_array("setpoints", setpoints)
         ticks = table.shape[0] if table.ndim in (2, 3) else 0
         if ticks == 0:
             raise InvalidArgumentError(
@@ -317,7 +323,7 @@ class Runner:
         def over_time(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:
             if value is None:
                 return None
-            rows = np.asarray(value)
+            rows = read_array(name, value)
             return self._rows(name, rows[:, None] if rows.ndim == 2 else rows, shape)
 
         targets = over_time("setpoints", setpoints)
@@ -494,6 +500,12 @@ class Runner:
             raise ClosedError("this Runner is closed; make a new one")
         self._pool.settle()
         return self._pool
+
+    def _within(self, name: str, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``rows``, checked: the engine turns what is far out into NaN."""
+        if self._contains:
+            return np.where(np.abs(rows) > _FAR, np.nan, rows)
+        return within(name, rows, _FAR, self.robot.joint_names)
 
     def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
         shape = (self.num_envs, self.robot.dof) if shape is None else shape

@@ -123,6 +123,8 @@ class Snapshot:
         InvalidArgumentError
             The file is missing, or no snapshot of this version.
         """
+        if not isinstance(path, str | os.PathLike):  # open() takes a number for a file descriptor
+            raise InvalidArgumentError("path", "must be a path", value=path, remedy="pass the file's name")
         try:
             with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 tables = {name: file[name] for name in file.files}

@@ -143,6 +143,7 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
     _keep_working_mimics(root, joints, path)
+    _spell_out(root, joints)
     ordered = tuple(_breadth_first(links, joints, path))
     return Urdf(
         name=root.get("name", path.stem),
@@ -267,6 +268,18 @@ def _keep_working_mimics(root: etree._Element, joints: Sequence[Joint], path: Pa
             )
         if not mimic_works(joint, joints):
             element.remove(element.find("mimic"))
+
+
+def _spell_out(root: etree._Element, joints: Sequence[Joint]) -> None:
+    """Write out what joints leave to the defaults: SAPIEN takes a missing limit for NaN, and fails without damping."""
+    for element, joint in zip(root.findall("joint"), joints, strict=True):
+        limit, dynamics = element.find("limit"), element.find("dynamics")
+        if limit is not None and joint.moves and not joint.continuous:
+            limit.set("lower", repr(joint.lower))
+            limit.set("upper", repr(joint.upper))
+        if dynamics is not None:
+            dynamics.set("damping", repr(joint.damping))
+            dynamics.set("friction", repr(joint.friction))
 
 
 def _read_link(element: etree._Element, path: Path) -> Link:

@@ -49,7 +49,10 @@ def load(name):
 
 
 MISSES = {
-    ("g1_description/urdf/g1_29dof_rev_1_0.urdf", "effort"): "an ankle's gains are too weak to leave its limit"
+    (
+        "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+        "effort",
+    ): "an ankle's gains are too weak to leave its limit"
 }
 
 

@@ -1,0 +1,386 @@
+"""Whatever is passed to a public entry point, it works as documented or raises the project's error that names it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import threading
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.errors import BatchPIDError
+from sim import Recorder, Robot, Runner, Snapshot, read_recording
+
+CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "10000"))
+ROBOT = Robot.load("panda")
+DOF, N = ROBOT.dof, 2
+PARAMS = ROBOT.params()
+ARRAY = np.zeros((N, DOF))
+
+
+class Odd:
+    """Something that no entry point expects, and that objects to being looked at."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise RuntimeError("cannot be an array")
+
+    def __repr__(self) -> str:
+        return "Odd()"
+
+
+NUMBERS = [0, 1, -1, 2, 10**9, -(10**9), 10**400, 0.0, -0.0, 0.5, -1.5, 1e-308, 1e300, -1e300]
+NUMBERS += [
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    np.float32(3),
+    np.int8(-4),
+    np.float64("nan"),
+    np.bool_(True),
+]
+OTHERS = [
+    None,
+    True,
+    False,
+    "",
+    "panda",
+    "pid",
+    "x" * 1000,
+    b"bytes",
+    "1.5",
+    "nan",
+    (),
+    [],
+    {},
+    set(),
+    object(),
+    Odd(),
+]
+OTHERS += [
+    len,
+    int,
+    1j,
+    range(3),
+    [None],
+    ["a"] * DOF,
+    [[1.0], [1.0, 2.0]],
+    {"kp": 1},
+    PARAMS,
+    slice(1),
+    ...,
+    NotImplemented,
+]
+SHAPES = [
+    (),
+    (0,),
+    (1,),
+    (DOF,),
+    (DOF + 1,),
+    (N, DOF),
+    (DOF, N),
+    (N, 1),
+    (1, DOF),
+    (0, DOF),
+    (N, 0),
+    (N + 1, DOF),
+]
+SHAPES += [(3, N, DOF), (3, DOF), (1, 1, 1), (2, 2, 2, 2), (0, N, DOF), (N,)]
+DTYPES = ["f8", "f4", "f2", "i8", "i1", "u1", "?", "c16", "O", "U3", "M8[s]"]
+
+
+@st.composite
+def arrays(draw: Any) -> Any:
+    shape, dtype = draw(st.sampled_from(SHAPES)), draw(st.sampled_from(DTYPES))
+    values = np.zeros(shape, dtype)
+    if dtype in ("f8", "f4", "f2") and values.size and draw(st.booleans()):
+        with np.errstate(all="ignore"):
+            values.flat[draw(st.integers(0, values.size - 1))] = draw(
+                st.sampled_from([np.nan, np.inf, -np.inf, 1.0, -1.0, 1e30, -1e30])
+            )
+    form = draw(st.sampled_from(["array", "list", "fortran", "strided", "readonly"]))
+    if form == "list":
+        return values.tolist()
+    if form == "fortran":
+        return np.asfortranarray(values)
+    if form == "strided" and values.ndim:
+        return np.repeat(values, 2, axis=-1)[..., ::2]
+    values.flags.writeable = form != "readonly"
+    return values
+
+
+nasty = st.one_of(st.sampled_from(NUMBERS), st.sampled_from(OTHERS), arrays())
+# What is valid but takes long, or a big machine: it is not what is looked for here.
+heavy = {
+    "num_envs": lambda value: isinstance(value, int | np.integer) and value > 64,
+    "workers": lambda value: isinstance(value, int | np.integer | None) and value != 0,
+    "substeps": lambda value: isinstance(value, int | np.integer) and 1000 < value <= 1_000_000,
+    "ticks": lambda value: False,
+    "joints": lambda value: isinstance(value, int | np.integer) and value > 10_000,
+    "pack_size": lambda value: False,
+}
+
+
+def quiet(call: Callable[[], Any]) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return call()
+
+
+@pytest.fixture(scope="module")
+def runner():
+    with Runner(ROBOT, N, workers=0, substeps=2) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def containing():
+    with Runner(ROBOT, N, workers=0, substeps=2, non_finite="contain") as made:
+        yield made
+
+
+def make_runner(**options: Any) -> None:
+    with Runner(**options) as made:
+        made.step(ROBOT.start, substeps=1)
+
+
+def assign(made: Runner, params: Any) -> None:
+    made.params = params
+
+
+def controller(method: str, **arguments: Any) -> Any:
+    pid = bp.BatchPID(PARAMS, N, 1 / 2000)
+    pid(ARRAY, ARRAY)
+    result = getattr(pid, method)(**arguments)
+    pid(ARRAY, ARRAY)
+    return result
+
+
+def make_controller(**arguments: Any) -> None:
+    bp.BatchPID(**arguments)
+
+
+def load_params(path: Any, joint_names: Any) -> None:
+    """Load a sound file, or what is not the path of one."""
+    with tempfile.TemporaryDirectory() as folder:
+        sound = Path(folder) / "params.yaml"
+        bp.save_params(sound, PARAMS, ROBOT.joint_names)
+        with contextlib.suppress(FileNotFoundError, IsADirectoryError):  # as documented
+            bp.load_params(sound if path is None else path, joint_names)
+
+
+GOOD_PARAMS = {
+    "joints": DOF,
+    "kp": 1.0,
+    "ki": 0.1,
+    "kd": 0.1,
+    "effort_limit": 5.0,
+    "effort_rate_limit": 100.0,
+    "integral_limit": 3.0,
+    "derivative_filter_time": 0.01,
+    "setpoint_weight": 0.5,
+    "deadband": 0.0,
+    "anti_windup": "back_calculation",
+    "tracking_time": 0.1,
+    "continuous": np.zeros(DOF, bool),
+    "integration": "output_first",
+    "non_finite": "propagate",
+    "joint_names": ROBOT.joint_names,
+    "dtype": np.float64,
+}
+GOOD_RUNNER = {
+    "robot": ROBOT,
+    "num_envs": N,
+    "params": PARAMS,
+    "workers": 0,
+    "timestep": 1 / 2000,
+    "substeps": 2,
+    "control": "pid",
+    "compensate": "gravity",
+    "physics": "fast",
+    "measurement_rate": False,
+    "ground": True,
+    "build": None,
+    "pack_size": 1,
+    "on_fault": "hold",
+    "speed_limit": 100.0,
+    "variation": None,
+    "non_finite": "raise",
+    "recover": True,
+    "checkpoint_steps": 100,
+    "timeout": 10.0,
+}
+STEP = {"setpoint": ARRAY, "setpoint_rate": ARRAY, "feedforward": ARRAY}
+ROLLOUT = {"setpoints": ARRAY[None], "setpoint_rates": ARRAY[None], "feedforwards": ARRAY[None]}
+POSE = {"qpos": ROBOT.start, "qvel": ARRAY, "mask": np.ones(N, bool)}
+MEASURED = {
+    "measurement": ARRAY,
+    "setpoint": ARRAY,
+    "measurement_rate": ARRAY,
+    "setpoint_rate": ARRAY,
+    "feedforward": ARRAY,
+}
+MATRIX = np.eye(DOF)
+BOUND = {"mass_matrix": MATRIX, "kp": 1.0, "kd": 1.0, "dt": 1e-3, "filter_time": 0.0, "damping": 0.0}
+
+# name: (what is called, its arguments when all is well)
+ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "make_params": (bp.make_params, GOOD_PARAMS),
+    "BatchPID": (make_controller, {"params": PARAMS, "num_envs": N, "dt": 1e-3, "backend": "numpy"}),
+    "BatchPID.__call__": (lambda **kwargs: controller("__call__", **kwargs), MEASURED),
+    "BatchPID.reset": (
+        lambda **kwargs: controller("reset", **kwargs),
+        {"measurement": ARRAY, "mask": np.ones(N, bool)},
+    ),
+    "BatchPID.track": (lambda **kwargs: controller("track", **kwargs), MEASURED | {"effort": ARRAY}),
+    "stability_bound": (bp.stability_bound, BOUND),
+    "spectral_radius": (bp.spectral_radius, BOUND | {"ki": 1.0}),
+    "load_params": (load_params, {"path": None, "joint_names": ROBOT.joint_names}),
+    "Robot.load": (
+        Robot.load,
+        {
+            "name_or_path": "panda",
+            "package_dirs": (),
+            "missing_meshes": "skip",
+            "dissipation": "urdf",
+            "fixed_base": True,
+        },
+    ),
+    "Robot.params": (ROBOT.params, {"kp": 1.0, "ki": 0.0, "kd": 0.1, "effort_limit": 10.0}),
+    "Robot.check": (
+        ROBOT.check,
+        {"params": PARAMS, "qpos": ROBOT.start, "setpoint": ROBOT.start, "timestep": 1e-3, "control": "pid"},
+    ),
+    "Runner": (make_runner, GOOD_RUNNER),
+    "Snapshot.load": (Snapshot.load, {"path": "none.npz"}),
+    "read_recording": (read_recording, {"path": "none.h5", "every": 1}),
+}
+METHODS = {
+    "step": STEP | {"substeps": 1},
+    "rollout": ROLLOUT,
+    "reset": POSE,
+    "restore": {"snapshot": None},
+    "params": {"params": PARAMS},
+}
+
+
+def attempt(data: Any, call: Callable[..., Any], good: dict[str, Any]) -> tuple[Any, dict[str, Any], bool]:
+    """Call with some arguments replaced by something nasty: the result, what was replaced, and whether it worked."""
+    names = data.draw(
+        st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=2, unique=True), label="replaced"
+    )
+    bad = {}
+    for name in names:
+        value = data.draw(nasty, label=name)
+        if name in heavy and heavy[name](value):
+            value = -1
+        bad[name] = value
+    try:
+        return quiet(lambda: call(**(good | bad))), bad, True
+    except BatchPIDError as error:
+        message = str(error)
+        assert len(message) > 20
+        event("refused")
+        return error, bad, False
+
+
+def names_it(error: BatchPIDError, bad: dict[str, Any]) -> bool:
+    """Whether the error is about one of the arguments that were bad, or about files of that name."""
+    words = [*bad, *(str(value) for value in bad.values() if isinstance(value, str) and value)]
+    if {"path", "name_or_path", "every"} & set(bad):
+        return True
+    return any(word.removesuffix("s") in str(error) for word in words) or bool(
+        {"joints", "num_envs", "joint_names"} & set(bad)
+    )
+
+
+def check_entry(data: Any) -> None:
+    name = data.draw(st.sampled_from(sorted(ENTRIES)), label="entry")
+    event(name)
+    call, good = ENTRIES[name]
+    result, bad, worked = attempt(data, call, good)
+    if not worked:
+        assert names_it(result, bad), (result, bad)
+
+
+def check_method(data: Any, runner: Runner) -> None:
+    method = data.draw(st.sampled_from(sorted(METHODS)), label="method")
+    event(method)
+    before = runner.observe(), runner.time
+    calls = {name: getattr(runner, name) for name in METHODS} | {"params": partial(assign, runner)}
+    result, bad, worked = attempt(data, calls[method], METHODS[method])
+    after = runner.observe()
+    if not worked:
+        assert names_it(result, bad), (result, bad)
+        assert runner.time == before[1]
+        for ours, theirs in zip(before[0], after, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    sound = after.ok[:, None]
+    for table in (after.qpos, after.qvel, after.effort):
+        assert (np.isfinite(table) | ~sound).all()
+    quiet(lambda: runner.reset())
+    runner.params = PARAMS
+    assert quiet(lambda: runner.step(ROBOT.start)).ok.all()
+
+
+def fuzz(count: int, check: Callable[..., None], *arguments: Any) -> None:
+    @settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=st.data())
+    def run(data: Any) -> None:
+        check(data, *arguments)
+
+    threads = threading.active_count()
+    run()
+    assert threading.active_count() <= threads
+
+
+def test_entry_points():
+    fuzz(400, check_entry)
+
+
+def test_methods_of_a_runner(runner):
+    fuzz(250, check_method, runner)
+
+
+def test_methods_of_a_runner_that_contains(containing):
+    fuzz(150, check_method, containing)
+
+
+@pytest.mark.slow
+def test_very_many(runner, containing):
+    fuzz(CASES // 2, check_entry)
+    fuzz(CASES // 4, check_method, runner)
+    fuzz(CASES // 4, check_method, containing)
+
+
+@pytest.mark.parametrize("name", sorted(ENTRIES))
+def test_the_good_arguments_are_good(name):
+    call, good = ENTRIES[name]
+    if name in ("Snapshot.load", "read_recording"):
+        with pytest.raises(BatchPIDError):
+            call(**good)
+    else:
+        quiet(lambda: call(**good))
+
+
+@pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
+def test_a_recorder(arguments, runner):
+    path, recorded = (*arguments, runner)[:2]
+    with pytest.raises(BatchPIDError):
+        Recorder(path, recorded)
+    assert runner.recorder is None
