@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from batchpid.cli.follow import Followed
-    from sim import Robot
+    from sim import Robot, Runner
 
-FORMATS = (".npz",)
+FORMATS = (".npz", ".h5", ".hdf5")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Rollout:
     params: Path | None = None
     """Gains, limits and times: a .yaml or .json file of batchpid.save_params. Default: the robot's own."""
     out: Path | None = None
-    """File to write: .npz."""
+    """File to write: .npz at the end, or .h5 tick by tick (extra `record`), which `batchpid plot` draws."""
     picture: Path | None = None
     """Step responses to draw: .png or .svg."""
 
@@ -75,17 +76,20 @@ class Rollout:
             goal = robot.start if settings is None else settings.target
         setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
         params = None if self.params is None else load_params(self.params, robot.joint_names)[0]
-        with Runner(
-            robot,
-            self.num_envs,
-            params=params,
-            workers=self.workers,
-            timestep=self.timestep,
-            substeps=self.substeps,
-            control=self.control,
-            compensate=self.compensate,
-            physics=self.physics,
-        ) as runner:
+        with (
+            Runner(
+                robot,
+                self.num_envs,
+                params=params,
+                workers=self.workers,
+                timestep=self.timestep,
+                substeps=self.substeps,
+                control=self.control,
+                compensate=self.compensate,
+                physics=self.physics,
+            ) as runner,
+            _recording(self.out, runner, self.seed),
+        ):
             run = follow(runner, setpoint, start, seconds, "simulating")
         metrics = report.judge(robot, run.rollout, run.start)
         print(report.speed(self.num_envs, run.steps, self.timestep, run.wall) + "\n")
@@ -93,13 +97,24 @@ class Rollout:
         for verdict in report.verdicts(robot, run.rollout, metrics):
             print(verdict)
         if self.out is not None:
-            _write(self.out, robot, run)
+            if self.out.suffix == ".npz":
+                _write(self.out, robot, run)
             print(f"written: {self.out}")
         if self.picture is not None:
             traces = plots.Traces.of(run.rollout, robot)
             print(
                 f"picture: {plots.save(plots.step_responses(traces, mark=0, title=robot.name), self.picture)}"
             )
+
+
+def _recording(path: Path | None, runner: Runner, seed: int) -> AbstractContextManager[Any]:
+    """A recorder for HDF5 files; it has made what is recorded so far safe whenever the run is cut short."""
+    from sim import Recorder
+
+    if path is None or path.suffix == ".npz":
+        return nullcontext()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return Recorder(path, runner, seed=seed, overwrite=True)
 
 
 def _check_out(path: Path) -> None:
