@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sim import Robot, Runner
-from sim.benchmark import CASES, Hand, Setup, check_motion, run_by_hand
+from sim.benchmark import CASES, Setup, check_motion
+from sim.hands import Hand, run_by_hand
 
 ROUNDS = 3
 

@@ -7,14 +7,10 @@ run in worker processes of their own, one for each worker, each with its share o
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
-import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -23,19 +19,17 @@ from numpy.typing import NDArray
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 
 from .arrays import Arrays
+from .hands import Hand, run_by_hand
 from .loop import Loop, LoopSpec
+from .peers import Stepper, make_peer, run_peer
 from .physics import PHYSICS
 from .robot import Robot
 from .runner import Runner
-from .scenes import Pack, SceneSpec, parse
-from .tutorial import TutorialLoop
-from .worker import ONE_THREAD
+from .scenes import SceneSpec
 
 Float64 = NDArray[np.float64]
 DISTANCE = 0.3
 """How far the arm starts from its target [rad]."""
-PACK = 8
-"""Scenes to a PhysX system in the bare engine's packed cases."""
 
 CASES = {
     "tutorial": "the tutorial's loop as written: one robot, one process",
@@ -110,8 +104,12 @@ class Result:
         return statistics.median(self.rates)
 
 
-def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -> dict[str, Result]:
+def compare(
+    setup: Setup, progress: Callable[[str], None] = lambda case: None, peers: Sequence[str] = ()
+) -> dict[str, Result]:
     """Measure every case ``setup.rounds`` times in turn; the rounds of different cases are paired.
+
+    ``peers`` are cases of :data:`sim.peers.PEERS` to measure as well.
 
     Raises
     ------
@@ -119,24 +117,31 @@ def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -
         The robot carries no gains and target to move with.
     BatchPIDError
         The robots of a case did not move, or ended elsewhere: its figure would mean nothing.
+    MissingDependencyError
+        The package of a peer is not installed.
     """
-    robot = setup.robot
+    robot, cases = setup.robot, (*CASES, *peers)
     if robot.settings is None:
         raise InvalidArgumentError(
             "robot", f"{robot.name!r} carries no gains and target", remedy=f"use one of {Robot.bundled()}"
         )
-    rates: dict[str, list[float]] = {case: [] for case in CASES}
+    rates: dict[str, list[float]] = {case: [] for case in cases}
     final: dict[str, Float64] = {}
-    hands = [Hand(setup, index) for index in range(max(setup.workers, 1))]
     robot = Robot.load(robot.path, dissipation="sapien")
+    hands: list[Hand] = []
+    others: dict[str, Stepper] = {}
     try:
+        hands += [Hand(setup, index) for index in range(max(setup.workers, 1))]
+        others |= {name: make_peer(name, setup) for name in peers}
         with Runner(
             robot, setup.num_envs, workers=setup.workers, physics=setup.physics, substeps=setup.substeps
         ) as runner:
             for _ in range(setup.rounds):
-                for case in CASES:
+                for case in cases:
                     progress(case)
-                    if case == "closed loop":
+                    if case in others:
+                        seconds, steps, final[case] = run_peer(others[case], setup)
+                    elif case == "closed loop":
                         seconds, steps, final[case] = _run_closed_loop(runner, setup)
                     else:
                         taken = hands[:1] if case == "tutorial" else hands
@@ -145,9 +150,11 @@ def compare(setup: Setup, progress: Callable[[str], None] = lambda case: None) -
     finally:
         for hand in hands:
             hand.close()
+        for other in others.values():
+            other.close()
     for case, place in final.items():
         check_motion(case, place, setup)
-    return {case: Result(tuple(rates[case]), final[case]) for case in CASES}
+    return {case: Result(tuple(rates[case]), final[case]) for case in cases}
 
 
 def phases(setup: Setup) -> dict[str, float]:
@@ -205,18 +212,6 @@ def _run_closed_loop(runner: Runner, setup: Setup) -> tuple[float, int, Float64]
     return seconds, setup.num_envs * setup.ticks * setup.substeps, obs.qpos[0].astype(np.float64)
 
 
-def run_by_hand(case: str, hands: list[Hand], setup: Setup) -> tuple[float, int, Float64]:
-    """Run one round of ``case`` on ``hands`` at once: (seconds, env-steps, where the first env ended)."""
-    for hand in hands:
-        hand.prepare(case)
-    began = time.perf_counter()
-    for hand in hands:
-        hand.go()
-    results = [hand.result() for hand in hands]
-    seconds = time.perf_counter() - began
-    return seconds, sum(steps for steps, _ in results), results[0][1]
-
-
 def check_motion(case: str, place: Float64, setup: Setup) -> None:
     """Raise unless the robot at ``place`` (dof,) has moved from the start towards the target."""
     moving = setup.moving
@@ -251,111 +246,3 @@ class _Clock:
 
         self.__dict__[name] = timed
         return timed
-
-
-class Hand:
-    """A process that steps its share of the scenes by hand, case after case."""
-
-    def __init__(self, setup: Setup, index: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        count = max(setup.workers, 1)
-        share = setup.num_envs * (index + 1) // count - setup.num_envs * index // count
-        saved = {name: os.environ.get(name) for name in ONE_THREAD}
-        os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-        try:
-            self._process = context.Process(target=_serve, args=(theirs, setup, share), daemon=True)
-            self._process.start()
-        finally:
-            for name, value in saved.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
-        theirs.close()
-
-    def prepare(self, case: str) -> None:
-        """Build what ``case`` needs, and put its robots at the start."""
-        self._connection.send(case)
-        self._connection.recv()
-
-    def go(self) -> None:
-        """Begin to step."""
-        self._connection.send(None)
-
-    def result(self) -> tuple[int, Float64]:
-        """Wait for the env-steps made, and where the first env ended."""
-        steps, final = self._connection.recv()
-        return steps, final
-
-    def close(self) -> None:
-        """End the process."""
-        self._connection.close()
-        self._process.join(5.0)
-        if self._process.is_alive():
-            self._process.kill()
-
-
-def _serve(connection: Connection, setup: Setup, share: int) -> None:
-    cases: dict[str, _Tutorial | _Engine] = {}
-    gc.disable()
-    try:
-        while True:
-            case: str = connection.recv()
-            if case not in cases:
-                cases[case] = _Tutorial(setup) if case.startswith("tutorial") else _Engine(case, setup, share)
-            cases[case].reset()
-            connection.send(None)
-            connection.recv()
-            connection.send(cases[case].run(setup.ticks * setup.substeps))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass
-
-
-class _Tutorial:
-    """The tutorial's loop, alone in its process."""
-
-    def __init__(self, setup: Setup) -> None:
-        self._start = setup.start
-        self._loop = TutorialLoop(setup.robot, setup.target, start=setup.start)
-
-    def reset(self) -> None:
-        self._loop.reset(self._start)
-
-    def run(self, steps: int) -> tuple[int, Float64]:
-        final = self._loop.run(steps).astype(np.float64)
-        return steps, final
-
-
-class _Engine:
-    """Scenes under PhysX's drive and nothing else: no gravity, so that the drive reaches what the PID reaches."""
-
-    def __init__(self, case: str, setup: Setup, share: int) -> None:
-        assert setup.robot.settings is not None
-        spec = setup.scene(gravity=False)
-        size = 1 if case == "drive, a scene a robot" else PACK
-        self._in_turn = case != "bare engine, pack by pack"
-        self._substeps = setup.substeps
-        builder = parse(spec)
-        sizes = [min(size, share - first) for first in range(0, share, size)]
-        self._packs = [Pack(builder, spec, count, system_size=size) for count in sizes]
-        self._start, self._share = setup.start, share
-        for pack in self._packs:
-            stiffness, damping = setup.robot.settings.drive_stiffness, setup.robot.settings.drive_damping
-            pack.write_drive(np.array(stiffness), np.array(damping), np.array(np.inf))
-            pack.write_drive_target(np.tile(setup.target, (pack.size, 1)))
-
-    def reset(self) -> None:
-        for pack in self._packs:
-            rows = np.tile(self._start, (pack.size, 1))
-            pack.write_state(range(pack.size), rows, np.zeros_like(rows))
-
-    def run(self, steps: int) -> tuple[int, Float64]:
-        packs = self._packs
-        if self._in_turn:
-            for _ in range(steps):
-                for pack in packs:
-                    pack.step()
-        else:
-            for _ in range(steps // self._substeps):
-                for pack in packs:
-                    for _ in range(self._substeps):
-                        pack.step()
-        return steps * self._share, packs[0].read_qpos()[0]

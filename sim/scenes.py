@@ -123,6 +123,13 @@ class Probe:
         rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, qacc)), strict=True)
         return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
 
+    def forward_dynamics(
+        self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        """Accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included, damping left out."""
+        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, effort)), strict=True)
+        return np.array([self._model.compute_forward_dynamics(*row) for row in rows])
+
     def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
         """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,).
 

@@ -32,6 +32,8 @@ class Bench:
     """Ticks of one measurement."""
     rounds: int = 5
     """How often each case is measured."""
+    peers: bool = False
+    """Also measure MuJoCo's rollout and Gymnasium's AsyncVectorEnv around the tutorial's loop, where installed."""
     json: Path | None = None
     """File for the figures, with the machine and the versions."""
 
@@ -42,6 +44,7 @@ class Bench:
         from sim import Robot
         from sim.arguments import integer
         from sim.benchmark import CASES, Setup, compare, phases
+        from sim.peers import PEERS, installed
 
         setup = Setup(
             Robot.load(self.robot),
@@ -52,8 +55,10 @@ class Bench:
             ticks=integer("ticks", self.ticks, 1, 1_000_000),
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
-        advance = iter(bar("bench")(range(setup.rounds * len(CASES))))
-        results = compare(setup, progress=lambda case: next(advance, None))
+        peers = installed() if self.peers else ()
+        what = CASES | {name: PEERS[name].description for name in peers}
+        advance = iter(bar("bench")(range(setup.rounds * len(what))))
+        results = compare(setup, progress=lambda case: next(advance, None), peers=peers)
         next(advance, None)  # the bar closes
         spent = phases(setup)
 
@@ -62,12 +67,15 @@ class Bench:
             f"physics {setup.physics!r}, {setup.substeps} substeps, {setup.rounds} rounds\n"
         )
         rows = [
-            [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", CASES[case]]
+            [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", what[case]]
             for case, result in results.items()
         ]
         print(report.table(rows, ["case", "thousand steps/s", "closed loop / case", "what it is"], "lrrl"))
         print("\nclosed loop, microseconds per env step in a worker:")
         print(report.table([[f"{value:.2f}" for value in spent.values()]], list(spent), "r" * len(spent)))
+        absent = sorted({peer.package for name, peer in PEERS.items() if self.peers and name not in peers})
+        if absent:
+            print(f"\nnot installed: {', '.join(absent)} (pip install 'batchpid[peers]')")
         if self.json is not None:
             self.json.parent.mkdir(parents=True, exist_ok=True)
             self.json.write_text(_as_json(setup, results, spent))
@@ -123,7 +131,7 @@ def machine() -> dict[str, Any]:
             if line.startswith("model name"):
                 processor = line.partition(":")[2].strip()
                 break
-    packages = ("batchpid", "sapien", "numpy", "jax")
+    packages = ("batchpid", "sapien", "numpy", "jax", "mujoco", "gymnasium")
     versions = {}
     for package in packages:
         with suppress(importlib.metadata.PackageNotFoundError):

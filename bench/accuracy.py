@@ -1,0 +1,68 @@
+"""What error each physics preset makes, as a table: ``python bench/accuracy.py [--json FILE]`` (two minutes).
+
+The figures do not depend on the machine's speed. What a preset costs, ``batchpid bench`` tells.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from batchpid.cli.report import table
+from sim import Robot
+from sim.accuracy import REFERENCES, TIMESTEP, measure
+
+THINNED = 20
+
+
+@dataclass(frozen=True)
+class Options:
+    """Errors of the physics presets beside references 20 times finer, under the robots' tuned gains."""
+
+    count: int = 8
+    """Moves of each kind."""
+    seconds: float = 1.0
+    """Length of a move."""
+    json: Path | None = None
+    """File for the figures."""
+
+
+def main(options: Options) -> None:
+    """Print the table, and write the figures."""
+    figures: list[dict[str, Any]] = []
+    for name in Robot.bundled():
+        for motion in REFERENCES:
+            errors = measure(Robot.load(name), motion, count=options.count, seconds=options.seconds)
+            for (physics, reference), error in errors.items():
+                figures.append(
+                    {
+                        "robot": name,
+                        "motion": motion,
+                        "physics": physics,
+                        "reference": reference,
+                        "max": error.largest,
+                        "rms": error.rms,
+                        "over_time": {
+                            "seconds": THINNED * TIMESTEP,
+                            "max": [
+                                float(f"{value:.3g}") for value in error.over_time[THINNED - 1 :: THINNED]
+                            ],
+                        },
+                    }
+                )
+    labels = ("robot", "motion", "physics", "reference")
+    rows = [
+        [str(row[label]) for label in labels] + [f"{row['max']:.1e}", f"{row['rms']:.1e}"] for row in figures
+    ]
+    print(table(rows, [*labels, "max [rad]", "RMS [rad]"], "llllrr"))
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps({"accuracy": figures}) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

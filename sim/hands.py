@@ -1,0 +1,153 @@
+"""Processes that step scenes by hand, without a Runner: what it is measured against (:mod:`sim.benchmark`)."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scenes import Pack, parse
+from .tutorial import TutorialLoop
+from .worker import ONE_THREAD
+
+if TYPE_CHECKING:
+    from .benchmark import Setup
+
+Float64 = NDArray[np.float64]
+PACK = 8
+"""Scenes to a PhysX system in the bare engine's packed cases."""
+
+
+def run_by_hand(case: str, hands: Sequence[Hand], setup: Setup) -> tuple[float, int, Float64]:
+    """Run one round of ``case`` on ``hands`` at once: (seconds, env-steps, where the first env ended)."""
+    for hand in hands:
+        hand.prepare(case)
+    began = time.perf_counter()
+    for hand in hands:
+        hand.go()
+    results = [hand.result() for hand in hands]
+    seconds = time.perf_counter() - began
+    return seconds, sum(steps for steps, _ in results), results[0][1]
+
+
+class Hand:
+    """A process that steps its share of the scenes by hand, case after case."""
+
+    def __init__(self, setup: Setup, index: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        count = max(setup.workers, 1)
+        share = setup.num_envs * (index + 1) // count - setup.num_envs * index // count
+        with one_thread_each():
+            self._process = context.Process(target=_serve, args=(theirs, setup, share), daemon=True)
+            self._process.start()
+        theirs.close()
+
+    def prepare(self, case: str) -> None:
+        """Build what ``case`` needs, and put its robots at the start."""
+        self._connection.send(case)
+        self._connection.recv()
+
+    def go(self) -> None:
+        """Begin to step."""
+        self._connection.send(None)
+
+    def result(self) -> tuple[int, Float64]:
+        """Wait for the env-steps made, and where the first env ended."""
+        steps, final = self._connection.recv()
+        return steps, final
+
+    def close(self) -> None:
+        """End the process."""
+        self._connection.close()
+        self._process.join(5.0)
+        if self._process.is_alive():
+            self._process.kill()
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Let processes that start now keep to one thread in their BLAS, as the Runner's workers do."""
+    saved = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _serve(connection: Connection, setup: Setup, share: int) -> None:
+    cases: dict[str, _Tutorial | _Engine] = {}
+    gc.disable()
+    try:
+        while True:
+            case: str = connection.recv()
+            if case not in cases:
+                cases[case] = _Tutorial(setup) if case.startswith("tutorial") else _Engine(case, setup, share)
+            cases[case].reset()
+            connection.send(None)
+            connection.recv()
+            connection.send(cases[case].run(setup.ticks * setup.substeps))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass
+
+
+class _Tutorial:
+    """The tutorial's loop, alone in its process."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._start = setup.start
+        self._loop = TutorialLoop(setup.robot, setup.target, start=setup.start)
+
+    def reset(self) -> None:
+        self._loop.reset(self._start)
+
+    def run(self, steps: int) -> tuple[int, Float64]:
+        final = self._loop.run(steps).astype(np.float64)
+        return steps, final
+
+
+class _Engine:
+    """Scenes under PhysX's drive and nothing else: no gravity, so that the drive reaches what the PID reaches."""
+
+    def __init__(self, case: str, setup: Setup, share: int) -> None:
+        assert setup.robot.settings is not None
+        spec = setup.scene(gravity=False)
+        size = 1 if case == "drive, a scene a robot" else PACK
+        self._in_turn = case != "bare engine, pack by pack"
+        self._substeps = setup.substeps
+        builder = parse(spec)
+        sizes = [min(size, share - first) for first in range(0, share, size)]
+        self._packs = [Pack(builder, spec, count, system_size=size) for count in sizes]
+        self._start, self._share = setup.start, share
+        for pack in self._packs:
+            stiffness, damping = setup.robot.settings.drive_stiffness, setup.robot.settings.drive_damping
+            pack.write_drive(np.array(stiffness), np.array(damping), np.array(np.inf))
+            pack.write_drive_target(np.tile(setup.target, (pack.size, 1)))
+
+    def reset(self) -> None:
+        for pack in self._packs:
+            rows = np.tile(self._start, (pack.size, 1))
+            pack.write_state(range(pack.size), rows, np.zeros_like(rows))
+
+    def run(self, steps: int) -> tuple[int, Float64]:
+        packs = self._packs
+        if self._in_turn:
+            for _ in range(steps):
+                for pack in packs:
+                    pack.step()
+        else:
+            for _ in range(steps // self._substeps):
+                for pack in packs:
+                    for _ in range(self._substeps):
+                        pack.step()
+        return steps * self._share, packs[0].read_qpos()[0]
