@@ -3,7 +3,7 @@ r"""Black-box tuning on the real scenes: CMA-ES from the designed gains, in log 
 Every candidate runs every move in an env of its own, so a generation is one rollout. Its cost is the mean over joints,
 taken as the mean over moves plus the worst move, of::
 
-    w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot O / 5 %
+    w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
         + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
 
 A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; E the error left
@@ -66,7 +66,7 @@ class Weights:
     settling: float = 1.0
     """Of the settling time in seconds."""
     overshoot: float = 1.0
-    """Of the overshoot, in units of 5 %."""
+    """Of the overshoot, as log(1 + overshoot / 5 %): one move beyond reach must not outweigh all others."""
     final: float = 1.0
     """Of the error left at the end, as log(1 + error / settling band's least width)."""
     chatter: float = 0.3
@@ -93,7 +93,7 @@ def tune(
     robot: Robot,
     *,
     seed: int = 0,
-    generations: int = 12,
+    generations: int = 10,
     population: int = 8,
     seconds: float = 1.5,
     gain_units: str = "mass_matrix",
@@ -291,7 +291,7 @@ class _Search:
         cost = (
             w.itae * part(m.itae) / self._size
             + w.settling * np.minimum(part(m.settling_time), 1.5 * horizon)
-            + w.overshoot * part(m.peak_deviation) / self._size / 0.05
+            + w.overshoot * np.log1p(part(m.peak_deviation) / self._size / 0.05)
             + w.final * np.log1p(part(m.steady_state_error) / self._band)
             + w.chatter * np.maximum(part(m.effort_variation) / self._smooth - 1, 0)
             + w.saturation * part(m.saturation_share)

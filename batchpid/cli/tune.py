@@ -18,7 +18,7 @@ class Tune:
 
     robot: Annotated[str, tyro.conf.Positional] = "panda"
     """A bundled robot, or the path of a URDF."""
-    generations: int = 12
+    generations: int = 10
     """How often the population is tried."""
     population: int = 8
     """Candidates tried at once."""
