@@ -6,8 +6,8 @@ import numpy as np
 
 from batchpid.errors import InvalidArgumentError
 
-from ..robot import Robot
 from ..observation import Rollout
+from ..robot import Robot
 from .source import Frame, Traces
 
 
