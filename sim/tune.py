@@ -23,7 +23,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -100,7 +100,7 @@ def tune(
     per_joint: bool = False,
     weights: Weights | None = None,
     moves: Moves | None = None,
-    variation: bool = False,
+    variation: Mapping[str, Any] | None = None,
     measurement_rate: bool = True,
     workers: int | None = None,
     time_limit: float | None = None,
@@ -127,7 +127,8 @@ def tune(
     moves
         Default: the tutorial's, where there is one, one that starts near it, and four random ones, one of each kind.
     variation
-        Draw payload and friction for each move (:mod:`sim.variation`), the same for all candidates.
+        Options of :func:`sim.variation.draw_variation`, {} for its defaults: each move gets a robot of its own payload
+        and friction, the same for all candidates. None: the robot as it is.
     measurement_rate
         Use the simulator's joint velocity for the derivative.
     workers
@@ -171,7 +172,7 @@ def tune(
         "moves": list(moves.names),
         "seconds": seconds,
         "weights": dataclasses.asdict(weights),
-        "variation": variation,
+        "variation": None if variation is None else dict(variation),
         "measurement_rate": measurement_rate,
         **{name: str(value) for name, value in runner_options.items()},
         "versions": _versions(),
@@ -184,8 +185,8 @@ def tune(
         "workers": workers,
         **runner_options,
     }
-    if variation:
-        drawn = draw_variation(robot, len(moves.start), seed)
+    if variation is not None:
+        drawn = draw_variation(robot, len(moves.start), seed, **variation)
         options["variation"] = drawn.for_envs(np.tile(np.arange(len(moves.start)), population))
     began, costs_of, best = time.monotonic(), [], (math.inf, np.zeros(search.dimension))
     start_cost = math.nan

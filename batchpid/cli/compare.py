@@ -29,6 +29,10 @@ class Compare:
     """Solver settings."""
     variation: bool = False
     """Payload, friction, coarse sensors and late efforts, drawn for each move."""
+    payload: float = 2.0
+    """With variation: the largest payload [kg], less where the robot does not carry it."""
+    friction: float = 0.1
+    """With variation: the largest joint friction (PhysX's coefficient)."""
     picture: Path | None = None
     """The first two sets on the first move: .png or .svg."""
 
@@ -50,7 +54,11 @@ class Compare:
         robot = Robot.load(self.robot)
         sets = [gain_set(robot, name) for name in self.gains]
         moves = tutorial_move(robot) + random_moves(robot, self.moves, self.seed)
-        drawn = draw_variation(robot, len(moves.start), self.seed) if self.variation else None
+        drawn = None
+        if self.variation:
+            drawn = draw_variation(
+                robot, len(moves.start), self.seed, payload=self.payload, friction=self.friction
+            )
         trials = [
             try_gains(
                 robot,

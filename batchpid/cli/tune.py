@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -44,6 +44,10 @@ class Tune:
     """Weight of the time in saturation."""
     variation: bool = False
     """Payload, friction, coarse sensors and late efforts, drawn for each move."""
+    payload: float = 2.0
+    """With variation: the largest payload [kg], less where the robot does not carry it."""
+    friction: float = 0.1
+    """With variation: the largest joint friction (PhysX's coefficient)."""
     physics: Literal["accurate", "fast"] = "accurate"
     """Solver settings."""
     workers: int | None = None
@@ -82,6 +86,9 @@ class Tune:
         history = out.with_suffix(".search.json")
         if not self.resume:
             history.unlink(missing_ok=True)
+        varied: dict[str, Any] | None = None
+        if self.variation:
+            varied = {"payload": self.payload, "friction": self.friction}
         found = tune(
             robot,
             seed=self.seed,
@@ -93,7 +100,7 @@ class Tune:
             weights=Weights(
                 self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation
             ),
-            variation=self.variation,
+            variation=varied,
             workers=self.workers,
             time_limit=self.time_limit,
             history=history,
@@ -102,7 +109,7 @@ class Tune:
         )
         print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
         moves = tutorial_move(robot) + random_moves(robot, 20, self.seed + 1)
-        drawn = draw_variation(robot, len(moves.start), self.seed + 1) if self.variation else None
+        drawn = None if varied is None else draw_variation(robot, len(moves.start), self.seed + 1, **varied)
         trials = [
             try_gains(
                 robot,

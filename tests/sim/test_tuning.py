@@ -162,6 +162,16 @@ def test_late_efforts_and_coarse_sensors(panda):
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-2)
 
 
+def test_tuning_with_variation_is_another_search(panda):
+    moves = random_moves(panda, 1, 0)
+    plain, varied = (
+        tune(panda, moves=moves, variation=v, workers=0, **SMALL)
+        for v in (None, {"payload": 1.0, "friction": 0.01})
+    )
+    assert plain.history != varied.history
+    assert varied.settings["variation"] == {"payload": 1.0, "friction": 0.01}
+
+
 def test_variation_must_fit_the_envs(panda):
     with pytest.raises(InvalidArgumentError, match="variation"):
         try_gains(
