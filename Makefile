@@ -2,6 +2,7 @@
 # make test    every test but the minutes-long ones
 # make check   linter, formatter and types: what CI runs before the tests
 # make bench   benchmarks, with the baselines to beat
+# make figures measure what docs/performance.md shows, and draw it (5 minutes, on a machine that does nothing else)
 # make soak    the minutes-long tests
 #
 # Each builds .venv when it is missing or older than pyproject.toml. Another Python: make PYTHON=/path/to/python3.12
@@ -14,7 +15,7 @@ RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
 
-.PHONY: demo test check format bench soak clean
+.PHONY: demo test check format bench figures accuracy soak clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
@@ -34,6 +35,22 @@ format: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	@$(RUN) -m pytest bench --timeout 1200 $(ARGS)
+
+MEASURED := out/bench
+bench_case = $(RUN) -m batchpid bench --robot $(1) --physics $(2) --json $(MEASURED)/$(1)-$(2).json $(3)
+
+figures: $(VENV)/.dev
+	$(call bench_case,panda,accurate,--peers)
+	$(call bench_case,panda,fast)
+	$(call bench_case,jaco2,accurate)
+	$(call bench_case,jaco2,fast)
+	@$(RUN) -m pytest bench/test_scaling.py bench/test_resources.py --benchmark-json $(MEASURED)/pytest.json
+	@$(RUN) bench/draw.py $(MEASURED)
+
+# The errors of the physics presets do not depend on the machine's speed: only new physics or gains change them.
+accuracy: $(VENV)/.dev
+	@$(RUN) bench/accuracy.py --json $(MEASURED)/accuracy.json
+	@$(RUN) bench/draw.py $(MEASURED)
 
 soak: $(VENV)/.dev
 	@$(RUN) -m pytest -m slow --timeout 14400 $(ARGS)

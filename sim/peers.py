@@ -53,8 +53,8 @@ class AsyncVector:
         import gymnasium
 
         self._setup, self._count = setup, count
-        # The processes are forks of one that has loaded the engine, or as many as envs would take a minute to start.
-        multiprocessing.set_forkserver_preload([__name__])
+        # The processes are forks of one that has loaded all packages: else many would take a minute to start.
+        multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
         with one_thread_each():
             self._envs = gymnasium.vector.AsyncVectorEnv(
                 [lambda: _tutorial_env(setup)] * count, context="forkserver"

@@ -1,0 +1,314 @@
+"""Draw the figures of docs/performance.md, and write its tables: ``python bench/draw.py [FOLDER]``.
+
+FOLDER holds what ``make figures`` measured; its figures go into docs/performance.json first. Without it everything is
+drawn from that file as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from batchpid.plots import save
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+SETUPS = {
+    "panda-accurate": "panda, accurate",
+    "panda-fast": "panda, fast",
+    "jaco2-accurate": "jaco2, accurate",
+    "jaco2-fast": "jaco2, fast",
+}
+ENGINES = ("bare engine", "bare engine, pack by pack")
+OURS, ENGINE, OTHER, FAST = "#2f6f9f", "#8a8a8a", "#c9b48a", "#e08a3c"
+PHASES = {
+    "step": "#8a8a8a",
+    "passive": "#2f6f9f",
+    "control": "#e08a3c",
+    "read": "#5aa469",
+    "write": "#b45f82",
+    "waiting": "#d9d9d9",
+}
+SCALING = {
+    # group of the benchmark: (its parameter, label of the axis)
+    "envs (2 workers)": ("num_envs", "envs (2 workers)"),
+    "workers (64 envs)": ("workers", "workers (64 envs; 0: in the caller's process)"),
+    "substeps (64 envs, 2 workers)": ("substeps", "sim steps in a tick (64 envs, 2 workers)"),
+}
+RESOURCES = {
+    # name in extra_info: (what it is, format)
+    "MB_per_env": ("memory of one env more (64 to 1024 envs)", "{:.2f} MB"),
+    "build_ms_per_env": ("building one env more (64 to 1024 envs, two workers)", "{:.2f} ms"),
+    "start_seconds": ("from `Runner(...)` to the first step, 64 envs", "{:.2f} s"),
+    "cost_2048_over_64": ("cost of an env step at 2048 envs over that at 64", "{:.2f}"),
+    "us_over_work": ("a tick of one sim step beyond the work of the slower worker, 64 envs", "{:.0f} µs"),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw the figures of docs/performance.md, and write its tables."""
+
+    folder: tyro.conf.Positional[Path | None] = None
+    """What was measured; default: nothing new."""
+
+
+def main(options: Options) -> None:
+    """Take in new figures, if any; draw; write."""
+    path = DOCS / "performance.json"
+    figures = json.loads(path.read_text()) if path.is_file() else {}
+    if options.folder is not None:
+        figures |= gather(options.folder, figures)
+        path.write_text(json.dumps(figures, indent=1) + "\n")
+    save(draw_speed(figures), DOCS / "images" / "performance.png")
+    save(draw_accuracy(figures["accuracy"]), DOCS / "images" / "accuracy.png")
+    page = DOCS / "performance.md"
+    text = page.read_text()
+    for name, table in tables(figures).items():
+        marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
+        text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
+    page.write_text(text)
+
+
+# -- figures -----------------------------------------------------------------------------------------------------
+
+
+def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
+    """Figures from the files in ``folder``; what it lacks stays as it is in ``old``."""
+    new: dict[str, Any] = {"cases": dict(old.get("cases", {}))}
+    for name in SETUPS:
+        if (path := folder / f"{name}.json").is_file():
+            measured = json.loads(path.read_text())
+            new["machine"] = measured["machine"]
+            new["cases"][name] = {
+                "rates": {case: round(row["median"]) for case, row in measured["cases"].items()},
+                "ratios": {
+                    case: round(row["closed_loop_over_case"], 3) for case, row in measured["cases"].items()
+                },
+                "phases": {
+                    phase: round(us, 2) for phase, us in measured["microseconds_per_env_step"].items()
+                },
+            }
+    if (path := folder / "pytest.json").is_file():
+        benchmarks = json.loads(path.read_text())["benchmarks"]
+        new["scaling"] = {
+            group: {
+                str(row["params"][parameter]): row["extra_info"]["env_steps_per_second"]
+                for row in benchmarks
+                if row["group"] == group
+            }
+            for group, (parameter, _) in SCALING.items()
+        }
+        new["resources"] = {}
+        for row in benchmarks:
+            if row["group"] == "resources":
+                robot = new["resources"].setdefault(row["params"]["setup"], {})
+                robot |= {key: value for key, value in row["extra_info"].items() if key in RESOURCES}
+    if (path := folder / "accuracy.json").is_file():
+        new["accuracy"] = json.loads(path.read_text())["accuracy"]
+    return new
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------
+
+
+def draw_speed(figures: dict[str, Any]) -> Figure:
+    """Bars of the cases, where the time goes, and how it scales."""
+    figure = Figure(figsize=(11, 7.2), layout="constrained")
+    grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
+    draw_cases(figure.add_subplot(grid[0, :4]), figures["cases"])
+    draw_phases(figure.add_subplot(grid[0, 4:]), figures["cases"])
+    for column, (group, (_, label)) in enumerate(SCALING.items()):
+        axes = figure.add_subplot(grid[1, 2 * column : 2 * column + 2])
+        draw_scaling(axes, figures["scaling"][group], label)
+    machine = figures["machine"]
+    figure.suptitle(
+        f"PID, gravity and Coriolis compensation at every sim step of 0.5 ms, 64 envs on 2 cores "
+        f"({machine['processor']}, SAPIEN {machine['sapien']})",
+        fontsize=9,
+    )
+    return figure
+
+
+def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
+    """Thousand env-steps per second of every case: the panda, both presets."""
+    accurate, fast = cases["panda-accurate"]["rates"], cases["panda-fast"]["rates"]
+    names = list(accurate)[::-1]
+    for row, name in enumerate(names):
+        colour = OURS if name == "closed loop" else ENGINE if name in ENGINES else OTHER
+        for rates, up, alpha in ((accurate, 0.2, 1.0), (fast, -0.2, 0.55)):
+            # A peer has physics of its own, and one bar.
+            if name in rates and (name in fast or up > 0):
+                rate = rates[name] / 1e3
+                place = row + up if name in fast else row
+                axes.barh(place, rate, height=0.38, color=colour, alpha=alpha, lw=0)
+                axes.text(rate, place, f" {rate:.0f}", va="center", fontsize=7)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_title(
+        "panda: thousand env-steps/s (upper bar: physics accurate, lower, pale: fast)",
+        fontsize=8.5,
+        loc="left",
+    )
+    tidy(axes, "x")
+
+
+def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
+    """Microseconds per env step of each phase, stacked."""
+    for row, (name, label) in enumerate(reversed(SETUPS.items())):
+        left = 0.0
+        for phase, colour in PHASES.items():
+            spent = cases[name]["phases"][phase]
+            axes.barh(
+                row, spent, left=left, height=0.6, color=colour, lw=0, label=phase if row == 0 else None
+            )
+            left += spent
+        axes.text(0.3, row + 0.38, label, fontsize=7.5, va="center")
+    axes.set_yticks([])
+    axes.set_ylim(-1.4, len(SETUPS) - 0.3)
+    axes.legend(loc="lower left", ncols=3, fontsize=7, frameon=False)
+    axes.set_title("closed loop: µs per env step in a worker", fontsize=8.5, loc="left")
+    tidy(axes, "x")
+
+
+def draw_scaling(axes: Axes, rates: dict[str, float], label: str) -> None:
+    """Thousand env-steps per second over a parameter."""
+    at = [int(value) for value in rates]
+    if max(at) > 10:
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(at, [str(value) for value in at])
+        axes.minorticks_off()
+    else:
+        axes.set_xticks(at)
+    axes.plot(at, [rate / 1e3 for rate in rates.values()], "o-", color=OURS, ms=4, lw=1.4)
+    axes.set_ylim(0)
+    axes.set_xlabel(label, fontsize=8)
+    axes.set_ylabel("thousand env-steps/s", fontsize=8)
+    tidy(axes, "y")
+
+
+def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
+    """The largest error over time, for each robot and kind of motion."""
+    robots = list(dict.fromkeys(row["robot"] for row in rows))
+    motions = list(dict.fromkeys(row["motion"] for row in rows))
+    figure = Figure(figsize=(11, 5), layout="constrained")
+    panels = figure.subplots(len(robots), len(motions), sharex=True, sharey=True, squeeze=False)
+    for row in rows:
+        axes = panels[robots.index(row["robot"])][motions.index(row["motion"])]
+        spacing, errors = row["over_time"]["seconds"], row["over_time"]["max"]
+        time = [spacing * (index + 1) for index in range(len(errors))]
+        colour, dotted = OURS if row["physics"] == "accurate" else FAST, row["reference"].startswith("TGS")
+        axes.semilogy(
+            time,
+            errors,
+            color=colour,
+            lw=1.3,
+            ls=":" if dotted else "-",
+            label=f"{row['physics']}, against {row['reference']}",
+        )
+    for robot, line in zip(robots, panels, strict=True):
+        for motion, axes in zip(motions, line, strict=True):
+            axes.set_title(f"{robot}, {motion}", fontsize=8.5, loc="left")
+            axes.legend(fontsize=6.5, frameon=False, loc="lower right")
+            tidy(axes, "y")
+        line[0].set_ylabel("largest error [rad]", fontsize=8)
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def tidy(axes: Axes, grid: str) -> None:
+    """Small ticks, a faint grid behind, no frame on top and at the right."""
+    axes.tick_params(labelsize=7.5)
+    axes.grid(axis=grid, color="#e6e6e6", lw=0.6)  # type: ignore[arg-type]
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+# -- tables ------------------------------------------------------------------------------------------------------
+
+
+def tables(figures: dict[str, Any]) -> dict[str, str]:
+    """Markdown of every table of the page, by its marker."""
+    return {
+        "machine": machine(figures["machine"]),
+        "cases": cases_table(figures["cases"]),
+        "phases": phases_table(figures["cases"]),
+        "presets": presets_table(figures),
+        "resources": resources_table(figures["resources"]),
+    }
+
+
+def machine(about: dict[str, Any]) -> str:
+    """The machine and the versions, in a line."""
+    packages = ", ".join(
+        f"{name} {about[name]}" for name in ("sapien", "numpy", "mujoco", "gymnasium") if name in about
+    )
+    return (
+        f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']}, {packages}."
+    )
+
+
+def cases_table(cases: dict[str, Any]) -> str:
+    """Rates, and the closed loop over each."""
+    rows = [
+        [case]
+        + [
+            f"{cases[name]['rates'][case] / 1e3:.1f} ({cases[name]['ratios'][case]:.2f})"
+            if case in cases[name]["rates"]
+            else ""
+            for name in SETUPS
+        ]
+        for case in cases["panda-accurate"]["rates"]
+    ]
+    return markdown(["thousand env-steps/s (closed loop / case)", *SETUPS.values()], rows)
+
+
+def phases_table(cases: dict[str, Any]) -> str:
+    """Microseconds per env step of each phase."""
+    rows = [
+        [label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)]
+        for name, label in SETUPS.items()
+    ]
+    return markdown(["µs per env step in a worker", *PHASES], rows)
+
+
+def presets_table(figures: dict[str, Any]) -> str:
+    """Cost and errors of each preset."""
+    rows = []
+    for name, label in SETUPS.items():
+        phases = figures["cases"][name]["phases"]
+        all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
+        first = [label, f"{phases['step']:.1f} / {all_work:.1f}"]
+        for row in figures["accuracy"]:
+            if f"{row['robot']}-{row['physics']}" == name:
+                errors = [f"{row[kind]:.1e}" for kind in ("max", "rms")]
+                rows.append([*first, row["motion"], row["reference"], *errors])
+                first = ["", ""]
+    headers = ["", "µs per env step: engine / all", "motion", "against", "max [rad]", "RMS [rad]"]
+    return markdown(headers, rows)
+
+
+def resources_table(resources: dict[str, dict[str, float]]) -> str:
+    """Memory, building, starting."""
+    rows = [
+        [what, *(form.format(robot[name]) for robot in resources.values())]
+        for name, (what, form) in RESOURCES.items()
+    ]
+    return markdown(["", *resources], rows)
+
+
+def markdown(headers: list[str], rows: list[list[str]]) -> str:
+    """A table."""
+    from tabulate import tabulate
+
+    return str(tabulate(rows, headers, tablefmt="github", disable_numparse=True))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
