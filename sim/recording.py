@@ -1,8 +1,8 @@
 """Recordings: every tick of a runner streamed to an HDF5 file, readable whatever ends the program.
 
 A thread writes what was recorded every half second, and sees to it that the file on disk is whole at any moment (HDF5's
-single-writer mode, times last): after a kill at most the last second is missing. The file grows beside its final name,
-as ``NAME.partial``, and takes that name when it is complete; no file of that name is touched before.
+single-writer mode, times last). A tick waits while one recorded longer ago than ``_LAG`` is not on disk yet, so that at
+most a second's ticks are missing after a kill, however slow the disk. The file grows beside its final name, as ``NAME.partial``, and takes that name when it is complete; no file of that name is touched before.
 
 Datasets, ticks first: ``time`` [s], ``setpoint``, ``qpos``, ``qvel``, ``effort``, ``saturated`` (ticks, envs, dof) and
 ``ok`` (ticks, envs); row k is the state at the end of tick k. What they belong to stands in the attributes.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import tempfile
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 FORMAT = "batchpid-recording-1"
 _EVERY = 0.5  # seconds from one write to the next
+_LAG = 0.75  # seconds by which what is on disk may lag behind what is recorded
 _BUFFER = 64 << 20  # bytes that may wait to be written
 _CHUNK = 1 << 18  # bytes of a chunk of the file, about
 
@@ -97,6 +99,7 @@ class Recorder:
         self._wake = threading.Condition()
         self._rows: list[tuple[Any, ...]] = []
         self._bytes = 0
+        self._since = math.inf  # when the oldest row was recorded that is not on disk
         self._closing = False
         self._error: Exception | None = None
         self._file, self._datasets = self._create(seed)
@@ -109,10 +112,11 @@ class Recorder:
         runner = self._runner
         row = (runner.time, np.array(setpoint), *runner.observe())
         with self._wake:
-            while self._bytes > _BUFFER and self._error is None:
+            while self._error is None and (self._bytes > _BUFFER or time.monotonic() - self._since > _LAG):
                 self._wake.wait()
             self._check()
             self._rows.append(row)
+            self._since = min(self._since, time.monotonic())
             self._bytes += sum(part.nbytes for part in row[1:])
             if len(self._rows) == 1:
                 self._wake.notify_all()
@@ -189,7 +193,7 @@ class Recorder:
                     self._wake.wait_for(lambda: self._closing or self._bytes > _BUFFER, _EVERY)
                     closing = self._closing
                 rows, self._rows, self._bytes = self._rows, [], 0
-                self._wake.notify_all()
+                taken = time.monotonic()
             try:
                 if rows:
                     self._write(rows)
@@ -198,6 +202,9 @@ class Recorder:
                     self._error = error
                     self._wake.notify_all()
                 return
+            with self._wake:
+                self._since = taken if self._rows else math.inf
+                self._wake.notify_all()
             if closing:
                 return
 
