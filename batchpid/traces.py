@@ -42,7 +42,7 @@ class Traces:
 
     @classmethod
     def of(cls, rollout: Any, robot: Any, label: str = "") -> Traces:
-        """Traces of a ``sim.Rollout`` of a ``sim.Robot`` (or of anything with these attributes)."""
+        """Traces of a ``sim.Rollout`` of a ``sim.Robot``, or of what a file says of one: see ``sim.dataset``."""
         alive = np.asarray(rollout.ok)[..., None]
         return cls(
             time=np.asarray(rollout.time),
@@ -51,7 +51,7 @@ class Traces:
             effort=np.where(alive, rollout.effort, np.nan),
             saturated=np.asarray(rollout.saturated),
             joint_names=tuple(robot.joint_names),
-            units=tuple(joint.unit for joint in robot.joints),
+            units=tuple(robot.units),
             lower=np.asarray(robot.lower),
             upper=np.asarray(robot.upper),
             effort_limit=np.asarray(robot.effort_limit),

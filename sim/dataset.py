@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
@@ -27,16 +30,26 @@ _SAYS = {
 
 
 class Recorded(NamedTuple):
-    """A rollout from a file, and what the file says of its robot: ``units`` are "rad" or "m", by joint."""
+    """A rollout from a file, and what the file says of its robot; ``complete`` is False where it was cut short."""
 
     rollout: Rollout
     robot: str
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
+    """Of each joint's position: "rad" or "m"."""
+    lower: NDArray[np.float64]
+    """(joints,) [rad or m]."""
+    upper: NDArray[np.float64]
+    """(joints,) [rad or m]."""
+    effort_limit: NDArray[np.float64]
+    """(joints,) [N m or N]."""
+    complete: bool = True
 
 
-def read_rollout(path: str | Path) -> Recorded:
+def read_rollout(path: str | Path, *, every: int = 1) -> Recorded:
     """Read what ``batchpid rollout --out FILE`` or a :class:`sim.Recorder` wrote: .npz, .h5 or .hdf5.
+
+    Takes every ``every``-th tick.
 
     Raises
     ------
@@ -47,31 +60,27 @@ def read_rollout(path: str | Path) -> Recorded:
     """
     path = Path(path)
     if path.suffix in (".h5", ".hdf5") or ".partial" in path.suffix:
-        found = read_recording(path)
+        found = read_recording(path, every=every)
         rollout = Rollout(*(getattr(found, name) for name in Rollout._fields))
-        return Recorded(
-            rollout,
-            str(found.attributes["robot"]),
-            found.joint_names,
-            tuple(map(str, found.attributes["units"])),
-        )
+        return _recorded(rollout, found.attributes, found.complete)
     if not path.is_file():
         raise InvalidArgumentError("path", "is no file", value=str(path), remedy="check the spelling")
     try:
         with np.load(path, allow_pickle=False) as data:
-            return Recorded(
-                Rollout(*(data[name] for name in Rollout._fields)),
-                str(data["robot"]),
-                tuple(map(str, data["joint_names"])),
-                tuple(map(str, data["units"])),
-            )
-    except (OSError, ValueError, KeyError, EOFError) as error:
+            return _recorded(Rollout(*(data[name][::every] for name in Rollout._fields)), data)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InvalidArgumentError(
             "path",
             f"cannot be read as a rollout: {error}",
             value=str(path),
             remedy="give a file that batchpid rollout --out wrote",
         ) from error
+
+
+def _recorded(rollout: Rollout, about: Mapping[str, Any], complete: bool = True) -> Recorded:
+    names, units = (tuple(map(str, about[name])) for name in ("joint_names", "units"))
+    lower, upper, limit = (np.asarray(about[name], np.float64) for name in ("lower", "upper", "effort_limit"))
+    return Recorded(rollout, str(about["robot"]), names, units, lower, upper, limit, complete)
 
 
 def to_dataset(rollout: Rollout, robot: Robot | Recorded) -> xarray.Dataset:
@@ -94,17 +103,14 @@ def to_dataset(rollout: Rollout, robot: Robot | Recorded) -> xarray.Dataset:
     for name, says in _SAYS.items():
         dims = ("time", "env") if name == "ok" else ("time", "env", "joint")
         variables[name] = (dims, getattr(rollout, name), {"long_name": says, "units": units.get(name, "1")})
-    if isinstance(robot, Robot):
-        title, joint_units = robot.name, [joint.unit for joint in robot.joints]
-    else:
-        title, joint_units = robot.robot, list(robot.units)
+    title = robot.name if isinstance(robot, Robot) else robot.robot
     return xarray.Dataset(
         variables,
         coords={
             "time": ("time", rollout.time, {"long_name": "simulated time", "units": "s"}),
             "env": np.arange(rollout.qpos.shape[1]),
             "joint": list(robot.joint_names),
-            "unit": ("joint", joint_units, {"long_name": "unit of the joint's position"}),
+            "unit": ("joint", list(robot.units), {"long_name": "unit of the joint's position"}),
         },
         attrs={"robot": title},
     )

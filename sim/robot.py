@@ -156,6 +156,11 @@ class Robot:
         return tuple(joint.name for joint in self.joints)
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the positions, "rad" or "m", in the order of :attr:`joint_names`."""
+        return tuple(joint.unit for joint in self.joints)
+
+    @property
     def lower(self) -> Float64:
         """Lower position limits (dof,) [rad or m]."""
         return np.array([joint.lower for joint in self.joints])

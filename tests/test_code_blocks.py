@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 import batchpid as bp
-from batchpid.cli import COMMANDS, _load, main
+from batchpid.cli import COMMANDS, main, parse
 from sim import Robot
 
 ROOT = Path(__file__).parents[1]
@@ -94,11 +94,9 @@ def run(words: list[str]) -> None:
 
 
 def command(name: str, *flags: str) -> None:
-    import tyro
-
     assert name in COMMANDS
     if name in ONLY_PARSED or "--viewer" in flags:
-        tyro.cli(_load(name), args=list(flags))
+        parse(name, flags)
         return
     if name == "view" and importlib.util.find_spec("viser") is None:
         return

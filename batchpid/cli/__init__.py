@@ -58,14 +58,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    import tyro
-
     from batchpid.errors import BatchPIDError
 
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            command: Command = tyro.cli(_load(name), prog=f"batchpid {name}", args=arguments)
+            command = parse(name, arguments)
             status = command.run()
             sys.stdout.flush()
         except BatchPIDError as error:
@@ -82,9 +80,23 @@ def _run(name: str, arguments: list[str]) -> int:
     return status or 0
 
 
-def _load(name: str) -> Any:
+def load(name: str) -> Any:
+    """Return the dataclass of a command."""
     module, _, attribute = COMMANDS[name][0].partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def parse(name: str, arguments: Sequence[str]) -> Command:
+    """Return the command with its flags; for flags it does not know, or --help, print what helps and exit."""
+    import tyro
+
+    plain = (
+        tyro.conf.DisallowNone,  # a flag is left out, not given None
+        tyro.conf.FlagCreatePairsOff,  # --viewer, and no --no-viewer beside it
+        tyro.conf.PositionalMetavarFromFieldName,
+    )
+    parsed: Command = tyro.cli(load(name), prog=f"batchpid {name}", args=list(arguments), config=plain)
+    return parsed
 
 
 def _version() -> str:

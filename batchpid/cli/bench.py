@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from batchpid.cli.optional import OptionalPath
+
 if TYPE_CHECKING:
     from sim.benchmark import Result, Setup
 
@@ -34,7 +36,7 @@ class Bench:
     """How often each case is measured."""
     peers: bool = False
     """Also measure MuJoCo's rollout and Gymnasium's AsyncVectorEnv around the tutorial's loop, where installed."""
-    json: Path | None = None
+    json: OptionalPath = None
     """File for the figures, with the machine and the versions."""
 
     def run(self) -> None:

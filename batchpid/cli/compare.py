@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+
+from batchpid.cli.optional import OptionalInt, OptionalPath
 
 
 @dataclass(frozen=True)
 class Compare:
     """Gain sets on the same seeded moves: settling, overshoot, final error and chatter of each."""
 
-    gains: Annotated[tuple[str, ...], tyro.conf.Positional] = ("tuned", "tutorial", "drive")
+    gains: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[GAINS ...]")] = (
+        "tuned",
+        "tutorial",
+        "drive",
+    )
     """Params files, or: tutorial, tuned, designed, drive, drive:STIFFNESS,DAMPING."""
     robot: str = "panda"
     """A bundled robot, or the path of a URDF."""
@@ -23,7 +28,7 @@ class Compare:
     """Of the moves."""
     seconds: float = 2.0
     """Simulated time of each move [s]."""
-    workers: int | None = None
+    workers: OptionalInt = None
     """Processes; 0: this one. Default: one for each available core."""
     physics: Literal["accurate", "fast"] = "accurate"
     """Solver settings."""
@@ -33,7 +38,7 @@ class Compare:
     """With variation: the largest payload [kg], less where the robot does not carry it."""
     friction: float = 0.1
     """With variation: the largest joint friction (PhysX's coefficient)."""
-    picture: Path | None = None
+    picture: OptionalPath = None
     """The first two sets on the first move: .png or .svg."""
 
     def run(self) -> None:

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from batchpid.cli.optional import Names, OptionalPath
+
 
 @dataclass(frozen=True)
 class Plot:
@@ -17,16 +19,16 @@ class Plot:
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """What ``rollout --out`` or a ``sim.Recorder`` wrote: .h5."""
-    versus: Path | None = None
+    """What ``rollout --out`` or a ``sim.Recorder`` wrote: .h5 or .npz."""
+    versus: OptionalPath = None
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
     """What to draw of one recording."""
-    joints: tuple[str, ...] = ()
+    joints: Names = ()
     """Names of joints. Default: all."""
     every: int = 1
-    """Take every so-manieth tick: for long recordings."""
-    out: Path | None = None
+    """Take only every n-th tick, for long recordings."""
+    out: OptionalPath = None
     """Picture to write: .png or .svg. Default: beside the recording."""
 
     def run(self) -> None:
@@ -48,18 +50,17 @@ class Plot:
 
 
 def _read(path: Path, every: int) -> Any:
-    import numpy as np
-
     from batchpid.errors import InvalidArgumentError
     from batchpid.plots import Traces
-    from sim import read_recording
+    from sim.dataset import read_rollout
 
-    run = read_recording(path, every=every)
-    about = run.attributes
-    ends = "" if run.complete else " (cut short)"
+    recorded = read_rollout(path, every=every)
+    run = recorded.rollout
+    failed = int((~run.ok[-1:]).sum())
     print(
-        f"{path}{ends}: robot {about['robot']}, {about['num_envs']} envs, {len(run.time)} ticks up to "
-        f"{run.time[-1] if len(run.time) else 0:g} s, {int((~run.ok[-1:]).sum())} envs failed at the end"
+        f"{path}{'' if recorded.complete else ' (cut short)'}: {run.ok.shape[1]} x {recorded.robot}, "
+        f"{len(run.time)} ticks up to {run.time[-1] if len(run.time) else 0:g} s"
+        + (f", {failed} envs diverged" if failed else "")
     )
     if not len(run.time):
         raise InvalidArgumentError(
@@ -67,17 +68,4 @@ def _read(path: Path, every: int) -> Any:
             f"{path} holds no tick",
             remedy="its run was cut short in its first second: run it again",
         )
-    alive = run.ok[..., None]
-    return Traces(
-        time=run.time,
-        setpoint=run.setpoint,
-        qpos=np.where(alive, run.qpos, np.nan),
-        effort=np.where(alive, run.effort, np.nan),
-        saturated=run.saturated,
-        joint_names=run.joint_names,
-        units=tuple(map(str, about["units"])),
-        lower=about["lower"],
-        upper=about["upper"],
-        effort_limit=about["effort_limit"],
-        label=path.name,
-    )
+    return Traces.of(run, recorded, label=path.name)

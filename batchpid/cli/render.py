@@ -7,6 +7,8 @@ from pathlib import Path
 
 import tyro
 
+from batchpid.cli.optional import OptionalStr
+
 
 @dataclass(frozen=True)
 class Render:
@@ -20,8 +22,8 @@ class Render:
     """What batchpid rollout --out wrote."""
     out: Path = Path("out/film.mp4")
     """The film: .mp4 or .gif."""
-    robot: str | None = None
-    """A bundled robot or the path of a URDF; default the recorded one."""
+    robot: OptionalStr = None
+    """A bundled robot or the path of a URDF. Default: the recorded one."""
     envs: int = 16
     """Show so many envs, the first ones."""
     fps: float = 30.0

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from batchpid.cli.optional import OptionalFloats, OptionalInt, OptionalPath, OptionalStr
+
 if TYPE_CHECKING:
     from batchpid.cli.follow import Followed
     from sim import Robot, Runner
@@ -26,7 +28,7 @@ class Rollout:
     """A bundled robot, or the path of a URDF."""
     num_envs: int = 64
     """How many robots."""
-    workers: int | None = None
+    workers: OptionalInt = None
     """Processes that step them; 0: this one. Default: one for each available core."""
     control: Literal["pid", "drive"] = "pid"
     """The batch PID, or PhysX's internal drive."""
@@ -46,20 +48,24 @@ class Rollout:
     """Of the start poses."""
     spread: float = 0.3
     """Envs but the first start up to this far from the robot's start pose [rad or m]."""
-    setpoint: tuple[float, ...] | None = None
+    setpoint: OptionalFloats = None
     """One position per joint [rad or m]. Default: the robot's own, else its start pose."""
-    params: Path | None = None
-    """Gains, limits and times: a .yaml or .json file of batchpid.save_params. Default: the robot's own."""
-    out: Path | None = None
+    params: OptionalStr = None
+    """Gains: a .yaml or .json file that `batchpid tune` or batchpid.save_params wrote, or one of tuned, designed,
+    tutorial, drive:STIFFNESS,DAMPING. Default: a bundled robot's own, which are the tutorial's, else designed."""
+    out: OptionalPath = None
     """File to write: .npz at the end, or .h5 tick by tick (extra `record`), which `batchpid plot` draws."""
-    picture: Path | None = None
+    picture: OptionalPath = None
     """Step responses to draw: .png or .svg."""
 
     def run(self) -> None:
         """Run it."""
-        from batchpid import load_params, plots
+        import numpy as np
+
+        from batchpid import plots
         from batchpid.cli import report
         from batchpid.cli.follow import duration, follow, start_poses
+        from batchpid.cli.gainsets import gain_set
         from sim import Robot, Runner
         from sim.arguments import array
 
@@ -75,18 +81,20 @@ class Rollout:
         if goal is None:
             goal = robot.start if settings is None else settings.target
         setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
-        params = None if self.params is None else load_params(self.params, robot.joint_names)[0]
+        options: dict[str, Any] = {"control": self.control}
+        named = self.params or (None if settings is not None else "designed")
+        if named is not None:
+            options |= gain_set(robot, named).options
         with (
             Runner(
                 robot,
                 self.num_envs,
-                params=params,
                 workers=self.workers,
                 timestep=self.timestep,
                 substeps=self.substeps,
-                control=self.control,
                 compensate=self.compensate,
                 physics=self.physics,
+                **options,
             ) as runner,
             _recording(self.out, runner, self.seed),
         ):
@@ -96,6 +104,8 @@ class Rollout:
         print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):
             print(verdict)
+        if self.params is None and settings is not None and not np.isfinite(metrics.settling_time).all():
+            print("These are the tutorial's gains. For some that settle add: --params tuned")
         if self.out is not None:
             if self.out.suffix == ".npz":
                 _write(self.out, robot, run)

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from batchpid.cli.optional import OptionalFloat, OptionalInt, OptionalPath
+
 
 @dataclass(frozen=True)
 class Tune:
@@ -50,17 +52,17 @@ class Tune:
     """With variation: the largest joint friction (PhysX's coefficient)."""
     physics: Literal["accurate", "fast"] = "accurate"
     """Solver settings."""
-    workers: int | None = None
+    workers: OptionalInt = None
     """Processes; 0: this one. Default: one for each available core."""
-    time_limit: float | None = None
+    time_limit: OptionalFloat = None
     """Stop after the generation in which this many seconds have passed."""
     missing_meshes: Literal["error", "skip"] = "error"
     """Go on without collision shapes whose mesh is missing."""
     resume: bool = False
     """Go on where a search with the same options stopped."""
-    out: Path | None = None
+    out: OptionalPath = None
     """Params file to write: .yaml or .json. Default: out/ROBOT.tuned.yaml."""
-    picture: Path | None = None
+    picture: OptionalPath = None
     """Before and after on the first move: .png or .svg. Default: beside the params."""
 
     def run(self) -> None:

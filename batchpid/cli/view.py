@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
+
+from batchpid.cli.optional import OptionalFloat, OptionalInt, OptionalPath, OptionalStr
+
+if TYPE_CHECKING:
+    from sim.view import Playback
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -18,8 +23,8 @@ class View:
     With two controls the same robots stand side by side, one group under each. With ``--play`` it shows a recorded run.
     """
 
-    robot: tyro.conf.Positional[str | None] = None
-    """A bundled robot, or the path of a URDF; default panda, or the recorded one."""
+    robot: tyro.conf.Positional[OptionalStr] = None
+    """A bundled robot, or the path of a URDF. Default: panda, or the recorded one."""
     num_envs: int = 16
     """Robots in each group; 64 in all at most."""
     control: tuple[Literal["pid", "drive"], ...] = ("pid",)
@@ -28,9 +33,9 @@ class View:
     """Passive force added to the joints."""
     physics: Literal["accurate", "fast"] = "accurate"
     """Solver settings."""
-    workers: int | None = None
-    """Processes that step the scenes; default one for each core."""
-    play: Path | None = None
+    workers: OptionalInt = None
+    """Processes that step the scenes. Default: one for each core."""
+    play: OptionalPath = None
     """A recorded run to show instead."""
     fps: float = 30.0
     """Frames a second."""
@@ -38,8 +43,8 @@ class View:
     """Address to listen on. Whoever reaches it can move the sliders."""
     port: int = 8080
     """Port; the next free one if it is taken."""
-    seconds: float | None = None
-    """Stop after so many seconds; default at Ctrl-C."""
+    seconds: OptionalFloat = None
+    """Stop after so many seconds. Default: at Ctrl-C."""
 
     def run(self) -> None:
         """Run it."""
@@ -47,16 +52,16 @@ class View:
 
         from batchpid.errors import InvalidArgumentError
         from sim import Robot
-        from sim.dataset import read_rollout
-        from sim.view import Live, Playback, View
+        from sim.arguments import integer
+        from sim.view import Live, View
         from sim.view.source import Source
 
+        port = integer("port", self.port, 1, 65535)
         if not 1.0 <= self.fps <= 120.0:
             raise InvalidArgumentError("fps", "out of range", value=self.fps, remedy="use 1 to 120")
         source: Source
         if self.play is not None:
-            recorded = read_rollout(self.play)
-            source = Playback(Robot.load(self.robot or recorded.robot), recorded.rollout, period=1 / self.fps)
+            source = _recorded(self.play, self.robot, 1 / self.fps)
         else:
             robot = Robot.load(self.robot or "panda")
             live = Live(
@@ -71,12 +76,38 @@ class View:
             if robot.settings is not None:
                 live.go_to(robot.settings.target)
             source = live
-        with View(source, host=self.host, port=self.port) as view:
+        with View(source, host=self.host, port=port) as view:
             if self.host not in LOOPBACK:
                 print(
                     f"batchpid: warning: listening on {self.host}: whoever reaches it can move the sliders",
                     file=sys.stderr,
                 )
-            print(f"{view.url}  (Ctrl-C ends it)", flush=True)
+            print(f"Open in a browser: {view.url}  (Ctrl-C ends it)", flush=True)
             view.run(self.seconds)
             print(f"{view.rate:.0f} frames/s at {view.factor:.2f} x real time")
+
+
+def _recorded(path: Path, name: str | None, period: float) -> Playback:
+    """The run in a file; of many envs those that fit on the page."""
+    from batchpid.errors import BatchPIDError, InvalidArgumentError
+    from sim import Robot
+    from sim.dataset import read_rollout
+    from sim.view import Playback
+    from sim.view.live import MOST
+
+    recorded = read_rollout(path)
+    try:
+        robot = Robot.load(name or recorded.robot)
+    except BatchPIDError as error:
+        if name is not None:
+            raise
+        raise InvalidArgumentError(
+            "play",
+            f"is a run of {recorded.robot!r}, which is not bundled",
+            value=str(path),
+            remedy=f"pass its URDF too: batchpid view path/to/{recorded.robot}.urdf --play {path}",
+        ) from error
+    count = recorded.rollout.qpos.shape[1]
+    if count > MOST:
+        print(f"showing the first {MOST} of {count} envs")
+    return Playback(robot, recorded.rollout.envs(slice(0, MOST)), period=period)

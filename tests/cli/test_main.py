@@ -62,7 +62,7 @@ def test_unknown_command_names_the_nearest(batchpid):
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
 def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
-    command = cli._load(name)
+    command = cli.load(name)
     assert dataclasses.is_dataclass(command)
     assert command.__dataclass_params__.frozen
     status, out, _ = batchpid(name, "--help")

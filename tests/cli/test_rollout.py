@@ -66,10 +66,26 @@ def test_params_from_a_file(batchpid, tmp_path, robot):
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
 
 
+def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, robot):
+    """By name or from the file that tune wrote: with the units and the measured rate that the file tells of."""
+    path = robot.path.with_name("panda.tuned.yaml")
+    by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--params", each) for each in ("tuned", path))
+    with Runner(robot, 3, workers=0, **robot.tuned()) as runner:
+        runner.reset(start_poses(robot, 3, 0.3, 0))
+        expected = runner.rollout(np.broadcast_to(robot.settings.target, (5, robot.dof)))
+    np.testing.assert_array_equal(by_name["qpos"], expected.qpos)
+    np.testing.assert_array_equal(by_file["qpos"], expected.qpos)
+
+
+def test_gains_that_ring_are_told_of(batchpid):
+    assert "--params tuned" in batchpid("rollout", *SHORT)[1]
+    assert "--params tuned" not in batchpid("rollout", *SHORT, "--params", "tuned")[1]
+
+
 def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, robot):
     path = tmp_path / "arm.urdf"
     path.write_text(robot.path.read_text())
-    assert "carries no gains" in batchpid("rollout", *SHORT, "--robot", path)[2]
+    assert batchpid("rollout", *SHORT, "--robot", path)[0] == 0  # with gains designed from its inertia
     bp.save_params(tmp_path / "gains.json", robot.params(), robot.joint_names)
     file = saved(batchpid, tmp_path / "run.npz", "--robot", path, "--params", tmp_path / "gains.json")
     # Without settings of its own it holds its start pose: zero, moved inside the limits.
@@ -90,7 +106,10 @@ def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
         (("--setpoint", *["nan"] * 9), "setpoint, joint 'panda_joint1'"),
         (("--out", "run.csv"), "out: unknown file format"),
         (("--picture", "run.bmp"), "path: unknown picture format"),
-        (("--params", "/nowhere/gains.yaml"), "/nowhere/gains.yaml: No such file"),
+        (
+            ("--params", "/nowhere/gains.yaml"),
+            "gains: is neither a name nor a file (got '/nowhere/gains.yaml')",
+        ),
         (("--seconds", "-1"), "seconds: out of range"),
         (("--timestep", "0"), "timestep: out of range"),
         (("--substeps", "0"), "substeps: out of range"),
