@@ -160,7 +160,7 @@ class Recorder:
         shape = (runner.num_envs, runner.robot.dof)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            file = h5py.File(self.partial, "x", libver="latest")
+            file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=_CHUNK, rdcc_w0=1.0)
         except OSError as error:
             raise RecordingError(f"{self.partial}: cannot be made: {error}") from error
         for name, value in _attributes(runner, seed).items():
