@@ -9,13 +9,12 @@ The loop needs a dozen calls and no more (:class:`Pack`); another gateway to the
 
 from __future__ import annotations
 
-import tempfile
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,13 +70,9 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     """
     loader = _bare_scene(physx.PhysxCpuSystem()).create_urdf_loader()
     loader.fix_root_link = spec.fixed_base
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.urdf"
-        path.write_text(spec.urdf)
-        if spec.srdf is not None:
-            path.with_suffix(".srdf").write_text(spec.srdf)
+    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
         try:
-            builders, actors, _ = loader.parse(str(path), str(path.with_suffix(".srdf")))
+            builders, actors, _ = loader.parse(urdf, srdf)
         except Exception as error:
             raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
     if len(builders) != 1 or actors:
@@ -85,6 +80,18 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
             "the URDF does not describe one articulated robot; it needs at least one moving joint"
         )
     return builders[0]
+
+
+@contextmanager
+def _in_memory(text: str | None) -> Iterator[str]:
+    """Path of a file that holds ``text``, for a loader that takes no text; whoever is killed leaves none behind."""
+    if text is None:
+        yield ""
+        return
+    with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        yield f"/proc/self/fd/{file.fileno()}"
 
 
 class Probe:
