@@ -2,7 +2,8 @@
 
 A thread writes what was recorded every half second, and sees to it that the file on disk is whole at any moment (HDF5's
 single-writer mode, times last). A tick waits while one recorded longer ago than ``_LAG`` is not on disk yet, so that at
-most a second's ticks are missing after a kill, however slow the disk. The file grows beside its final name, as ``NAME.partial``, and takes that name when it is complete; no file of that name is touched before.
+most a second's ticks are missing after a kill, however slow the disk. The file grows beside its final name, as
+``NAME.partial``, and takes that name when it is complete; no file of that name is touched before.
 
 Datasets, ticks first: ``time`` [s], ``setpoint``, ``qpos``, ``qvel``, ``effort``, ``saturated`` (ticks, envs, dof) and
 ``ok`` (ticks, envs); row k is the state at the end of tick k. What they belong to stands in the attributes.

@@ -193,7 +193,7 @@ with Runner(robot, 3, workers=0, substeps=2) as runner, Recorder(sys.argv[1], ru
 
 
 def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
-    """Beginning and end, on the clock, of every tick of a recorded program that got the signal then, or in its pause."""
+    """Beginning and end, on the clock, of every tick of a recorded program that got the signal then or in its pause."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, path, str(pause)], stdout=subprocess.PIPE, text=True, env=environment
@@ -202,7 +202,9 @@ def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
     end = time.monotonic() + seconds
     while time.monotonic() < end and lines[-1] != "pause\n":
         lines.append(process.stdout.readline())
-    while lines[-1] == "pause\n" and time.monotonic() < end and read_count(path + ".partial") < len(lines) - 1:
+    while (
+        lines[-1] == "pause\n" and time.monotonic() < end and read_count(path + ".partial") < len(lines) - 1
+    ):
         time.sleep(0.1)
     process.send_signal(number)
     lines += process.stdout.read().splitlines()

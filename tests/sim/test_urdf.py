@@ -198,12 +198,12 @@ def test_a_mimic_is_kept_only_where_sapien_gets_it_right(multiplier, offset, wor
 
 def test_building_writes_no_file(tmp_path, monkeypatch):
     """So that a killed worker leaves none behind, and a full disk stops none."""
-    text = one_joint().replace("hinge", "Gelenk für α")
+    text = one_joint().replace("hinge", "Ellbogengelenk für die Übung")
     path = write(tmp_path, text)
     write(tmp_path, '<robot name="x"/>', "test.srdf")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     named = Robot.load(path)
-    assert named.joint_names == ("Gelenk für α",)
+    assert named.joint_names == ("Ellbogengelenk für die Übung",)
     assert named.srdf is not None
     with Runner(named, 1, workers=0, params=named.params(kp=1.0), ground=False):
         pass
