@@ -25,7 +25,6 @@ SETUPS = {
     "jaco2-accurate": "jaco2, accurate",
     "jaco2-fast": "jaco2, fast",
 }
-ENGINES = ("bare engine", "bare engine, pack by pack")
 OURS, ENGINE, OTHER, FAST = "#2f6f9f", "#8a8a8a", "#c9b48a", "#e08a3c"
 PHASES = {
     "step": "#8a8a8a",
@@ -141,7 +140,7 @@ def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
     accurate, fast = cases["panda-accurate"]["rates"], cases["panda-fast"]["rates"]
     names = list(accurate)[::-1]
     for row, name in enumerate(names):
-        colour = OURS if name == "closed loop" else ENGINE if name in ENGINES else OTHER
+        colour = OURS if "closed loop" in name else ENGINE if "bare engine" in name else OTHER
         for rates, up, alpha in ((accurate, 0.2, 1.0), (fast, -0.2, 0.55)):
             # A peer has physics of its own, and one bar.
             if name in rates and (name in fast or up > 0):

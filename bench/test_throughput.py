@@ -4,11 +4,10 @@ Groups hold what is to be compared. One round of every case is 64 robots (the tu
 simulated second; ``extra_info`` has env-steps per second. ``batchpid bench`` prints the same cases paired.
 """
 
-import numpy as np
 import pytest
 
 from sim import Robot, Runner
-from sim.benchmark import CASES, Setup, check_motion
+from sim.benchmark import CASES, Setup, check_motion, run_closed_loop
 from sim.hands import Hand, run_by_hand
 
 ROUNDS = 3
@@ -28,7 +27,7 @@ def setups():
 class TestThroughput:
     """The cases of ``batchpid bench``."""
 
-    @pytest.mark.parametrize("case", [case for case in CASES if case != "closed loop"])
+    @pytest.mark.parametrize("case", [case for case in CASES if not case.startswith("closed loop")])
     def test_by_hand(self, benchmark, setups, name, physics, case):
         setup = setups[name, physics]
         benchmark.group = f"{name}, {physics}"
@@ -41,21 +40,16 @@ class TestThroughput:
         check_motion(case, final, setup)
         record(benchmark, steps)
 
-    def test_closed_loop(self, benchmark, setups, name, physics):
+    @pytest.mark.parametrize("case", [case for case in CASES if case.startswith("closed loop")])
+    def test_closed_loop(self, benchmark, setups, name, physics, case):
         setup = setups[name, physics]
         benchmark.group = f"{name}, {physics}"
         robot = Robot.load(name, dissipation="sapien")
         with Runner(robot, setup.num_envs, workers=setup.workers, physics=physics) as runner:
-
-            def second():
-                runner.reset(setup.start)
-                for _ in range(setup.ticks):
-                    obs = runner.step(setup.target)
-                return obs.qpos[0].astype(np.float64)
-
-            final = benchmark.pedantic(second, rounds=ROUNDS, warmup_rounds=1)
-        check_motion("closed loop", final, setup)
-        record(benchmark, setup.num_envs * setup.ticks * setup.substeps)
+            arguments = (case, runner, setup)
+            _, steps, final = benchmark.pedantic(run_closed_loop, arguments, rounds=ROUNDS, warmup_rounds=1)
+        check_motion(case, final, setup)
+        record(benchmark, steps)
 
 
 def record(benchmark, steps):

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .shared import Layout
+
 
 class Arrays(NamedTuple):
     """What goes in and out of a loop, one row per env: (envs, dof), ``ok`` (envs,).
@@ -30,16 +32,22 @@ class Arrays(NamedTuple):
     fault_cause: NDArray[np.int64]
 
     @staticmethod
-    def layout(num_envs: int, dof: int) -> dict[str, tuple[tuple[int, ...], Any]]:
-        """Name -> (shape, dtype) of every field."""
-        table = (num_envs, dof)
+    def layout(ticks: int, num_envs: int, dof: int) -> Layout:
+        """Name -> (shape, dtype) of every field, for so many ticks: see :meth:`of_ticks`."""
+        row, table = (ticks, num_envs), (ticks, num_envs, dof)
         doubles = ("setpoint", "setpoint_rate", "feedforward")
         return (
             {name: (table, np.float64) for name in doubles}
             | {name: (table, np.float32) for name in ("qpos", "qvel", "effort")}
-            | {"saturated": (table, np.bool_), "ok": ((num_envs,), np.bool_)}
-            | {name: ((num_envs,), np.int64) for name in ("fault_step", "fault_joint", "fault_cause")}
+            | {"saturated": (table, np.bool_), "ok": (row, np.bool_)}
+            | {name: (row, np.int64) for name in ("fault_step", "fault_joint", "fault_cause")}
         )
+
+    @staticmethod
+    def of_ticks(fields: dict[str, NDArray[Any]], envs: slice) -> list[Arrays]:
+        """Views of ``envs``, for each of the ticks in ``fields``, which are as :meth:`layout` says."""
+        ticks = range(len(fields["ok"]))
+        return [Arrays(**{name: field[tick, envs] for name, field in fields.items()}) for tick in ticks]
 
     def rows(self, envs: slice) -> Arrays:
         """Views of some envs."""

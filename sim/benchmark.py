@@ -35,9 +35,11 @@ CASES = {
     "tutorial": "the tutorial's loop as written: one robot, one process",
     "tutorial, a process a core": "the tutorial's loop, one robot in each of the processes",
     "drive, a scene a robot": "internal drive, no control, one PhysX system to a robot, all stepped in turn",
-    "bare engine": "internal drive, no control, no gravity, packed scenes, all stepped in turn",
+    "bare engine, packs of 8": "internal drive, no control, no gravity, 8 robots to a system, all stepped in turn",
+    "bare engine": "the same, 4 robots to a system, as the Runner packs them",
     "bare engine, pack by pack": "the same, each pack stepped for a tick while it is in the cache",
-    "closed loop": "the Runner: PID with gravity and Coriolis compensation at every sim step",
+    "closed loop, tick by tick": "PID, gravity and Coriolis compensation at every sim step: Runner.step, tick by tick",
+    "closed loop": "the same by Runner.rollout: as all of the above, the workers never wait for each other",
 }
 PHASES = {
     "read": ("read_qpos", "read_qvel"),
@@ -141,8 +143,8 @@ def compare(
                     progress(case)
                     if case in others:
                         seconds, steps, final[case] = run_peer(others[case], setup)
-                    elif case == "closed loop":
-                        seconds, steps, final[case] = _run_closed_loop(runner, setup)
+                    elif case.startswith("closed loop"):
+                        seconds, steps, final[case] = run_closed_loop(case, runner, setup)
                     else:
                         taken = hands[:1] if case == "tutorial" else hands
                         seconds, steps, final[case] = run_by_hand(case, taken, setup)
@@ -161,22 +163,22 @@ def phases(setup: Setup) -> dict[str, float]:
     """Microseconds per env step that each phase of the closed loop takes, in one process with a worker's share.
 
     "control" is all that is not a call on the engine. The clock's own calls are in the figures: they add about one
-    percent. "waiting" is what a tick takes beyond the work of the slower worker, measured on a Runner.
+    percent. "waiting" is what a tick of :meth:`Runner.step` takes beyond the work of a worker, on average.
     """
     share = max(1, setup.num_envs // max(setup.workers, 1))
     spec = LoopSpec(
         setup.scene(gravity=True), share, Robot.load(setup.robot.path, dissipation="sapien").params()
     )
-    layout = Arrays.layout(share, setup.robot.dof).items()
-    arrays = Arrays(**{name: np.zeros(shape, dtype) for name, (shape, dtype) in layout})
-    loop = Loop(spec, arrays)
+    layout = Arrays.layout(1, share, setup.robot.dof).items()
+    fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout}
+    loop = Loop(spec, Arrays.of_ticks(fields, slice(0, share)))
     clocks = [_Clock(cell) for cell in loop.cells]
     everyone, still = np.ones(share, bool), np.zeros((share, setup.robot.dof))
     loop.reset(everyone, np.tile(setup.start, (share, 1)), still)
-    arrays.setpoint[...] = setup.target
+    loop.ticks[0].setpoint[...] = setup.target
     for clock in clocks:
         clock.seconds.clear()
-    total = sum(loop.tick(setup.substeps, False, False) for _ in range(setup.ticks))
+    total = sum(loop.run(1, setup.substeps, False, False) for _ in range(setup.ticks))
     loop.close()
     steps = setup.ticks * setup.substeps * share
     spent = {
@@ -203,13 +205,17 @@ def _waiting(setup: Setup) -> float:
     return idle / (setup.ticks * setup.substeps * setup.num_envs / max(setup.workers, 1))
 
 
-def _run_closed_loop(runner: Runner, setup: Setup) -> tuple[float, int, Float64]:
+def run_closed_loop(case: str, runner: Runner, setup: Setup) -> tuple[float, int, Float64]:
+    """Run one round of ``case`` on ``runner``: (seconds, env-steps, where the first env ended)."""
     runner.reset(setup.start)
     began = time.perf_counter()
-    for _ in range(setup.ticks):
-        obs = runner.step(setup.target)
+    if case == "closed loop":
+        final = runner.rollout(np.broadcast_to(setup.target, (setup.ticks, setup.robot.dof))).qpos[-1]
+    else:
+        for _ in range(setup.ticks):
+            final = runner.step(setup.target).qpos
     seconds = time.perf_counter() - began
-    return seconds, setup.num_envs * setup.ticks * setup.substeps, obs.qpos[0].astype(np.float64)
+    return seconds, setup.num_envs * setup.ticks * setup.substeps, final[0].astype(np.float64)
 
 
 def check_motion(case: str, place: Float64, setup: Setup) -> None:

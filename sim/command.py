@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,33 +54,28 @@ class Call(Command):
 
 
 @dataclass(frozen=True)
-class Tick(Command):
-    """Run a tick. The arrays are (envs, dof)."""
+class Run(Command):
+    """Run ticks under setpoints, their rates and feedforwards, (ticks, envs, dof) each; the latter two may be None."""
 
-    setpoint: NDArray[np.float64]
-    setpoint_rate: NDArray[np.float64] | None
-    feedforward: NDArray[np.float64] | None
+    commands: tuple[NDArray[np.float64] | None, ...]
+    ticks: int
     substeps: int
 
-    idle_limit = 0.7  # a tick does nothing but compute
+    idle_limit = 0.7  # ticks do nothing but compute
 
     def send(self, worker: Worker, envs: slice) -> None:
         """Ask ``worker``, whose envs are ``envs``."""
-        arrays = worker.arrays
-        arrays.setpoint[...] = self.setpoint[envs]
-        if self.setpoint_rate is not None:
-            arrays.setpoint_rate[...] = self.setpoint_rate[envs]
-        if self.feedforward is not None:
-            arrays.feedforward[...] = self.feedforward[envs]
-        worker.send_tick(self.substeps, self.setpoint_rate is not None, self.feedforward is not None)
+        for name, rows in zip(("setpoint", "setpoint_rate", "feedforward"), self.commands, strict=True):
+            if rows is not None:
+                for tick, row in zip(worker.ticks, rows, strict=False):
+                    getattr(tick, name)[...] = row[envs]
+        _, rate, feedforward = self.commands
+        worker.send_run(self.ticks, self.substeps, rate is not None, feedforward is not None)
 
     def limit(self, envs: int) -> float:
         """Seconds that it takes for so many envs at the very most: a sim step of one takes some 20 us."""
-        return 1e-3 * self.substeps * envs
+        return 1e-3 * self.ticks * self.substeps * envs
 
-    def kept(self) -> Tick:
+    def kept(self) -> Run:
         """Copy of it, which stays as it is when the caller writes to the arrays."""
-        rate, feedforward = (
-            None if rows is None else rows.copy() for rows in (self.setpoint_rate, self.feedforward)
-        )
-        return Tick(self.setpoint.copy(), rate, feedforward, self.substeps)
+        return replace(self, commands=tuple(None if rows is None else rows.copy() for rows in self.commands))

@@ -22,8 +22,13 @@ if TYPE_CHECKING:
     from .benchmark import Setup
 
 Float64 = NDArray[np.float64]
-PACK = 4
-"""Scenes to a PhysX system in the bare engine's packed cases, as in the Runner: the fastest of 1, 2, 4, 8 and 16."""
+ENGINES = {
+    # case: (scenes to a PhysX system, whether all systems are stepped in turn)
+    "drive, a scene a robot": (1, True),
+    "bare engine, packs of 8": (8, True),
+    "bare engine": (4, True),  # as in the Runner: the fastest of 1, 2, 4, 8 and 16
+    "bare engine, pack by pack": (4, False),
+}
 
 
 def run_by_hand(case: str, hands: Sequence[Hand], setup: Setup) -> tuple[float, int, Float64]:
@@ -122,8 +127,7 @@ class _Engine:
     def __init__(self, case: str, setup: Setup, share: int) -> None:
         assert setup.robot.settings is not None
         spec = setup.scene(gravity=False)
-        size = 1 if case == "drive, a scene a robot" else PACK
-        self._in_turn = case != "bare engine, pack by pack"
+        size, self._in_turn = ENGINES[case]
         self._substeps = setup.substeps
         builder = parse(spec)
         sizes = [min(size, share - first) for first in range(0, share, size)]

@@ -1,7 +1,7 @@
 """The closed loop over some packs of scenes: read, compensate, control, write, step.
 
-The same code runs in a worker process and in the caller's. A pack runs all its substeps before the next pack, so
-that its working set stays in the cache; nothing depends on how envs are grouped.
+The same code runs in a worker process and in the caller's. A cell of envs runs all its substeps before the next
+cell, so that its working set stays in the cache; nothing depends on how envs are grouped.
 """
 
 from __future__ import annotations
@@ -48,10 +48,14 @@ class LoopSpec:
 
 
 class Loop:
-    """The closed loop of ``spec.num_envs`` robots, which it builds. ``arrays`` is where it reads and writes."""
+    """The closed loop of ``spec.num_envs`` robots, which it builds.
 
-    def __init__(self, spec: LoopSpec, arrays: Arrays) -> None:
-        self.spec, self.arrays = spec, arrays
+    ``ticks`` is where it reads and writes, for each of the ticks that it may be told to run at once. What it does
+    between ticks it tells in the first.
+    """
+
+    def __init__(self, spec: LoopSpec, ticks: list[Arrays]) -> None:
+        self.spec, self.ticks = spec, ticks
         self._builder = parse(spec.scene)
         self._steps = 0
         size = max(IN_STEP // spec.pack_size, 1) * spec.pack_size
@@ -85,27 +89,28 @@ class Loop:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
         for cell in self.cells:
             cell.reset(mask[cell.envs], qpos[cell.envs], qvel[cell.envs], self._steps)
-            cell.observe(self.arrays.rows(cell.envs))
+            cell.observe(self.ticks[0].rows(cell.envs))
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
         for cell in self.cells:
             cell.set_params(params.for_envs(cell.envs))
 
-    def tick(self, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
-        """Run ``substeps`` sim steps under the commands in ``arrays``; returns the seconds it took."""
+    def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
+        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; returns the seconds it took."""
         began = time.perf_counter()
         for cell in self.cells:
-            rows = self.arrays.rows(cell.envs)
-            cell.run(
-                self._steps,
-                substeps,
-                rows.setpoint,
-                rows.setpoint_rate if use_rate else None,
-                rows.feedforward if use_feedforward else None,
-            )
-            cell.observe(rows)
-        self._steps += substeps
+            for done, tick in enumerate(self.ticks[:ticks]):
+                rows = tick.rows(cell.envs)
+                cell.run(
+                    self._steps + done * substeps,
+                    substeps,
+                    rows.setpoint,
+                    rows.setpoint_rate if use_rate else None,
+                    rows.feedforward if use_feedforward else None,
+                )
+                cell.observe(rows)
+        self._steps += ticks * substeps
         return time.perf_counter() - began
 
     def snapshot(self) -> EnvStates:
@@ -120,7 +125,7 @@ class Loop:
         self.set_params(snapshot.params)
         self._place(snapshot.states)
         for cell in self.cells:
-            cell.observe(self.arrays.rows(cell.envs))
+            cell.observe(self.ticks[0].rows(cell.envs))
 
     def _place(self, states: EnvStates) -> None:
         # The engine's contact caches, and the order in which it solves contacts, depend on its past. Only a new

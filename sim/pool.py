@@ -20,7 +20,7 @@ from typing import Any
 from batchpid.errors import BatchPIDError, WorkerError
 
 from .arrays import Arrays
-from .command import Command, Start, Tick, Worker
+from .command import Command, Run, Start, Worker
 from .loop import LoopSpec
 from .shared import SharedArrays
 from .worker import LocalWorker, ProcessWorker, WorkerLost
@@ -56,6 +56,8 @@ class WorkerPool:
     ----------
     spec
         For a slice of envs, the spec of their loop.
+    ticks
+        How many ticks one command may run.
     recover
         Whether lost workers are brought back. Otherwise the loss is raised, and the pool is closed.
     timeout
@@ -69,6 +71,7 @@ class WorkerPool:
         count: int,
         pack_size: int,
         *,
+        ticks: int = 1,
         recover: bool,
         timeout: float,
     ) -> None:
@@ -82,9 +85,9 @@ class WorkerPool:
         self.recoveries = 0
         """How many lost workers were replaced."""
         dof = len(spec(slice(0, num_envs)).scene.joints)
-        self._shared = SharedArrays(Arrays.layout(num_envs, dof))
-        self.arrays = Arrays(**self._shared.arrays)
-        """What goes in and out, over all envs; each worker has its rows of it."""
+        self._shared = SharedArrays(Arrays.layout(ticks, num_envs, dof))
+        self.ticks = Arrays.of_ticks(self._shared.arrays, slice(0, num_envs))
+        """What goes in and out, over all envs, for each tick of a command; each worker has its rows of it."""
         try:
             for index, envs in enumerate(_share(num_envs, count, pack_size)):
                 seat = _Seat(spec(envs), index, envs, self._kind(spec(envs), index, self._shared))
@@ -122,7 +125,7 @@ class WorkerPool:
             seat.queue.append(command)
         self._kept = keep
         if keep and self._recover:
-            self._journal.append(command.kept() if isinstance(command, Tick) else command)
+            self._journal.append(command.kept() if isinstance(command, Run) else command)
         try:
             self._finish()
         except Exception as error:

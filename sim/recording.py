@@ -36,6 +36,7 @@ from .arguments import integer
 if TYPE_CHECKING:
     import h5py
 
+    from .observation import Observation
     from .runner import Runner
 
 FORMAT = "batchpid-recording-1"
@@ -108,10 +109,9 @@ class Recorder:
         self._writer.start()
         runner.recorder = self
 
-    def append(self, setpoint: NDArray[Any]) -> None:
-        """Record the runner's present state, reached under ``setpoint`` (envs, dof). The runner calls it."""
-        runner = self._runner
-        row = (runner.time, np.array(setpoint), *runner.observe())
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof). The runner calls it."""
+        row = (time_, np.array(setpoint), *observation)
         with self._wake:
             while self._error is None and (self._bytes > _BUFFER or time.monotonic() - self._since > _LAG):
                 self._wake.wait()

@@ -17,7 +17,8 @@ import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
 
 from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
-from .command import Call, Tick, Worker
+from .arrays import Arrays
+from .command import Call, Run, Worker
 from .control import CONTROLS, check_params, default_params
 from .faults import ACTIONS, Fault, FaultLog
 from .limits import LimitWatch
@@ -36,6 +37,7 @@ Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 _FAR = 1e6  # rad or m, and per second
+_AHEAD = 8000  # sim steps of envs that a worker of a rollout is sent at once: a fifth of a second
 
 
 class Runner:
@@ -181,7 +183,7 @@ class Runner:
         self.recorder: Recorder | None = None
         """What records every tick; :class:`sim.Recorder` sets it."""
         self.work_seconds = np.zeros(0)
-        """Seconds that each worker worked in the last tick."""
+        """Seconds that each worker worked in the last tick; in a rollout, the mean of those it did at a time."""
         self._about = {
             "robot": robot.name,
             "urdf": hashlib.sha256(robot.urdf.encode()).hexdigest(),
@@ -226,7 +228,17 @@ class Runner:
                 )
             recover, self._checkpoint_steps = False, None
         first_params = self._params
-        self._pool = WorkerPool(spec, self.num_envs, count, pack_size, recover=recover, timeout=timeout)
+        share = -(-self.num_envs // max(count, 1))
+        self._pool = WorkerPool(
+            spec,
+            self.num_envs,
+            count,
+            pack_size,
+            ticks=max(1, _AHEAD // (self.substeps * share)),
+            recover=recover,
+            timeout=timeout,
+        )
+        self._last = 0  # which of the pool's ticks is the present
         try:
             self.reset()
         except BaseException:
@@ -253,9 +265,10 @@ class Runner:
         velocity = self._within("qvel", self._rows("qvel", 0.0 if qvel is None else qvel))
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
         self._limits.check("qpos", position[chosen])
+        self._last = 0
         pool.run(Call("reset", (chosen, position, velocity)))
         self._faults.forget(chosen)
-        self._faults.note(pool.arrays)
+        self._faults.note(pool.ticks[0])
         return self.observe()
 
     def step(
@@ -286,7 +299,7 @@ class Runner:
         extra = None if feedforward is None else self._rows("feedforward", feedforward)
         if self.control != "effort":
             self._limits.check("setpoint", target)
-        self._tick(target, rate, extra, count)
+        self._run(tuple(None if rows is None else rows[None] for rows in (target, rate, extra)), 1, count)
         return self.observe()
 
     def rollout(
@@ -340,21 +353,20 @@ class Runner:
             saturated=np.empty(shape, np.bool_),
             ok=np.empty(shape[:2], np.bool_),
         )
+        done = 0
         for tick in range(ticks) if progress is None else progress(range(ticks)):
-            self._tick(
-                targets[tick],
-                None if rates is None else rates[tick],
-                None if extras is None else extras[tick],
-                self.substeps,
-            )
-            for name in Observation._fields:
-                getattr(result, name)[tick] = getattr(pool.arrays, name)
+            if tick == done:  # a tick for which no worker has been sent ahead
+                done = min(ticks, tick + self._room())
+                commands = (None if rows is None else rows[tick:done] for rows in (targets, rates, extras))
+                self._run(tuple(commands), done - tick, self.substeps)
+                for row, arrays in zip(range(tick, done), pool.ticks, strict=False):
+                    for name in Observation._fields:
+                        getattr(result, name)[row] = getattr(arrays, name)
         return result
 
     def observe(self) -> Observation:
         """State of every env now, as fresh arrays."""
-        pool = self._open()
-        return Observation(*(getattr(pool.arrays, name).copy() for name in Observation._fields))
+        return self._observe(self._open().ticks[self._last])
 
     def poses(self) -> Float32:
         """Poses now of the entities that ``build`` returned, (envs, entities, 7): x, y, z [m], quaternion w, x, y, z.
@@ -414,6 +426,7 @@ class Runner:
             )
         snapshot.check(self._about)
         check_params(snapshot.params, self.robot, self.num_envs, self.control)
+        self._last = 0
         pool.run(Call("restore", (snapshot,)))
         self._steps, self._params = snapshot.steps, snapshot.params
         self._faults.restore(snapshot.states.containment["step"])
@@ -464,22 +477,33 @@ class Runner:
 
     # -- inside --------------------------------------------------------------------------------------------------
 
-    def _tick(
-        self,
-        setpoint: NDArray[np.float64],
-        rate: NDArray[np.float64] | None,
-        feedforward: NDArray[np.float64] | None,
-        substeps: int,
-    ) -> None:
-        pool = self._open()
+    def _run(self, commands: tuple[NDArray[np.float64] | None, ...], ticks: int, substeps: int) -> None:
+        """Run ticks under setpoints, their rates and feedforwards (ticks, envs, dof)."""
+        pool, setpoint = self._open(), commands[0]
+        assert setpoint is not None
         if self._checkpoint_steps is not None and self._since_checkpoint >= self._checkpoint_steps:
             self.snapshot()
-        self._steps += substeps
-        self._since_checkpoint += substeps
-        self.work_seconds = np.array(pool.run(Tick(setpoint, rate, feedforward, substeps)))
-        self._faults.note(pool.arrays)
-        if self.recorder is not None:
-            self.recorder.append(setpoint)
+        before, self._steps = self._steps, self._steps + ticks * substeps
+        self._since_checkpoint += ticks * substeps
+        self._last = ticks - 1
+        self.work_seconds = np.array(pool.run(Run(commands, ticks, substeps))) / ticks
+        for done, arrays in enumerate(pool.ticks[:ticks], start=1):
+            self._faults.note(arrays)
+            if self.recorder is not None:
+                time = (before + done * substeps) * self.timestep
+                self.recorder.append(time, setpoint[done - 1], self._observe(arrays))
+
+    def _room(self) -> int:
+        """How many ticks the workers can be sent at once: no more than up to the next checkpoint."""
+        room = len(self._open().ticks)
+        if self._checkpoint_steps is None:
+            return room
+        left = self._checkpoint_steps - self._since_checkpoint % self._checkpoint_steps
+        return min(room, -(-left // self.substeps))
+
+    @staticmethod
+    def _observe(arrays: Arrays) -> Observation:
+        return Observation(*(getattr(arrays, name).copy() for name in Observation._fields))
 
     def _refuse_variation(self) -> None:
         if self._varies:

@@ -16,11 +16,16 @@ from numpy.typing import NDArray
 _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
-class SharedArrays:
-    """Named arrays of given ``layout`` (name -> (shape, dtype)) in one block of shared memory."""
+Layout = dict[str, tuple[tuple[int, ...], Any]]
+"""Name -> (shape, dtype)."""
 
-    def __init__(self, layout: dict[str, tuple[tuple[int, ...], Any]], fd: int | None = None) -> None:
+
+class SharedArrays:
+    """Named arrays of given ``layout`` in one block of shared memory."""
+
+    def __init__(self, layout: Layout, fd: int | None = None) -> None:
         """Make a new block, or with ``fd`` map an existing one of the same layout."""
+        self.layout = layout
         offsets, size = {}, 0
         for name, (shape, dtype) in layout.items():
             offsets[name] = size

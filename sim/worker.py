@@ -33,9 +33,9 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 from .arrays import Arrays
 from .liveness import Pulse
 from .loop import Loop, LoopSpec
-from .shared import SharedArrays
+from .shared import Layout, SharedArrays
 
-TICK = struct.Struct("<cI??")  # b"T", substeps, use_rate, use_feedforward
+TICK = struct.Struct("<cII??")  # b"T", ticks, substeps, use_rate, use_feedforward
 DONE = struct.Struct("<cd")  # b"D", seconds of work
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -51,17 +51,17 @@ class LocalWorker:
 
     def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
         self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        self.arrays = Arrays(**shared.arrays).rows(slice(self.envs.start, self.envs.stop))
-        self._loop = Loop(spec, self.arrays)
+        self.ticks = Arrays.of_ticks(shared.arrays, slice(self.envs.start, self.envs.stop))
+        self._loop = Loop(spec, self.ticks)
         self._result: Any = None
 
     def send(self, method: str, *args: Any) -> None:
         """Call ``method`` of the loop; :meth:`receive` gives its result."""
         self._result = getattr(self._loop, method)(*args)
 
-    def send_tick(self, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
-        """Run one tick; :meth:`receive` gives the seconds it took."""
-        self._result = self._loop.tick(substeps, use_rate, use_feedforward)
+    def send_run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
+        """Run so many ticks; :meth:`receive` gives the seconds they took."""
+        self._result = self._loop.run(ticks, substeps, use_rate, use_feedforward)
 
     def receive(self) -> Any:
         """Result of the last request."""
@@ -80,9 +80,9 @@ class ProcessWorker:
 
     def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
         self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        message = _pickle((spec, len(shared.arrays["ok"])))
+        message = _pickle((spec, shared.layout))
         self._owner = os.getpid()
-        self.arrays = Arrays(**shared.arrays).rows(slice(self.envs.start, self.envs.stop))
+        self.ticks = Arrays.of_ticks(shared.arrays, slice(self.envs.start, self.envs.stop))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         ours, theirs = socket.socketpair()
         descriptors = (theirs.fileno(), shared.fd, self._trace)
@@ -119,9 +119,9 @@ class ProcessWorker:
         """Ask for ``loop.method(*args)``."""
         self._send(pickle.dumps((method, args)))
 
-    def send_tick(self, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
-        """Ask for one tick; its result is the seconds it took."""
-        self._send(TICK.pack(b"T", substeps, use_rate, use_feedforward))
+    def send_run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
+        """Ask for so many ticks; the result is the seconds they took."""
+        self._send(TICK.pack(b"T", ticks, substeps, use_rate, use_feedforward))
 
     def receive(self) -> Any:
         """Wait for the result of the last request.
@@ -223,10 +223,9 @@ def main() -> None:
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     connection = Connection(channel)
     try:
-        spec, num_envs = connection.recv()
-        layout = Arrays.layout(num_envs, len(spec.scene.joints))
-        arrays = Arrays(**SharedArrays(layout, memory).arrays)
-        _serve(connection, spec, arrays.rows(slice(spec.first_env, spec.first_env + spec.num_envs)))
+        spec, layout = connection.recv()
+        envs = slice(spec.first_env, spec.first_env + spec.num_envs)
+        _serve(connection, spec, Arrays.of_ticks(SharedArrays(layout, memory).arrays, envs))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent closed, or died
     os._exit(0)  # nothing is left to save, and the engine's own end can take long
@@ -245,9 +244,9 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _serve(connection: Connection, spec: LoopSpec, arrays: Arrays) -> None:
+def _serve(connection: Connection, spec: LoopSpec, ticks: list[Arrays]) -> None:
     try:
-        loop = Loop(spec, arrays)
+        loop = Loop(spec, ticks)
     except Exception as error:
         connection.send((None, _portable(error)))
         return
@@ -260,8 +259,7 @@ def _serve(connection: Connection, spec: LoopSpec, arrays: Arrays) -> None:
         message = connection.recv_bytes()
         try:
             if message[:1] == b"T":
-                _, substeps, use_rate, use_feedforward = TICK.unpack(message)
-                connection.send_bytes(DONE.pack(b"D", loop.tick(substeps, use_rate, use_feedforward)))
+                connection.send_bytes(DONE.pack(b"D", loop.run(*TICK.unpack(message)[1:])))
             else:
                 method, args = pickle.loads(message)
                 connection.send((getattr(loop, method)(*args), None))
@@ -271,8 +269,8 @@ def _serve(connection: Connection, spec: LoopSpec, arrays: Arrays) -> None:
             connection.send((None, _portable(error)))
 
 
-def _pickle(spec: tuple[LoopSpec, int]) -> bytes:
-    """The spec and the number of all envs; cloudpickle takes along a function that the worker cannot import."""
+def _pickle(spec: tuple[LoopSpec, Layout]) -> bytes:
+    """Spec and layout of the shared arrays; cloudpickle takes along a function that the worker cannot import."""
     try:
         return cloudpickle.dumps(spec)
     except Exception as error:

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from sim import Robot, Runner
+from sim import FaultWarning, Robot, Runner
 
 TICKS = 100  # of 20 sim steps: 1 s
 
@@ -80,6 +80,33 @@ def test_rollout_equals_steps():
     for name in reference()._fields:
         assert getattr(rollout, name)[-1].tobytes() == getattr(reference(), name).tobytes(), name
     assert rollout.time[-1] == pytest.approx(TICKS * 20 / 2000)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_ticks_sent_at_once_are_the_same_as_one_by_one(workers):
+    """With checkpoints amid them, an env that fails, rates and feedforwards."""
+    model, ticks, envs = robot("panda"), 57, 8
+    noise = np.random.default_rng(1).uniform(-0.05, 0.05, (3, ticks, envs, model.dof))
+    setpoints = np.clip(model.settings.target + noise[0], model.lower, model.upper)
+    setpoints[20, 3, 2] = np.nan
+    options = {"workers": workers, "substeps": 3, "checkpoint_steps": 100, "non_finite": "contain"}
+    options |= {"on_fault": "reset"}
+    with Runner(model, envs, **options) as runner, Runner(model, envs, **options) as other:
+        assert len(runner._pool.ticks) > ticks
+        with pytest.warns(FaultWarning):
+            rollout = runner.rollout(setpoints, setpoint_rates=noise[1], feedforwards=noise[2])
+        with pytest.warns(FaultWarning):
+            steps = [
+                other.step(setpoint, setpoint_rate=rate, feedforward=extra)
+                for setpoint, rate, extra in zip(setpoints, noise[1], noise[2], strict=True)
+            ]
+        assert runner.time == other.time
+        assert list(runner.faults) == list(other.faults)
+        assert len(runner.faults) == 1
+        for name, now in runner.observe()._asdict().items():
+            assert now.tobytes() == getattr(steps[-1], name).tobytes()
+    for name in steps[0]._fields:
+        assert getattr(rollout, name).tobytes() == np.stack([getattr(step, name) for step in steps]).tobytes()
 
 
 def test_masked_reset_leaves_the_others_alone():

@@ -120,7 +120,7 @@ def test_asleep_amid_a_tick_and_told_where():
         if env == 4:
             lock = threads.Lock()
             lock.acquire()
-            sim.loop.Loop.tick = lambda *_: lock.acquire()
+            sim.loop.Loop.run = lambda *_: lock.acquire()
 
     with (
         make(recover=False, build=build) as runner,
@@ -140,7 +140,7 @@ def test_too_slow_for_the_timeout():
             while True:
                 pass
 
-        sim.loop.Loop.tick = endless
+        sim.loop.Loop.run = endless
 
     with (
         make(recover=False, build=build, timeout=0.5) as runner,
@@ -202,7 +202,7 @@ def test_what_kills_every_worker_is_not_tried_for_ever(monkeypatch):
         def crash(*_):
             os.kill(os.getpid(), signal.SIGSEGV)
 
-        sim.loop.Loop.tick = crash
+        sim.loop.Loop.run = crash
 
     with (
         make(build=build) as runner,
@@ -218,7 +218,7 @@ def test_what_a_loop_raises_comes_with_its_traceback():
         def explode(*_):
             raise ZeroDivisionError("what the worker said")
 
-        sim.loop.Loop.tick = explode
+        sim.loop.Loop.run = explode
 
     with (
         make(build=build) as runner,
