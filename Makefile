@@ -22,7 +22,7 @@ demo: $(VENV)/.base
 	@$(RUN) -m batchpid demo $(ARGS)
 
 test: $(VENV)/.dev
-	@$(RUN) -m pytest $(ARGS)
+	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 check: $(VENV)/.dev
 	$(RUN) -m ruff check .
