@@ -18,7 +18,7 @@ from .scenes import Pack, SceneSpec, probe
 Float64 = NDArray[np.float64]
 
 INERTIA_EVERY = 4
-"""Sim steps for which a mass matrix is kept within a tick."""
+"""Sim steps after which the mass matrix is taken anew within a tick, here and where the robot will be by then."""
 
 
 class Control:
@@ -87,7 +87,11 @@ class PIDControl(Control):
 
 
 class InertiaPIDControl(PIDControl):
-    """As :class:`PIDControl`, with gains per unit of inertia; the mass matrix is kept for some sim steps.
+    """As :class:`PIDControl`, with gains per unit of inertia.
+
+    The mass matrix is interpolated between that of the present pose and that of the pose some sim steps ahead, at the
+    present velocity. Keeping one matrix so long would not do: where axes are nearly in line its inverse changes by a
+    tenth within 10 mrad.
 
     With the whole matrix M the joints' own viscous damping B is made up for as well. The engine takes it
     implicitly, (M + dt B) (v+ - v) = dt (u - B v), so u = (M + dt B) a + B v gives exactly v+ = v + dt a.
@@ -106,11 +110,13 @@ class InertiaPIDControl(PIDControl):
     ) -> Float64 | None:
         """Advance the law by one sim step."""
         if step % INERTIA_EVERY == 0:
-            # Where the robot will be half-way through these steps: old and new pose are off by half as much.
-            ahead = 0.5 * (INERTIA_EVERY - 1) * self.dt
-            self._matrix = self._mass_matrix(qpos + ahead * pack.read_qvel())
+            self._matrix = self._mass_matrix(qpos)
+            ahead = self._mass_matrix(qpos + INERTIA_EVERY * self.dt * pack.read_qvel())
+            self._change = (ahead - self._matrix) / INERTIA_EVERY
             if self._damping is not None:
                 self._matrix += self.dt * np.diag(self._damping)
+        else:
+            self._matrix += self._change
         qvel = pack.read_qvel() if self._measurement_rate or self._damping is not None else None
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel

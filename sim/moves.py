@@ -1,7 +1,7 @@
 r"""Moves to judge gains by: seeded, free of contact, with the fastest that the effort limits allow.
 
 A move is a step of the setpoint from rest at ``start`` to ``target``. The straight line between them, which good gains
-follow, is tested for contact. On that line q(z) = start + z (target - start) all joints move in step, so that the
+follow, is tested for contact, and on for the overshoot that a good move may have. On that line q(z) = start + z (target - start) all joints move in step, so that the
 effort of a motion z(t) in time T is gravity(q) + h / T^2, with h from the inverse dynamics of the same motion in unit
 time. The shortest bang-bang motion, accelerating up to half the way and braking from there, has in closed form::
 
@@ -25,6 +25,8 @@ from .robot import Robot
 Float64 = NDArray[np.float64]
 KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
+OVERSHOOT = 0.05
+"""Overshoot of a good move at most, as a fraction of it."""
 _LINE = 24
 _EDGE = 0.02
 _NEARBY = 0.3
@@ -67,7 +69,7 @@ def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
 
 
 def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:
-    """``count`` seeded moves within the joint limits, free of contact on the straight line.
+    """``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
     whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0.
@@ -85,7 +87,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     starts: list[Float64] = []
     targets: list[Float64] = []
     names: list[str] = []
-    line = np.linspace(0, 1, _LINE)[:, None]
+    line = np.linspace(0, 1 + OVERSHOOT, _LINE)[:, None]
     for _ in range(200 * count + 200):
         if len(starts) == count:
             break

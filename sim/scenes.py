@@ -79,7 +79,32 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
         raise RobotError(
             "the URDF does not describe one articulated robot; it needs at least one moving joint"
         )
+    _part(builders[0])
     return builders[0]
+
+
+def _part(builder: ArticulationBuilder) -> None:
+    """Let links that fixed joints tie together not touch: they cannot move apart, and the solver would shake them.
+
+    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit of
+    the third word never touch; one that no pair of the .srdf uses is given to each such group, while there are any.
+    """
+    body: dict[str, str] = {}
+    groups: dict[str, list[Any]] = {}
+    for link in builder.link_builders:
+        tied = link.parent is not None and link.joint_record.joint_type == "fixed"
+        body[link.name] = body[link.parent.name] if tied else link.name
+        groups.setdefault(body[link.name], []).append(link)
+    used = 0
+    for link in builder.link_builders:
+        used |= link.collision_groups[2]
+    free = (1 << bit for bit in range(32) if not used >> bit & 1)
+    for links in groups.values():
+        solid = [link for link in links if link.collision_records]
+        if len(links) > 2 and len(solid) > 1:
+            bit = next(free, 0)
+            for link in solid:
+                link.collision_groups[2] |= bit
 
 
 @contextmanager

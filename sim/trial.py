@@ -12,7 +12,7 @@ import batchpid as bp
 from batchpid.metrics import StepMetrics, step_metrics
 
 from .limits import SetpointWarning
-from .moves import Moves, fastest, smooth_effort
+from .moves import OVERSHOOT, Moves, fastest, smooth_effort
 from .observation import Rollout
 from .robot import Robot
 from .runner import Runner
@@ -45,7 +45,7 @@ class Trial(NamedTuple):
         """
         demands = (
             ("settling time", self.metrics.settling_time / self.allowed[:, None], 1.0),
-            ("overshoot", self.metrics.overshoot, 0.05),
+            ("overshoot", self.metrics.overshoot, OVERSHOOT),
             ("steady-state error", self.metrics.steady_state_error, 1e-3),
             ("chatter", self.chatter, 2.0),
         )

@@ -196,6 +196,24 @@ def test_a_mimic_is_kept_only_where_sapien_gets_it_right(multiplier, offset, wor
         np.testing.assert_allclose(qpos, [0.5, 0.0], atol=0.02)
 
 
+def test_links_tied_by_fixed_joints_do_not_push_each_other(tmp_path):
+    """A hand that dips into the arm beyond its flange: the engine would find contact there at every step."""
+    box = INERTIAL + '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
+    parts = [link("base"), link("arm", box), link("flange"), link("hand", box), link("finger", box)]
+    chain = [
+        HINGE,
+        joint("mount", "arm", "flange", "fixed", "", "0 0 0.1"),
+        joint("grip", "flange", "hand", "fixed", "", "0 0 0"),
+        joint("close", "hand", "finger", origin="0 0 0.25"),
+    ]
+    arm = Robot.load(write(tmp_path, robot(*parts, *chain)))
+    with Runner(arm, 1, workers=0, control="effort", substeps=400, ground=False) as runner:
+        runner.reset(np.array([0.3, 0.0]))
+        still = runner.step(np.zeros(2))
+    np.testing.assert_allclose(still.qpos, [[0.3, 0.0]], atol=1e-5)
+    assert arm.probe().touches(np.array([[0.3, 0.0]])).tolist() == [False]
+
+
 def test_building_writes_no_file(tmp_path, monkeypatch):
     """So that a killed worker leaves none behind, and a full disk stops none."""
     text = one_joint().replace("hinge", "Ellbogengelenk für die Übung")
