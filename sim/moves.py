@@ -1,9 +1,10 @@
 r"""Moves to judge gains by: seeded, free of contact, with the fastest that the effort limits allow.
 
 A move is a step of the setpoint from rest at ``start`` to ``target``. The straight line between them, which good gains
-follow, is tested for contact, and on for the overshoot that a good move may have. On that line q(z) = start + z (target - start) all joints move in step, so that the
-effort of a motion z(t) in time T is gravity(q) + h / T^2, with h from the inverse dynamics of the same motion in unit
-time. The shortest bang-bang motion, accelerating up to half the way and braking from there, has in closed form::
+follow, is tested for contact, and so is what lies beyond it by as much as a good move may overshoot. On that line
+q(z) = start + z (target - start) all joints move in step, so that the effort of a motion z(t) in time T is
+gravity(q) + h / T^2, with h from the inverse dynamics of the same motion in unit time. The shortest bang-bang motion,
+accelerating up to half the way and braking from there, has in closed form::
 
     T^2 = max over joints and line of |h_j| / (limit_j -+ gravity_j)
 
@@ -66,6 +67,14 @@ def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
     others = Moves(starts, np.tile(target, (64, 1)), ("near the tutorial's",) * 64)
     hardest = np.argsort(fastest(robot, others))[::-1][:nearby]
     return move + Moves(others.start[hardest], others.target[hardest], others.names[:nearby])
+
+
+def hardest_move(robot: Robot, seed: int = 0) -> Moves:
+    """Of 32 seeded random moves, the one that needs most time under the effort limits, of those that can be made."""
+    moves = random_moves(robot, 32, seed)
+    duration = fastest(robot, moves)
+    hardest = int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))
+    return Moves(moves.start[[hardest]], moves.target[[hardest]], (f"{moves.names[hardest]}, hardest of 32",))
 
 
 def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:

@@ -86,8 +86,8 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
 def _part(builder: ArticulationBuilder) -> None:
     """Let links that fixed joints tie together not touch: they cannot move apart, and the solver would shake them.
 
-    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit of
-    the third word never touch; one that no pair of the .srdf uses is given to each such group, while there are any.
+    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit
+    of the third word never touch; each such group is given one that no pair of the .srdf uses, while there are any.
     """
     body: dict[str, str] = {}
     groups: dict[str, list[Any]] = {}
