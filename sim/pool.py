@@ -33,7 +33,7 @@ class RecoveryWarning(UserWarning):
     """A worker was lost and brought back."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Seat:
     """The place of one worker: its envs, what it has to do, and how far it is with the first of that."""
 
