@@ -71,6 +71,10 @@ class ClosedError(BatchPIDError, RuntimeError):
     """The object was closed before this call."""
 
 
+class InUseError(BatchPIDError, RuntimeError):
+    """The object is at work for another caller: a thread, a signal handler, or the process this one was forked from."""
+
+
 def _rebuild(cls: type[Exception], args: tuple[Any, ...], fields: dict[str, Any]) -> Exception:
     error = cls.__new__(cls)
     error.args = args

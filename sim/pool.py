@@ -8,7 +8,10 @@ catch up while the others go on, and an interrupted wait (Ctrl-C) can be taken u
 
 from __future__ import annotations
 
+import contextlib
+import os
 import select
+import threading
 import time
 import warnings
 from collections import deque
@@ -17,7 +20,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-from batchpid.errors import BatchPIDError, WorkerError
+from batchpid.errors import BatchPIDError, ClosedError, InUseError, WorkerError
 
 from .arrays import Arrays
 from .command import Command, Run, Start, Worker
@@ -82,6 +85,8 @@ class WorkerPool:
         self._poller = select.poll()
         self._kept = True  # whether the command in hand is in the journal
         self._warning: str | None = None
+        self._closing = False
+        self._owner, self._user = os.getpid(), 0  # the process, and the thread amid a call
         self.recoveries = 0
         """How many lost workers were replaced."""
         dof = len(spec(slice(0, num_envs)).scene.joints)
@@ -101,7 +106,7 @@ class WorkerPool:
     @property
     def closed(self) -> bool:
         """Whether :meth:`close` was called, or a worker was lost for good."""
-        return not self._seats
+        return self._closing or not self._seats
 
     @property
     def workers(self) -> list[Worker]:
@@ -119,8 +124,15 @@ class WorkerPool:
             What a loop raised on purpose; nothing was changed.
         WorkerError
             A loop raised something else, or a worker was lost for good; the pool is closed.
+        InUseError
+            It is amid another command, or belongs to another process.
+        ClosedError
+            It was closed meanwhile.
         """
-        self.settle()
+        return self._alone(lambda: self._run(command, keep))
+
+    def _run(self, command: Command, keep: bool) -> list[Any]:
+        self._settle()
         for seat in self._seats:
             seat.queue.append(command)
         self._kept = keep
@@ -140,7 +152,11 @@ class WorkerPool:
         return [seat.result for seat in self._seats]
 
     def settle(self) -> None:
-        """Finish what a wait that was interrupted left unfinished."""
+        """Finish what a wait that was interrupted left unfinished; raises as :meth:`run` does."""
+        if self._user or os.getpid() != self._owner or any(seat.queue for seat in self._seats):
+            self._alone(self._settle)
+
+    def _settle(self) -> None:
         if any(seat.queue for seat in self._seats):
             try:
                 self._finish()
@@ -154,11 +170,38 @@ class WorkerPool:
             self._journal = [command]
 
     def close(self) -> None:
-        """End all workers; those amid a command at once."""
+        """End all workers; those amid a command at once, unless it is in this process: then after it."""
+        self._closing = True
+        if self._user and self._kind is LocalWorker:
+            return  # its scenes cannot be freed under its feet
         seats, self._seats = self._seats, []
         for seat in seats:
             self._dismiss(seat, patience=0.0 if seat.queue else 5.0)
         self._shared.close()
+
+    def _alone(self, act: Callable[[], Any]) -> Any:
+        """Return ``act()``, unless the pool is at work for someone else."""
+        me, mine = threading.get_ident(), False
+        try:
+            if os.getpid() != self._owner:
+                raise InUseError(
+                    f"this Runner belongs to process {self._owner}, from which this one was forked; use it there, or "
+                    "make one here"
+                )
+            if self._user:
+                raise InUseError(
+                    "this Runner is amid a call that this one interrupted; let a signal handler set a flag, or close it"
+                    if self._user == me
+                    else "this Runner is amid a call from another thread; take turns, or make one for each thread"
+                )
+            # No call from the look to here, so that neither a thread nor a signal gets in between.
+            self._user, mine = me, True
+            return act()
+        finally:
+            if mine:
+                self._user = 0
+                if self._closing:
+                    self.close()
 
     # -- one command, until every worker has done it ---------------------------------------------------------------
 
@@ -180,6 +223,8 @@ class WorkerPool:
                     if seat.phase == "busy" and seat not in answered:
                         self._attempt(seat, self._look, errors)
                 look = time.monotonic() + _LOOK
+        if self.closed:
+            raise ClosedError("this Runner was closed amid a call")
         if errors:
             raise next((error for error in errors if not _on_purpose(error)), errors[0])
 
@@ -228,6 +273,8 @@ class WorkerPool:
 
     def _lose(self, seat: _Seat, error: WorkerLost) -> None:
         """Put a new worker in the place of one that is lost, with all it has to do to catch up."""
+        if self.closed:
+            raise ClosedError("this Runner was closed amid a call") from error
         if not self._recover:
             raise WorkerLost(
                 f"{str(error) or f'worker {seat.index} was interrupted'}; its envs are lost, because recovery is off: "
@@ -259,7 +306,10 @@ class WorkerPool:
 
     def _dismiss(self, seat: _Seat, patience: float) -> None:
         if isinstance(seat.worker, ProcessWorker):
-            self._poller.unregister(seat.worker.fileno())
+            with contextlib.suppress(
+                KeyError, ValueError
+            ):  # closed already, when there could be no other after it
+                self._poller.unregister(seat.worker.fileno())
         seat.worker.close(patience)
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
+from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError, MissingDependencyError
 
 from .arguments import integer
 
@@ -76,7 +76,9 @@ class Recorder:
     Raises
     ------
     InvalidArgumentError
-        There is such a file, or the name ends otherwise.
+        There is such a file, or the name ends otherwise; or another Recorder records the runner.
+    ClosedError
+        The runner is closed.
     MissingDependencyError
         h5py is not installed.
     RecordingError
@@ -94,6 +96,14 @@ class Recorder:
         if not hasattr(runner, "recorder"):
             raise InvalidArgumentError(
                 "runner", "must be a Runner", value=type(runner).__name__, remedy="pass the runner to record"
+            )
+        if runner.closed:
+            raise ClosedError("this Runner is closed; record one that is not")
+        if runner.recorder is not None:
+            raise InvalidArgumentError(
+                "runner",
+                f"is being recorded already, to {runner.recorder.path}",
+                remedy="close that Recorder first",
             )
         self.path = check_path(path, overwrite=overwrite)
         self._overwrite, self._runner = overwrite, runner

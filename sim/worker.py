@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 import traceback
-from multiprocessing.connection import Connection
+from collections.abc import Iterator
 from typing import Any
 
 import cloudpickle
@@ -31,6 +31,7 @@ import cloudpickle
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 
 from .arrays import Arrays
+from .channel import Channel
 from .liveness import Pulse
 from .loop import Loop, LoopSpec
 from .shared import Layout, SharedArrays
@@ -39,6 +40,10 @@ TICK = struct.Struct("<cII??")  # b"T", ticks, substeps, use_rate, use_feedforwa
 DONE = struct.Struct("<cd")  # b"D", seconds of work
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+_TAKE_LIMITS = (
+    10.0,
+    60.0,
+)  # seconds amid a message, asleep or at work: a new process imports a lot before it reads
 _STOP_LIMIT = 0.7  # seconds: whoever goes on after Ctrl-Z continues all processes at once
 
 
@@ -86,7 +91,7 @@ class ProcessWorker:
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         ours, theirs = socket.socketpair()
         descriptors = (theirs.fileno(), shared.fd, self._trace)
-        with theirs:
+        with theirs, _without_interrupts():
             self._process = subprocess.Popen(
                 [
                     sys.executable,
@@ -100,11 +105,14 @@ class ProcessWorker:
                 stdin=subprocess.DEVNULL,
                 env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
             )
-        self._connection = Connection(ours.detach())
         self._pulse = Pulse(self.pid)
-        self._began = time.monotonic()
-        with contextlib.suppress(OSError):  # it died: the first receive says so
-            self._connection.send_bytes(message)
+        self._channel = Channel(ours, lambda: self.check_alive(*_TAKE_LIMITS))
+        try:
+            with contextlib.suppress(OSError):  # it died: the first receive says so
+                self._channel.send(message)
+        except BaseException:
+            self.close(0.0)
+            raise
 
     @property
     def pid(self) -> int:
@@ -113,7 +121,7 @@ class ProcessWorker:
 
     def fileno(self) -> int:
         """File descriptor that becomes readable when there is a result, or the worker is dead."""
-        return self._connection.fileno()
+        return self._channel.fileno()
 
     def send(self, method: str, *args: Any) -> None:
         """Ask for ``loop.method(*args)``."""
@@ -134,7 +142,7 @@ class ProcessWorker:
             The loop raised; the message holds the worker's traceback. What it raised on purpose comes as it is.
         """
         try:
-            message = self._connection.recv_bytes()
+            message = self._channel.receive()
         except (EOFError, OSError) as error:
             raise self._death() from error
         if message[:1] == b"D":
@@ -152,21 +160,22 @@ class ProcessWorker:
         Raises
         ------
         WorkerLost
-            It has been stopped, or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``.
+            It has been stopped, or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``,
+            not counting the time for which it waited for a processor.
         """
-        now = time.monotonic()
-        idle, stopped = self._pulse.idle(now), self._pulse.stopped
-        if idle > (_STOP_LIMIT if stopped else idle_limit):
-            state = "stopped" if stopped else "asleep"
-            raise self._lost(f"is stuck: {state} for {idle:.1f} s amid a request")
-        if now - self._began > limit:
+        pulse = self._pulse
+        pulse.look(time.monotonic())
+        if pulse.idle > (_STOP_LIMIT if pulse.stopped else idle_limit):
+            state = "stopped" if pulse.stopped else "asleep"
+            raise self._lost(f"is stuck: {state} for {pulse.idle:.1f} s amid a request")
+        if pulse.spent > limit:
             raise self._lost(
                 f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short"
             )
 
     def close(self, patience: float = 5.0) -> None:
         """End the process: ask, and kill it after ``patience`` seconds."""
-        self._connection.close()
+        self._channel.close()
         if os.getpid() == self._owner:  # else we are a fork of the parent, and the process is not ours to end
             try:
                 self._process.wait(patience) if patience else self._process.kill()
@@ -178,10 +187,9 @@ class ProcessWorker:
             self._trace = -1
 
     def _send(self, message: bytes) -> None:
-        self._began = time.monotonic()
-        self._pulse.begin(self._began)
+        self._pulse.begin()
         try:
-            self._connection.send_bytes(message)
+            self._channel.send(message)
         except OSError as error:
             raise self._death() from error
 
@@ -190,7 +198,7 @@ class ProcessWorker:
 
     def _death(self) -> WorkerLost:
         try:
-            code = self._process.wait(1.0)
+            code = self._process.wait(5.0)
         except subprocess.TimeoutExpired:
             return self._lost("closed its connection")
         return self._lost(f"died ({_signal_name(-code)})" if code < 0 else f"died (exit code {code})")
@@ -201,6 +209,19 @@ class ProcessWorker:
             time.sleep(0.05)
         trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
         return WorkerLost(f"{self._name()} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Let processes that start now never hear of Ctrl-C: the parent does, and must not find them half-way.
+
+    A blocked signal stays blocked in the child, from its first instruction on.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _signal_name(number: int) -> str:
@@ -215,15 +236,13 @@ _BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.worke
 
 def main() -> None:
     """Entry point of the child: ``argv`` holds the import path, the parent's pid and three file descriptors."""
-    # The parent handles Ctrl-C and closes the socket; the worker must not die half-way through a tick.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent, channel, memory, trace = map(int, sys.argv[2:])
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    connection = Connection(channel)
+    connection = Channel(socket.socket(fileno=channel))
     try:
-        spec, layout = connection.recv()
+        spec, layout = pickle.loads(connection.receive())
         envs = slice(spec.first_env, spec.first_env + spec.num_envs)
         _serve(connection, spec, Arrays.of_ticks(SharedArrays(layout, memory).arrays, envs))
     except (EOFError, BrokenPipeError, ConnectionResetError):
@@ -244,29 +263,29 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _serve(connection: Connection, spec: LoopSpec, ticks: list[Arrays]) -> None:
+def _serve(connection: Channel, spec: LoopSpec, ticks: list[Arrays]) -> None:
     try:
         loop = Loop(spec, ticks)
     except Exception as error:
-        connection.send((None, _portable(error)))
+        connection.send(pickle.dumps((None, _portable(error))))
         return
-    connection.send((None, None))
+    connection.send(pickle.dumps((None, None)))
     # Nothing here makes cycles; a collection in the hot loop would only cost time.
     gc.collect()
     gc.freeze()
     gc.disable()
     while True:
-        message = connection.recv_bytes()
+        message = connection.receive()
         try:
             if message[:1] == b"T":
-                connection.send_bytes(DONE.pack(b"D", loop.run(*TICK.unpack(message)[1:])))
+                connection.send(DONE.pack(b"D", loop.run(*TICK.unpack(message)[1:])))
             else:
                 method, args = pickle.loads(message)
-                connection.send((getattr(loop, method)(*args), None))
+                connection.send(pickle.dumps((getattr(loop, method)(*args), None)))
         except (BrokenPipeError, ConnectionResetError):
             raise
         except Exception as error:
-            connection.send((None, _portable(error)))
+            connection.send(pickle.dumps((None, _portable(error))))
 
 
 def _pickle(spec: tuple[LoopSpec, Layout]) -> bytes:

@@ -16,7 +16,7 @@ import pytest
 h5py = pytest.importorskip("h5py")
 
 from batchpid.cli import main  # noqa: E402
-from batchpid.errors import BatchPIDError, InvalidArgumentError  # noqa: E402
+from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError  # noqa: E402
 from sim import FaultWarning, Recorder, Robot, Runner, read_recording  # noqa: E402
 from sim.recording import RecordingError  # noqa: E402
 
@@ -117,6 +117,23 @@ def test_an_exception_leaves_what_was_recorded(tmp_path):
         raise ZeroDivisionError
     assert path.read_bytes() == kept
     assert len(read_recording(tmp_path / "run.h5.partial").time) == 2
+
+
+def test_one_recorder_at_a_time_and_none_of_a_closed_runner(tmp_path):
+    with make() as runner:
+        with Recorder(tmp_path / "a.h5", runner):
+            runner.step(ROBOT.start)
+            with pytest.raises(
+                InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"
+            ):
+                Recorder(tmp_path / "b.h5", runner)
+            runner.step(ROBOT.start)
+        with Recorder(tmp_path / "b.h5", runner):
+            runner.step(ROBOT.start)
+    with pytest.raises(ClosedError):
+        Recorder(tmp_path / "c.h5", runner)
+    assert sorted(os.listdir(tmp_path)) == ["a.h5", "b.h5"]
+    assert [len(read_recording(tmp_path / name).time) for name in ("a.h5", "b.h5")] == [2, 1]
 
 
 def test_a_file_made_meanwhile_is_kept(tmp_path):

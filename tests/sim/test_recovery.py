@@ -193,6 +193,49 @@ def test_everything_is_replayed(undisturbed):
         assert runner.recoveries == 4
 
 
+def test_killed_amid_whatever_it_does(tmp_path):
+    """Once in each method of the loop the worker dies when it has done it, before it can say so."""
+    methods = ("reset", "set_params", "run", "snapshot", "restore", "poses")
+
+    def build(scene, env):
+        import sim.loop
+
+        for name in methods:
+            act, mark = getattr(sim.loop.Loop, name), tmp_path / name
+            if hasattr(act, "__wrapped__"):
+                continue
+
+            def lethal(self, *args, act=act, mark=mark):
+                result = act(self, *args)
+                if armed.exists() and not mark.exists():
+                    mark.touch()
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return result
+
+            lethal.__wrapped__ = act
+            setattr(sim.loop.Loop, name, lethal)
+        return []
+
+    def program(runner):
+        runner.params = ROBOT.params(kp=30.0)
+        runner.reset(qpos=ROBOT.settings.target, mask=np.arange(2) == 1)
+        runner.rollout(table(3)[:, :2])
+        snapshot = runner.snapshot()
+        runner.step(table()[3, :2])
+        assert runner.poses().shape == (2, 0, 7)
+        runner.restore(snapshot)
+        return runner.rollout(table(4)[:, :2])
+
+    armed = tmp_path / "armed"
+    with Runner(ROBOT, 2, workers=0, build=lambda scene, env: []) as runner:
+        expected = program(runner)
+    with Runner(ROBOT, 2, workers=1, build=build) as runner, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecoveryWarning)
+        armed.touch()
+        same(expected, program(runner))
+    assert sorted(os.listdir(tmp_path)) == sorted([*methods, "armed"])
+
+
 def test_what_kills_every_worker_is_not_tried_for_ever(monkeypatch):
     monkeypatch.setattr("sim.pool._LIVES", 2)
 
