@@ -105,7 +105,7 @@ class Recorder:
                 f"is being recorded already, to {runner.recorder.path}",
                 remedy="close that Recorder first",
             )
-        self.path = check_path(path, overwrite=overwrite)
+        self.path: Path = check_path(path, overwrite=overwrite)
         self._overwrite, self._runner = overwrite, runner
         self.partial = _free_name(self.path)
         self._wake = threading.Condition()
