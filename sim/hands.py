@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .pool import cores_of_their_own
 from .scenes import Pack, parse
 from .tutorial import TutorialLoop
 from .worker import ONE_THREAD
@@ -55,6 +56,8 @@ class Hand:
             self._process = context.Process(target=_serve, args=(theirs, setup, share), daemon=True)
             self._process.start()
         theirs.close()
+        if cores := cores_of_their_own(count):
+            os.sched_setaffinity(self._process.pid or 0, {cores[index]})
 
     def prepare(self, case: str) -> None:
         """Build what ``case`` needs, and put its robots at the start."""

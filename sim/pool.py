@@ -93,8 +93,10 @@ class WorkerPool:
         self._shared = SharedArrays(Arrays.layout(ticks, num_envs, dof))
         self.ticks = Arrays.of_ticks(self._shared.arrays, slice(0, num_envs))
         """What goes in and out, over all envs, for each tick of a command; each worker has its rows of it."""
+        slices = _share(num_envs, count, pack_size)
+        self._cores = cores_of_their_own(len(slices))
         try:
-            for index, envs in enumerate(_share(num_envs, count, pack_size)):
+            for index, envs in enumerate(slices):
                 seat = _Seat(spec(envs), index, envs, self._kind(spec(envs), index, self._shared))
                 self._seats.append(seat)
                 self._welcome(seat)
@@ -302,6 +304,8 @@ class WorkerPool:
         seat.queue.clear()
         if isinstance(seat.worker, ProcessWorker):
             self._poller.register(seat.worker.fileno(), select.POLLIN)
+            if self._cores:
+                seat.worker.keep_to(self._cores[seat.index])
             seat.queue.append(Start())
 
     def _dismiss(self, seat: _Seat, patience: float) -> None:
@@ -325,6 +329,16 @@ def packing(num_envs: int, pack_size: int) -> int:
     what else its system holds, and so would, otherwise, on the number of workers.
     """
     return min(pack_size, max(1, num_envs // 8))
+
+
+def cores_of_their_own(workers: int) -> list[int]:
+    """One core for each worker, where there are as many workers as cores; else none.
+
+    A kernel may wake two workers on the core of the parent that woke them, and leave the other core idle for
+    milliseconds. Fewer workers than cores are not tied, lest those of several programs end up on the same cores.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    return cores if workers == len(cores) else []
 
 
 def _share(num_envs: int, workers: int, pack_size: int) -> list[slice]:

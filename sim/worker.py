@@ -40,10 +40,10 @@ TICK = struct.Struct("<cII??")  # b"T", ticks, substeps, use_rate, use_feedforwa
 DONE = struct.Struct("<cd")  # b"D", seconds of work
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-_TAKE_LIMITS = (
-    10.0,
-    60.0,
-)  # seconds amid a message, asleep or at work: a new process imports a lot before it reads
+_TAKE_LIMITS = (10.0, 60.0)
+"""Seconds amid a message, asleep or at work: a new process imports a lot before it reads."""
+_SPIN = 2e-4
+"""Seconds for which a worker looks out for the next request before it sleeps: waking up takes 30 us."""
 _STOP_LIMIT = 0.7  # seconds: whoever goes on after Ctrl-Z continues all processes at once
 
 
@@ -186,6 +186,11 @@ class ProcessWorker:
             os.close(self._trace)
             self._trace = -1
 
+    def keep_to(self, core: int) -> None:
+        """Run on that core only."""
+        with contextlib.suppress(OSError):  # it died, or the core was taken from us
+            os.sched_setaffinity(self.pid, {core})
+
     def _send(self, message: bytes) -> None:
         self._pulse.begin()
         try:
@@ -274,7 +279,12 @@ def _serve(connection: Channel, spec: LoopSpec, ticks: list[Arrays]) -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
+    poller = select.poll()
+    poller.register(connection.fileno(), select.POLLIN)
     while True:
+        asleep = time.perf_counter() + _SPIN
+        while not poller.poll(0) and time.perf_counter() < asleep:
+            os.sched_yield()
         message = connection.receive()
         try:
             if message[:1] == b"T":

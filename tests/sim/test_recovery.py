@@ -149,6 +149,20 @@ def test_too_slow_for_the_timeout():
         runner.step(ROBOT.settings.target)
 
 
+def test_as_many_workers_as_cores_keep_to_one_each():
+    cores = os.sched_getaffinity(0)
+    with Runner(ROBOT, 8 * len(cores) + 8, workers=len(cores), recover=True) as runner:
+        assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {
+            frozenset([core]) for core in cores
+        }
+        os.kill(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            runner.step(ROBOT.start)
+        assert len(os.sched_getaffinity(runner.pids[0])) == 1
+    with Runner(ROBOT, 8 * len(cores) + 8, workers=len(cores) + 1) as runner:
+        assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {frozenset(cores)}
+
+
 def test_a_busy_or_starved_worker_is_not_taken_for_stuck():
     with make(recover=False) as runner:
         obs = runner.step(ROBOT.settings.target, substeps=8_000)  # more than a second in one tick
