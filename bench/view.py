@@ -1,6 +1,7 @@
 """How many frames a second a page of ``batchpid view`` gets, and draws, while the simulation keeps real time.
 
     python bench/view.py --width 800 --height 600
+    python bench/view.py --robot panda --num-envs 8 --control pid drive --width 1440 --height 900 --picture view.png
 
 Everything runs on this machine: workers, page server, and headless Chromium drawing in software, which is put behind
 the others (nice 19). ``served`` is what the view sends, ``drawn`` what the browser shows.
@@ -8,16 +9,19 @@ the others (nice 19). ``served`` is what the view sends, ``drawn`` what the brow
 
 from __future__ import annotations
 
+import io
 import shutil
 import tempfile
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import psutil
 import tyro
+from PIL import Image
 from selenium import webdriver
 
 from sim import Robot
@@ -45,17 +49,21 @@ class Options:
 
     robot: str = "jaco2"
     num_envs: int = 16
+    control: tuple[Literal["pid", "drive"], ...] = ("pid",)
     physics: Literal["accurate", "fast"] = "fast"
-    width: int = 800
-    height: int = 600
+    width: int = 1280
+    height: int = 800
     seconds: float = 8.0
+    picture: Path | None = None
+    """Keep what the page looks like 2 s after all robots were sent to their targets."""
 
 
 def main(options: Options) -> None:
     """Serve, open, wait until all is loaded, count."""
     robot = Robot.load(options.robot)
-    live = Live(robot, options.num_envs, physics=options.physics)
-    live.go_to(robot.settings.target if robot.settings is not None else robot.start)
+    live = Live(robot, options.num_envs, controls=options.control, physics=options.physics)
+    target = robot.settings.target if robot.settings is not None else robot.start
+    live.go_to(target)
     first = live.frame().qpos
     with View(live, port=18200) as view, tempfile.TemporaryDirectory() as profile:
         thread = threading.Thread(target=view.run)
@@ -77,14 +85,36 @@ def main(options: Options) -> None:
         drawn = page.execute_script("return window.drawn")
         wall = time.monotonic() - began
         served, factor = (live.time / live.period - frames) / wall, (live.time - simulated) / wall
+        moved = np.abs(live.frame().qpos - first).max()
+        if options.picture is not None:
+            _picture(page, live, target, options.picture)
         page.quit()
         view.stop()
         thread.join()
-        assert np.abs(live.frame().qpos - first).max() > 0.1, "the robots did not move"
+        assert moved > 0.1, "the robots did not move"
     print(
-        f"{options.num_envs} x {robot.name}, {options.physics}, {options.width} x {options.height}: "
+        f"{options.num_envs} x {robot.name}, {' beside '.join(options.control)}, {options.physics}, "
+        f"{options.width} x {options.height}: "
         f"{served:.1f} frames/s served, {drawn / wall:.1f} drawn, {factor:.2f} x real time"
     )
+
+
+def _picture(page: webdriver.Chrome, live: Live, target: np.ndarray, path: Path) -> None:
+    """Send the robots to the start, then to the target, and take the page as it is 2 s later."""
+    for toast in page.find_elements("css selector", ".mantine-Notification-closeButton"):
+        toast.click()  # that WebGL runs in software
+    live.go_to(live.robot.start)
+    _until(live, 4.0)
+    live.go_to(target)
+    _until(live, 2.0)
+    with Image.open(io.BytesIO(page.get_screenshot_as_png())) as image:
+        image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def _until(live: Live, seconds: float) -> None:
+    end = live.time + seconds
+    while live.time < end:
+        time.sleep(0.02)
 
 
 if __name__ == "__main__":

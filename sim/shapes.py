@@ -26,8 +26,10 @@ Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Rgba = tuple[float, float, float, float]
 
-SEGMENTS = 24
-"""Of a circle, where nothing else is said."""
+DEVIATION = 2e-3
+"""How far flat triangles may stay from the round that they stand for, where nothing else is said [m]."""
+FEWEST, MOST = 6, 48
+"""Segments of a circle."""
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 
 
@@ -40,8 +42,8 @@ class Surface(NamedTuple):
     faces: Faces
 
 
-def surfaces(robot: Robot, segments: int = SEGMENTS) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour; circles have so many ``segments``.
+def surfaces(robot: Robot, deviation: float = DEVIATION) -> list[Surface]:
+    """Return the surfaces of ``robot``, one for each link and colour, as round as ``deviation`` [m] asks.
 
     Vertices are not shared across sharp edges, so that averaged normals shade right.
 
@@ -60,20 +62,20 @@ def surfaces(robot: Robot, segments: int = SEGMENTS) -> list[Surface]:
     result = []
     for link in original.findall("link"):
         name = link.get("name")
-        shapes = _shapes(link.findall("visual"), robot, segments)
+        shapes = _shapes(link.findall("visual"), robot, deviation)
         if not shapes:
-            shapes = _shapes(collisions.get(name, []), robot, segments) or []
+            shapes = _shapes(collisions.get(name, []), robot, deviation) or []
         result += _merge(name, [(_colour(element, colours, name), *mesh) for element, mesh in shapes])
     return result
 
 
 def _shapes(
-    elements: list[etree._Element], robot: Robot, segments: int
+    elements: list[etree._Element], robot: Robot, deviation: float
 ) -> list[tuple[etree._Element, tuple[Vertices, Faces]]] | None:
     """Return each element's triangles in the link's frame, or None if one of its files is missing."""
     result = []
     for element in elements:
-        mesh = _triangles(element.find("geometry"), robot, segments)
+        mesh = _triangles(element.find("geometry"), robot, deviation)
         if mesh is None:
             return None
         vertices, faces = mesh
@@ -100,14 +102,16 @@ def _merge(link: str, parts: list[tuple[Rgba, Vertices, Faces]]) -> list[Surface
     return merged
 
 
-def _triangles(geometry: etree._Element | None, robot: Robot, segments: int) -> tuple[Vertices, Faces] | None:
+def _triangles(
+    geometry: etree._Element | None, robot: Robot, deviation: float
+) -> tuple[Vertices, Faces] | None:
     for shape in () if geometry is None else geometry:
         if shape.tag == "box":
             return box(numbers(shape, "size", "0 0 0"))
         if shape.tag == "cylinder":
-            return cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)), segments)
+            return cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)), deviation)
         if shape.tag == "sphere":
-            return sphere(float(shape.get("radius", 0)), segments)
+            return sphere(float(shape.get("radius", 0)), deviation)
         if shape.tag == "mesh":
             return _file(shape, robot)
     return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -158,27 +162,39 @@ def box(size: NDArray[np.float64]) -> tuple[Vertices, Faces]:
     return np.concatenate(vertices) * np.asarray(size) / 2, np.concatenate(faces)
 
 
-def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> tuple[Vertices, Faces]:
+def segments_of(radius: float, deviation: float) -> int:
+    """Return how many chords a circle [m] needs for none to be farther than ``deviation`` [m] from its arc.
+
+    A chord over the angle 2a stays r (1 - cos a) behind it.
+    """
+    if radius <= deviation:
+        return FEWEST
+    return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
+
+
+def cylinder(radius: float, length: float, deviation: float = DEVIATION) -> tuple[Vertices, Faces]:
     """Return a cylinder along z about the origin, its caps apart from its side."""
+    segments = segments_of(radius, deviation)
     angle = 2 * math.pi * np.arange(segments) / segments
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(segments)], axis=1)
     up = np.array([0.0, 0.0, length / 2])
     here, following = np.arange(segments), (np.arange(segments) + 1) % segments
     low, high, bottom, top = (n * segments for n in range(4))
-    centre = 4 * segments
+    fan, first = here[1:-1], np.zeros(segments - 2, np.int64)
     faces = [
         np.stack([low + here, low + following, high + following], axis=1),
         np.stack([low + here, high + following, high + here], axis=1),
-        np.stack([np.full(segments, centre), bottom + following, bottom + here], axis=1),
-        np.stack([np.full(segments, centre + 1), top + here, top + following], axis=1),
+        bottom + np.stack([first, fan + 1, fan], axis=1),
+        top + np.stack([first, fan, fan + 1], axis=1),
     ]
-    vertices = [ring - up, ring + up, ring - up, ring + up, -up[None], up[None]]
+    vertices = [ring - up, ring + up, ring - up, ring + up]
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def sphere(radius: float, segments: int = SEGMENTS) -> tuple[Vertices, Faces]:
+def sphere(radius: float, deviation: float = DEVIATION) -> tuple[Vertices, Faces]:
     """Return a sphere about the origin, of rings of latitude."""
-    rings = segments // 2
+    segments = segments_of(radius, deviation)
+    rings = math.ceil(segments / 2)
     polar = math.pi * np.arange(rings + 1) / rings
     angle = 2 * math.pi * np.arange(segments) / segments
     flat = np.sin(polar)[:, None]

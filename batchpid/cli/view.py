@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -83,7 +84,8 @@ class View:
                     file=sys.stderr,
                 )
             print(f"Open in a browser: {view.url}  (Ctrl-C ends it)", flush=True)
-            view.run(self.seconds)
+            with suppress(KeyboardInterrupt):  # that is how it ends
+                view.run(self.seconds)
             print(f"{view.rate:.0f} frames/s at {view.factor:.2f} x real time")
 
 

@@ -34,7 +34,7 @@ class Charts:
                 scales={
                     "x": {"time": False, "range": (-WINDOW, 0.0)}
                 },  # a range of its own would drift in viser 1.1
-                legend={"show": True},
+                legend={"show": True, "live": False},
                 height=168,
                 axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
                 padding=(4, 14, 0, 0),
@@ -49,7 +49,8 @@ class Charts:
         self._position = chart("position", [*lines("qpos"), _dashed("setpoint", _INK["setpoint"])])
         self._error = chart("error", lines("error"))
         self._effort = chart(
-            "effort", [*lines("effort"), _dashed("least", _INK["limit"]), _dashed("most", _INK["limit"])]
+            "effort",
+            [_dashed("lower limit", _INK["limit"]), _dashed("upper limit", _INK["limit"]), *lines("effort")],
         )
 
     def show(self, env: int, joint: int) -> None:
@@ -68,13 +69,14 @@ class Charts:
         ago = keep[0][0] - keep[0][0][-1]
         bounds = source.effort_limits(robots[0], joint)
         peak = max(float(np.abs(trace[3]).max()) for trace in keep)
-        limits = tuple(  # far limits would flatten the curve
-            np.full(len(ago), bound if abs(bound) < _NEAR * peak else np.nan) for bound in bounds
+        # A far limit would flatten the curve, and a gap (NaN) empties the chart: it lies under the curve instead.
+        limits = tuple(
+            np.full(len(ago), bound) if abs(bound) < _NEAR * peak else keep[0][3] for bound in bounds
         )
         for chart, title, columns in (
             (self._position, f"{name} [{unit}]", (*(trace[1] for trace in keep), keep[0][2])),
             (self._error, f"setpoint - qpos [{unit}]", tuple(trace[2] - trace[1] for trace in keep)),
-            (self._effort, f"effort [{force}]", (*(trace[3] for trace in keep), *limits)),
+            (self._effort, f"effort [{force}]", (*limits, *(trace[3] for trace in keep))),
         ):
             if chart.title != title:
                 chart.title = title

@@ -226,11 +226,11 @@ class Panel:
 
 
 def short_names(robot: Robot) -> tuple[str, ...]:
-    """Return the joint names without the prefix that all of them share."""
-    first, last = min(robot.joint_names), max(robot.joint_names)  # what these two share, all share
-    alike = [a == b for a, b in zip(first, last, strict=False)]
-    shared = first[: alike.index(False)].rfind("_") + 1 if False in alike else 0
-    return tuple(name[shared:] for name in robot.joint_names)
+    """Return the joint names without the words that all of them begin with; a bare number keeps the word before."""
+    words = [name.split("_") for name in robot.joint_names]
+    first, last = min(words), max(words)  # what these two share, all share
+    shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    return tuple("_".join(each[shared - (shared > 0 and each[shared].isdigit()) :]) for each in words)
 
 
 def _first_moving(robot: Robot) -> int:

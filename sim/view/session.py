@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -93,9 +94,12 @@ class View:
     def close(self) -> None:
         """End the page, and what the source holds."""
         self._stop = True
-        with _quiet():
-            self._server.stop()
         self.source.close()
+        # Once a browser was there, viser takes some 5 s to end its threads. They are daemons: nobody need wait.
+        end = threading.Thread(target=self._server.stop, daemon=True)
+        with _quiet():
+            end.start()
+            end.join(timeout=0.5)
 
     def __enter__(self) -> View:
         return self

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sim import Robot
-from sim.shapes import box, cylinder, sphere, surfaces
+from sim.shapes import FEWEST, MOST, box, cylinder, segments_of, sphere, surfaces
 
 LINK = (
     '<link name="{name}"><inertial><mass value="1"/>'
@@ -54,6 +56,16 @@ def test_primitives_are_closed_and_face_out(mesh, expected, share):
     assert len(forth) == len(edges)  # every edge once in each direction: closed, and wound alike
     assert forth == back
     assert len(points) > 7
+
+
+@given(radius=st.floats(1e-3, 10), deviation=st.floats(1e-4, 1e-2))
+def test_chords_stay_as_near_to_the_arc_as_asked(radius, deviation):
+    segments = segments_of(radius, deviation)
+    if FEWEST < segments < MOST:
+        assert radius * (1 - np.cos(np.pi / segments)) <= deviation * (1 + 1e-9)
+        assert radius * (1 - np.cos(np.pi / (segments - 1))) > deviation
+    assert FEWEST <= segments <= MOST
+    assert len(sphere(radius, deviation)[0]) >= 4 * FEWEST
 
 
 @pytest.mark.parametrize("name", Robot.bundled())

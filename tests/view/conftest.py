@@ -22,6 +22,7 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-gpu-compositing",
+    "--window-size=1100,760",  # every pixel is drawn by the processor
 ]
 
 
@@ -47,48 +48,47 @@ def serve():
         view.close()
 
 
-@pytest.fixture
-def open_page(tmp_path):
-    """Open a page in headless Chromium, drawn in software; skipped where it is not installed."""
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """Headless Chromium that draws in software, started once; skipped where it is not installed."""
     webdriver = pytest.importorskip("selenium.webdriver")
-    browser, driver = (
-        shutil.which("chromium") or shutil.which("chromium-browser"),
-        shutil.which("chromedriver"),
-    )
-    if browser is None or driver is None:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    driver = shutil.which("chromedriver")
+    if chromium is None or driver is None:
         pytest.skip("needs Chromium and chromedriver (Debian: apt-get install chromium chromium-driver)")
-    pages = []
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    page = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    page.set_page_load_timeout(120)
+    yield page
+    page.quit()
 
-    def open_page(url, width=1280, height=800):
-        options = webdriver.ChromeOptions()
-        options.binary_location = browser
-        for flag in (
-            *FLAGS,
-            f"--window-size={width},{height}",
-            f"--user-data-dir={tmp_path / f'profile{len(pages)}'}",
-        ):
-            options.add_argument(flag)
-        page = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-        pages.append(page)
-        page.set_page_load_timeout(60)
-        page.get(url)
-        return page
+
+@pytest.fixture
+def open_page(browser):
+    """Open a page, left again at the end of the test."""
+
+    def open_page(url):
+        browser.get(url)
+        return browser
 
     yield open_page
-    for page in pages:
-        page.quit()
+    browser.get("about:blank")
 
 
 @pytest.fixture
 def until():
     """Wait until a condition holds, and return what it returned."""
 
-    def until(condition, seconds=60, what="it"):
-        deadline = time.monotonic() + seconds
+    def until(condition, seconds=200, what="it"):
+        deadline, pause = time.monotonic() + seconds, 0.05
         while time.monotonic() < deadline:
             if found := condition():
                 return found
-            time.sleep(0.1)
+            time.sleep(pause)
+            pause = min(0.5, 1.5 * pause)  # a look costs what the page needs to go on
         raise AssertionError(f"{what} did not happen within {seconds} s")
 
     return until

@@ -185,4 +185,4 @@ def test_names_lose_what_they_share():
         "finger_joint1",
         "finger_joint2",
     )
-    assert short_names(Robot.load("jaco2"))[6:8] == ("7", "finger_1")
+    assert short_names(Robot.load("jaco2"))[6:8] == ("joint_7", "finger_1")

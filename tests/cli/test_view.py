@@ -1,0 +1,60 @@
+"""batchpid view: how it begins and ends; the page itself is looked at in tests/view."""
+
+import numpy as np
+import pytest
+
+from sim import Robot, Rollout
+
+pytest.importorskip("viser")
+SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
+
+
+def write(path, robot="panda", envs=1):
+    """A rollout of two ticks at rest, as batchpid rollout --out writes it."""
+    panda = Robot.load("panda")
+    zeros = np.zeros((2, envs, panda.dof), np.float32)
+    rollout = Rollout(np.array([0.1, 0.2]), zeros, zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
+    told = {name: getattr(panda, name) for name in ("joint_names", "units", "lower", "upper", "effort_limit")}
+    np.savez(path, **rollout._asdict(), **told, robot=robot)
+    return path
+
+
+def test_ctrl_c_is_how_it_ends(batchpid, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sim.view.View.run", interrupted)
+    status, said, err = batchpid("view", *SHORT)
+    assert (status, err) == (0, "")
+    assert "http://127.0.0.1:" in said
+    assert "x real time" in said
+
+
+def test_of_many_recorded_robots_those_are_shown_that_fit(batchpid, tmp_path):
+    run = write(tmp_path / "run.npz", envs=70)
+    status, said, _ = batchpid("view", *SHORT, "--play", run, "--seconds", 0.2)
+    assert status == 0
+    assert "the first 64 of 70" in said
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--port", 99999), "port: out of range (got 99999)"),
+        (("--fps", 0), "fps: out of range"),
+        (("--play", "nothing.npz"), "path: is no file"),
+        (("--num-envs", 65), "num_envs: out of range"),
+    ],
+)
+def test_bad_flags_are_named(flags, message, batchpid):
+    status, said, err = batchpid("view", *flags)
+    assert (status, said) == (2, "")
+    assert err.startswith(f"batchpid: {message}")
+
+
+def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
+    run = write(tmp_path / "run.npz", robot="arm")
+    assert "batchpid view path/to/arm.urdf --play" in batchpid("view", *SHORT, "--play", run)[2]
+    path = tmp_path / "arm.urdf"
+    path.write_text(Robot.load("panda").path.read_text())
+    assert batchpid("view", path, *SHORT, "--play", run, "--seconds", 0.1)[0] == 0
