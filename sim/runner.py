@@ -54,7 +54,7 @@ class Runner:
         and kd are the drive's stiffness and damping (default: the robot's settings).
     workers
         Processes that step the scenes; 0 runs the same code in this process. Default: one for each available
-        core. The results are the same bytes for any number.
+        core, and each keeps to its own. The results are the same bytes for any number.
     timestep
         Of simulation and control [s].
     substeps
