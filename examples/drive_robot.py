@@ -2,10 +2,12 @@
 
     python examples/drive_robot.py --use-external-pid
     python examples/drive_robot.py --use-internal-drive --compensate none
+    python examples/drive_robot.py --use-external-pid --compensate none --seconds 6
     python examples/drive_robot.py                                          # nothing holds it: it falls
 
 SAPIEN's tutorial "Drive Robot with PID Controller" has the same two switches. Without compensation a drive keeps a
 steady-state error, because only an error makes it push back against gravity; the integral of a PID removes it.
+The tutorial's own gains (--gains tutorial) ring, because the robot is as frictionless as its URDF says.
 """
 
 from dataclasses import dataclass
@@ -25,11 +27,15 @@ class Options:
     use_internal_drive: bool = False
     """PhysX's PD drive, stiffness 20 and damping 5."""
     use_external_pid: bool = False
-    """One PID a joint with the tutorial's gains, computed at every sim step."""
+    """One PID a joint, computed at every sim step."""
+    gains: Literal["tuned", "tutorial"] = "tuned"
+    """Of the PID: those that batchpid tune found, or the tutorial's."""
     compensate: Literal["gravity+coriolis", "gravity", "none"] | None = None
     """Passive force added to the joints; default gravity+coriolis where something drives them, else none."""
     num_envs: int = 8
+    """How many robots, each from a pose a little different."""
     seconds: float = 3.0
+    """Simulated time."""
 
 
 def main(options: Options) -> None:
@@ -42,26 +48,23 @@ def main(options: Options) -> None:
 
     robot = Robot.load(options.robot)
     target = robot.settings.target
-    command = (
-        target if driven else np.zeros(robot.dof)
-    )  # under "effort" the command is the joint effort itself
+    command = target if driven else np.zeros(robot.dof)  # under "effort" it is the joint effort itself
+    gains = robot.tuned() if control == "pid" and options.gains == "tuned" else {}
     start = robot.start + np.random.default_rng(0).uniform(-0.1, 0.1, (options.num_envs, robot.dof))
     start = np.clip(start, robot.lower, robot.upper)
 
-    with Runner(robot, options.num_envs, control=control, compensate=compensate) as runner:
+    with Runner(robot, options.num_envs, control=control, compensate=compensate, **gains) as runner:
         runner.reset(start)
         ticks = round(options.seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(command, (ticks, robot.dof)))
 
-    print(
-        f"{options.num_envs} x {robot.name}, control {control!r}, compensate {compensate!r}, {rollout.time[-1]:g} s"
-    )
-    print(f"{'joint':30} {'start':>8} {'target':>8} {'end':>8} {'error':>9} {'worst env':>10}")
     error = np.abs(rollout.qpos[-1] - target)
+    print(f"{options.num_envs} x {robot.name}, {control=}, {compensate=}, after {rollout.time[-1]:g} s")
+    print(f"{'joint':30} {'start':>8} {'target':>8} {'end':>8} {'error':>9} {'worst env':>10}")
     for j, joint in enumerate(robot.joints):
         print(
             f"{joint.name:30} {start[0, j]:8.3f} {target[j]:8.3f} {rollout.qpos[-1, 0, j]:8.3f} "
-            f"{error[0, j]:9.4f} {error[:, j].max():10.4f} {joint.unit}"
+            f"{error[0, j]:9.5f} {error[:, j].max():10.5f} {joint.unit}"
         )
 
 

@@ -8,65 +8,71 @@ as far as the model is right. The integral of a PID finds the load by itself.
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-import batchpid as bp
+from batchpid import plots
 from sim import Robot, Runner
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
 VARIANTS = (
-    # control, compensate, label, colour
-    ("drive", "none", "drive (20, 5), no compensation", "#d97706"),
-    ("drive", "gravity+coriolis", "drive (20, 5), compensated", "#fbbf24"),
-    ("pid", "none", "PID, no compensation", "#15803d"),
-    ("pid", "gravity+coriolis", "PID, compensated", "#86c99a"),
+    # control, compensate, label, colour, filled
+    ("drive", "none", "drive (20, 5), no compensation", "#c2570c", True),
+    ("drive", "gravity+coriolis", "drive (20, 5), compensated", "#c2570c", False),
+    ("pid", "none", "PID, no compensation", "#15803d", True),
+    ("pid", "gravity+coriolis", "PID, compensated", "#15803d", False),
 )
 FLOOR = 1e-6  # [rad]: below it the last bits of float32 positions speak
 
 
 def final_errors(robot: Robot, control: str, compensate: str, seconds: float) -> np.ndarray:
     """Return |setpoint - qpos| of every joint (dof,) after ``seconds`` at the tutorial's target."""
-    params = bp.design_gains(robot) if control == "pid" else None
-    with Runner(robot, 1, params=params, control=control, compensate=compensate, workers=0) as runner:
-        target = robot.settings.target
-        for _ in range(round(seconds / (runner.substeps * runner.timestep))):
-            obs = runner.step(target)
-    return np.abs(obs.qpos[0] - target)
+    gains = robot.tuned() if control == "pid" else {}
+    with Runner(robot, 1, control=control, compensate=compensate, workers=0, **gains) as runner:
+        ticks = round(seconds / (runner.substeps * runner.timestep))
+        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (ticks, robot.dof)))
+    return np.abs(rollout.qpos[-1, 0] - robot.settings.target)
+
+
+def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:
+    """One row a joint, one mark a variant: how far from the target it stays, in powers of ten."""
+    figure = Figure(figsize=(7.5, 0.34 * len(names) + 1.5), layout="constrained")
+    axes = figure.add_subplot()
+    rows = np.arange(len(names))
+    axes.axvspan(FLOOR / 10, FLOOR, color="#f1f3f6", lw=0)
+    axes.text(FLOOR * 0.63, -0.8, "0 ± 1e-6", ha="center", va="center", fontsize=7, color="#6b7280")
+    beside = np.linspace(-0.24, 0.24, len(VARIANTS))  # so that no mark hides another
+    for (*_, label, colour, filled), error, shift in zip(VARIANTS, errors.values(), beside, strict=True):
+        face = colour if filled else "white"
+        at_least = np.maximum(error, FLOOR * 0.63)
+        axes.plot(at_least, rows + shift, "o", ms=5, mec=colour, mfc=face, mew=1.2, label=label)
+    axes.set_xscale("log")
+    axes.set_xlim(FLOOR * 0.4, 2)
+    axes.set_yticks(rows, names)
+    axes.set_ylim(len(names) - 0.4, -1.1)
+    axes.hlines(rows[1:] - 0.5, FLOOR * 0.4, 2, color="#eef0f3", lw=0.8, zorder=0)
+    axes.set_xlabel("final error [rad]")
+    axes.grid(axis="x", alpha=0.3)
+    axes.tick_params(axis="y", length=0)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.set_title(title, fontsize=10, loc="left")
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8.5)
+    return figure
 
 
 def main(robot: str = "panda", seconds: float = 12.0, out: Path = Path("out/steady-state.png")) -> None:
     """Run the four, print the errors, and draw them."""
     loaded = Robot.load(robot)
-    arm = [joint for joint in range(loaded.dof) if "finger" not in loaded.joint_names[joint]]
+    arm = [joint for joint, name in enumerate(loaded.joint_names) if "finger" not in name]
     names = [f"joint {joint + 1}" for joint in arm]
-    figure, axes = plt.subplots(figsize=(9, 4), layout="constrained")
+    errors = {}
     print(f"{'final error [rad]':32}", *(f"{name:>9}" for name in names))
-    for place, (control, compensate, label, colour) in enumerate(VARIANTS):
-        errors = final_errors(loaded, control, compensate, seconds)[arm]
-        print(f"{label:32}", *(f"{error:9.1e}" for error in errors))
-        axes.bar(
-            np.arange(len(arm)) + 0.2 * (place - 1.5),
-            np.maximum(errors, FLOOR),
-            0.2,
-            color=colour,
-            label=label,
-        )
-    axes.set_yscale("log")
-    axes.set_ylim(FLOOR, 2)
-    axes.set_xticks(range(len(arm)), names)
-    axes.set_ylabel("final error [rad]")
-    axes.set_title(f"{loaded.name} at the tutorial's target, after {seconds:g} s")
-    axes.grid(axis="y", alpha=0.3)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=110)
-    print("picture:", out)
+    for control, compensate, label, *_ in VARIANTS:
+        errors[label] = final_errors(loaded, control, compensate, seconds)[arm]
+        print(f"{label:32}", *(f"{error:9.1e}" for error in errors[label]))
+    title = f"What error stays: {loaded.name}, {seconds:g} s after a step to the tutorial's target"
+    print("picture:", plots.save(draw(errors, names, title), out))
 
 
 if __name__ == "__main__":

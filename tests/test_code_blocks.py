@@ -27,9 +27,9 @@ BLOCK = re.compile(
 )
 SHORTER = {
     # command: flags that make it short
-    "demo": ["--num-envs", "4", "--seconds", "0.2"],
-    "rollout": ["--num-envs", "2", "--seconds", "0.2"],
-    "view": ["--seconds", "1", "--port", "8765"],
+    "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "view": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1", "--port", "8765"],
 }
 ONLY_PARSED = ("bench", "tune", "compare", "render")
 

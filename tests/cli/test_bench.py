@@ -3,7 +3,7 @@ import json
 
 def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     path = tmp_path / "new" / "bench.json"
-    flags = ["--num-envs", 2, "--workers", 1, "--ticks", 100, "--rounds", 1]
+    flags = ["--num-envs", 1, "--workers", 1, "--ticks", 100, "--rounds", 1]
     status, out, err = batchpid("bench", *flags, "--json", path)
     assert status == 0, err
     assert "closed loop" in out
@@ -13,7 +13,7 @@ def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     assert closed["closed_loop_over_case"] == 1.0
     assert tutorial["closed_loop_over_case"] == closed["median"] / tutorial["median"]
     assert figures["machine"]["sapien"]
-    assert figures["setup"]["num_envs"] == 2
+    assert figures["setup"]["num_envs"] == 1
 
 
 def test_bench_refuses_too_short_a_run(batchpid):

@@ -32,7 +32,7 @@ def test_every_example_is_tested():
 
 @pytest.mark.parametrize("robot", ["jaco2", "panda"])
 def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot):
-    drive = ("drive_robot.py", "--robot", robot, "--num-envs", "2", "--seconds", "5", "--use-internal-drive")
+    drive = ("drive_robot.py", "--robot", robot, "--num-envs", "1", "--seconds", "4", "--use-internal-drive")
     kept = errors(run(*drive, "--compensate", "none"))
     removed = errors(run(*drive))
     joint = {"jaco2": "j2s7s300_joint_4", "panda": "panda_joint2"}[robot]
@@ -42,10 +42,10 @@ def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, ro
 
 def test_undriven_it_falls_and_the_pid_brings_it_there(run):
     panda = ("drive_robot.py", "--robot", "panda", "--num-envs", "2")
-    rows = [row.split() for row in run(*panda, "--seconds", "2").splitlines()[2:]]
+    rows = [row.split() for row in run(*panda, "--seconds", "1").splitlines()[2:]]
     assert max(abs(float(end) - float(start)) for _, start, _, end, *_ in rows) > 0.5
-    held = errors(run(*panda, "--seconds", "6", "--use-external-pid"))
-    assert held["panda_joint2"] < 0.1
+    held = errors(run(*panda, "--seconds", "1.5", "--use-external-pid"))
+    assert max(held.values()) < 2e-3
 
 
 def test_both_switches_are_an_error(run):
@@ -76,13 +76,13 @@ def test_a_profile_is_easier_to_follow_than_a_step(run):
 
 def test_the_integral_removes_what_an_uncompensated_drive_keeps(run, tmp_path):
     out = tmp_path / "errors.png"
-    text = run("steady_state.py", "--seconds", "5", "--out", str(out))
+    text = run("steady_state.py", "--seconds", "2", "--out", str(out))
     errors = {
         row[:32].strip(): [float(e) for e in row[32:].split()]
         for row in text.splitlines()
         if "compensat" in row
     }
     assert max(errors["drive (20, 5), no compensation"]) > 0.3
-    assert max(errors["PID, no compensation"]) < 5e-3
-    assert max(errors["PID, compensated"]) < 5e-3
+    assert max(errors["PID, no compensation"]) < 1e-3
+    assert max(errors["PID, compensated"]) < 1e-3
     assert out.stat().st_size > 10_000
