@@ -240,7 +240,8 @@ def _checked(path: Path, document: Any) -> dict[str, dict[str, Any]]:
 def _check_entry(path: Path, joint: str, key: str, entry: Any) -> None:
     wanted: type = type(OFF[key])
     if wanted is float:
-        good = (isinstance(entry, float | int) and not isinstance(entry, bool)) or entry in ("inf", "-inf")
+        whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
+        good = whole or isinstance(entry, float) or entry in ("inf", "-inf")
     else:
         good = isinstance(entry, wanted)
     if not good:

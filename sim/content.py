@@ -94,6 +94,11 @@ class Content:
             robot.set_qpos(qpos)
             robot.set_qvel(np.zeros_like(qpos))
 
+    @property
+    def size(self) -> int:
+        """How many numbers :meth:`read` gives."""
+        return 13 * len(self._bodies) + sum(13 + 3 * robot.dof for robot, *_ in self._articulations)
+
     def read(self) -> NDArray[np.float32]:
         """State of everything that moves, in one row of numbers."""
         parts: list[Any] = []

@@ -134,6 +134,10 @@ class Loop:
             cell.pack.close()
             cell.write(self._build(cell.envs), states.for_envs(cell.envs))
 
+    def content_sizes(self) -> list[int]:
+        """How many numbers a snapshot holds of each env's content."""
+        return [size for cell in self.cells for size in cell.pack.content_sizes()]
+
     def poses(self) -> list[NDArray[np.float32]]:
         """Poses of the entities that each env's content wants watched, (watched, 7) each."""
         return [rows for cell in self.cells for rows in cell.pack.read_poses()]

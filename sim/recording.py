@@ -53,6 +53,7 @@ _FIELDS = {
     "saturated": np.bool_,
     "ok": np.bool_,
 }
+_PER_JOINT = ("joint_names", "units", "lower", "upper")  # attributes
 
 
 class RecordingError(BatchPIDError, OSError):
@@ -324,12 +325,30 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording
             attributes = dict(file.attrs)
             if attributes.get("format") != FORMAT:
                 raise ValueError(f"its format is {attributes.get('format')!r}, not {FORMAT!r}")
+            lacking = {"complete", "faults", "params", *_PER_JOINT} - set(attributes)
+            if lacking:
+                raise ValueError(f"it does not say its {', '.join(sorted(lacking))}")
             times = file["time"][:]
             count = int(np.isfinite(times).sum())
             arrays = {name: file[name][:count:every] for name in _FIELDS}
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+            _check_shapes(arrays, attributes)
+    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
         raise RecordingError(f"{path}: cannot be read as a recording: {error}") from error
     return Recording(path=path, time=times[:count:every], attributes=attributes, **arrays)
+
+
+def _check_shapes(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:
+    ticks, envs = arrays["ok"].shape
+    dof = len(attributes["joint_names"])
+    for name, rows in arrays.items():
+        shape = (ticks, envs) if name == "ok" else (ticks, envs, dof)
+        if rows.shape != shape or rows.dtype != _FIELDS[name]:
+            raise ValueError(
+                f"its {name} is {rows.dtype} {rows.shape}, not {np.dtype(_FIELDS[name])} {shape}"
+            )
+    for name in _PER_JOINT:
+        if np.shape(attributes[name]) != (dof,):
+            raise ValueError(f"its {name} are {np.shape(attributes[name])}, not one for each of {dof} joints")
 
 
 def check_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:

@@ -426,6 +426,8 @@ class Runner:
             )
         snapshot.check(self._about)
         check_params(snapshot.params, self.robot, self.num_envs, self.control)
+        sizes = [size for part in pool.run(Call("content_sizes"), keep=False) for size in part]
+        snapshot.states.check(self.num_envs, self.robot.dof, snapshot.params, sizes)
         self._last = 0
         pool.run(Call("restore", (snapshot,)))
         self._steps, self._params = snapshot.steps, snapshot.params

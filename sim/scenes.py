@@ -308,6 +308,10 @@ class Pack:
             line[: len(row)] = row
         return table
 
+    def content_sizes(self) -> list[int]:
+        """How many of a scene's numbers in :meth:`read_content` are its own (M,)."""
+        return [content.size for content in self._contents] or [0] * self.size
+
     def write_content(self, table: NDArray[Any]) -> None:
         """Put each scene's own content into the state that :meth:`read_content` gave."""
         for content, row in zip(self._contents, table, strict=False):

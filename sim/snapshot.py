@@ -23,6 +23,8 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.markers import MARKERS
 
+from .faults import CAUSES, Containment
+
 _FORMAT = 1
 
 
@@ -47,6 +49,45 @@ class EnvStates:
         """The state of some of the envs, as copies."""
         return _build({name: rows[envs].copy() for name, rows in _flatten(self)})
 
+    def check(self, num_envs: int, dof: int, params: bp.PIDParams, sizes: Sequence[int]) -> None:
+        """Check that these are states of so many envs and joints under such params, with content of such sizes (envs,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            They are not.
+        """
+        row, table = np.zeros((num_envs, 13), np.float32), np.zeros((num_envs, dof), np.float32)
+        wanted: dict[str, Any] = dict.fromkeys(("qpos", "qvel", "effort"), table)
+        wanted |= {"root": row, "saturated": table > 0, "content": self.content[:num_envs]}
+        known = Containment(num_envs, dof, "hold", None).read()
+        wanted |= {f"containment.{name}": rows for name, rows in known.items()}
+        found = dict(_flatten(self))
+        remembered = bp.init(params, table)._asdict()
+        wanted |= {f"controller.{name}": leaf for name, leaf in remembered.items() if leaf is not None}
+        for name in sorted(set(wanted) | set(found)):
+            ours, theirs = wanted.get(name), found.get(name)
+            if ours is None or theirs is None:
+                problem = "no " + name if theirs is None else f"an unknown {name}"
+            elif ours.shape != theirs.shape or ours.dtype.kind != theirs.dtype.kind:
+                problem = f"{name} of {theirs.dtype} {theirs.shape}, not {ours.dtype} {ours.shape}"
+            else:
+                continue
+            raise InvalidArgumentError("snapshot", f"has {problem}", remedy="take a new one")
+        for name, count in (("joint", dof), ("cause", len(CAUSES))):
+            if not ((self.containment[name] >= 0) & (self.containment[name] < count)).all():
+                raise InvalidArgumentError(
+                    "snapshot", f"names a {name} beyond {count}", remedy="take a new one"
+                )
+        for env, size in enumerate(sizes):
+            if size > self.content.shape[1] or not np.isnan(self.content[env, size:]).all():
+                raise InvalidArgumentError(
+                    "snapshot",
+                    "holds other content than this runner's build makes",
+                    env=env,
+                    remedy="make the runner with the same build=",
+                )
+
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
         """The states of the envs of all ``parts``."""
@@ -68,7 +109,7 @@ class Snapshot:
     states: EnvStates
 
     def check(self, about: dict[str, Any]) -> None:
-        """Check that it fits a runner of which all this is true.
+        """Check that it is of a runner of which all this is true.
 
         Raises
         ------
@@ -81,13 +122,6 @@ class Snapshot:
                     "snapshot",
                     f"is of a runner with {key} {self.about.get(key)!r}, not {ours!r}",
                     remedy="restore it in a runner made with the same options",
-                )
-        shape = (about["num_envs"], len(about["joints"]))
-        for name, rows in _flatten(self.states):
-            per_env = name in ("root", "content") or rows.ndim == 1
-            if rows.shape[: 1 if per_env else 2] != shape[: 1 if per_env else 2]:
-                raise InvalidArgumentError(
-                    "snapshot", f"has {name} of shape {rows.shape}, not {shape}", remedy="take a new one"
                 )
 
     def for_envs(self, envs: slice) -> Snapshot:
@@ -131,13 +165,16 @@ class Snapshot:
             head = json.loads(str(tables.pop("head")))
             if head["format"] != _FORMAT:
                 raise ValueError(f"format {head['format']}, not {_FORMAT}")
+            about, steps = head["about"], head["steps"]
+            if not isinstance(about, dict) or not isinstance(steps, int) or not 0 <= steps < 2**62:
+                raise ValueError("it does not say what it is of")
             params = {
                 name.removeprefix("params."): tables.pop(name)
                 for name in list(tables)
                 if name.startswith("params.")
             }
             params |= {name: _marker(kind) for name, kind in head["markers"].items()}
-            return cls(head["about"], int(head["steps"]), bp.PIDParams(**params), _build(tables))
+            return cls(about, steps, bp.PIDParams(**params), _build(tables))
         except (
             OSError,
             ValueError,

@@ -93,6 +93,7 @@ BAD = {
     "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
     "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is no float"),
     "bool": (JOINT % '"kp": true', "no float"),
+    "huge": (JOINT % f'"kp": 1{"0" * 400}', "kp, joint 'elbow'.*no float"),
     "null": (JOINT % '"kp": null', "no float"),
     "nested": (JOINT % '"kp": [[1.0]]', "no float"),
     "empty": (JOINT % '"kp": []', "no float"),

@@ -193,6 +193,29 @@ def test_bad_files(tmp_path):
             read_recording(tmp_path / name)
 
 
+DAMAGE = {
+    "no names": (lambda file: file.attrs.pop("joint_names"), "does not say its joint_names"),
+    "a group": (lambda file: (file.pop("qpos"), file.create_group("qpos")), "slice"),
+    "other joints": (
+        lambda file: file.attrs.create("joint_names", ["a", "b"]),
+        r"setpoint is float64 \(2, 3, 9\)",
+    ),
+    "other limits": (lambda file: file.attrs.create("upper", 3.0), r"upper are \(\), not one for each of 9"),
+    "text": (lambda file: (file.pop("ok"), file.create_dataset("ok", data=["a", "b"])), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_file_is_told_of(case, tmp_path):
+    damage, message = DAMAGE[case]
+    with make() as runner, Recorder(tmp_path / "run.h5", runner):
+        runner.rollout(table(2))
+    with h5py.File(tmp_path / "run.h5", "r+") as file:
+        damage(file)
+    with pytest.raises(RecordingError, match=rf"cannot be read as a recording: .*{message}|{message}"):
+        read_recording(tmp_path / "run.h5")
+
+
 PROGRAM = """
 import sys, time, numpy as np, warnings
 warnings.simplefilter("ignore")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import subprocess
 import sys
@@ -154,6 +155,62 @@ def test_a_snapshot_of_another_kind_of_runner_is_refused(options, message):
         same(before, other.observe())
         with pytest.raises(InvalidArgumentError, match="snapshot: is none"):
             other.restore(before)
+
+
+def box(scene, env):
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.05, 0.05, 0.05])
+    builder.build(name="box")
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_snapshot_with_other_content_is_refused(kept):
+    builds = (box, None) if kept else (None, box)
+    with (
+        Runner(ROBOTS["panda"], 2, workers=0, build=builds[0]) as first,
+        Runner(ROBOTS["panda"], 2, workers=0, build=builds[1]) as second,
+    ):
+        snapshot, before = first.snapshot(), second.observe()
+        with pytest.raises(InvalidArgumentError, match=r"snapshot, env 0: holds other content.*same build="):
+            second.restore(snapshot)
+        same(before, second.observe())
+
+
+BROKEN = {
+    "about": (lambda head, tables: head.update(about=[]), "cannot be read"),
+    "steps": (lambda head, tables: head.update(steps=-1), "cannot be read"),
+    "a marker": (lambda head, tables: head.update(markers={"anti_windup": "Evil"}), "cannot be read"),
+    "no integral": (lambda head, tables: tables.pop("controller.integral"), "no controller.integral"),
+    "no home": (lambda head, tables: tables.pop("containment.home_qvel"), "no containment.home_qvel"),
+    "more": (lambda head, tables: tables.update(more=np.zeros(1)), "cannot be read"),
+    "an unknown leaf": (
+        lambda head, tables: tables.update({"containment.x": np.zeros(2)}),
+        "an unknown containment.x",
+    ),
+    "text": (lambda head, tables: tables.update(qpos=tables["qpos"].astype("U8")), "qpos of <U8"),
+    "one env": (lambda head, tables: tables.update(qvel=tables["qvel"][:1]), r"qvel of float32 \(1, 9\)"),
+    "a joint beyond": (
+        lambda head, tables: tables.update({"containment.joint": np.full(2, 9)}),
+        "names a joint beyond 9",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_damaged_snapshot_is_refused_before_anything_changes(case, tmp_path):
+    damage, message = BROKEN[case]
+    with Runner(ROBOTS["panda"], 2, workers=0) as runner:
+        runner.snapshot().save(tmp_path / "good.npz")
+        with np.load(tmp_path / "good.npz") as file:
+            tables = dict(file)
+        head = json.loads(str(tables.pop("head")))
+        damage(head, tables)
+        np.savez(tmp_path / "bad.npz", head=np.array(json.dumps(head)), **tables)
+        before = runner.step(ROBOTS["panda"].settings.target)
+        with pytest.raises(InvalidArgumentError, match=message):
+            runner.restore(Snapshot.load(tmp_path / "bad.npz"))
+        same(before, runner.observe())
+        assert runner.step(ROBOTS["panda"].settings.target).ok.all()
 
 
 def test_files_that_are_no_snapshot(tmp_path):
