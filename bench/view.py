@@ -4,7 +4,8 @@
     python bench/view.py --robot panda --num-envs 8 --control pid drive --width 1440 --height 900 --picture view.png
 
 Everything runs on this machine: workers, page server, and headless Chromium drawing in software, which is put behind
-the others (nice 19). ``served`` is what the view sends, ``drawn`` what the browser shows.
+the others (nice 19). ``served`` is what the view sends, ``drawn`` what the browser shows
+of it.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def main(options: Options) -> None:
     print(
         f"{options.num_envs} x {robot.name}, {' beside '.join(options.control)}, {options.physics}, "
         f"{options.width} x {options.height}: "
-        f"{served:.1f} frames/s served, {drawn / wall:.1f} drawn, {factor:.2f} x real time"
+        f"{served:.1f} frames/s served, {min(served, drawn / wall):.1f} drawn, {factor:.2f} x real time"
     )
 
 

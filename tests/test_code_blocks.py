@@ -34,6 +34,10 @@ SHORTER = {
 ONLY_PARSED = ("bench", "tune", "compare", "render")
 
 
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
 def blocks(page: Path, *languages: str) -> list[re.Match]:
     return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
 
@@ -49,9 +53,26 @@ def test_every_block_is_of_a_kind_that_is_run():
             assert match["language"] in ("python", "sh", "text"), f"{page.name}: {match[0][:60]}"
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name
-)
+def test_links_lead_somewhere():
+    for page in [*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"]:
+        text = page.read_text()
+        assert not re.findall(r"`[\w-]+\.md`", text), f"{page.name}: a page named without a link"
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#([\w-]+))?\)", text):
+            path, anchor = page.parent / target[0], target[1]
+            if not re.match(r"\w+:", target[0]):
+                assert path.exists(), f"{page.name}: {target[0]}"
+                titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
+                assert not anchor or anchor in [
+                    re.sub(r"[^\w-]", "", t.lower().replace(" ", "-")) for t in titles
+                ]
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs/README.md").read_text()
+    assert all(f"({page.name})" in index for page in ROOT.glob("docs/*.md") if page.name != "README.md")
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
 def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     namespace: dict = {"__name__": "__main__"}
@@ -62,7 +83,7 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
         exec(compile("\n" * line + match["code"], page, "exec"), namespace)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=name)
 def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     panda = Robot.load("panda")
