@@ -81,8 +81,20 @@ def draw_efforts(axes: Axes, traces: Traces, joint: int, mark: int | None) -> No
         note = f"peak {peak / limit:.0%} of ±{limit:g} {traces.effort_unit(joint)}"
     else:
         note = f"peak {peak:.3g} {traces.effort_unit(joint)}, no limit"
+    # Out of the way of the curves' ends.
+    low, high = axes.get_ylim()
+    ends = values[2 * len(values) // 3 :]
+    above = np.mean(ends, where=np.isfinite(ends)) < (low + high) / 2 if np.isfinite(ends).any() else False
     axes.text(
-        0.99, 0.09, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5, color="#444444"
+        0.99,
+        0.86 if above else 0.1,
+        note,
+        transform=axes.transAxes,
+        ha="right",
+        va="top" if above else "bottom",
+        fontsize=6.5,
+        color="#444444",
+        bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6},
     )
 
 

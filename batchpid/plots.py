@@ -184,18 +184,19 @@ def _figure(
     columns = min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
     lines = math.ceil(len(chosen) / columns)
     heights = (1.7, 0.85)[:rows]
-    size = ((4.0 if columns < 5 else 3.6) * columns, sum(heights) * lines + 0.75)
+    between = 0.06  # a thin empty row sets one joint's panels apart from the next one's
+    size = ((4.0 if columns < 5 else 3.6) * columns, (sum(heights) + between) * lines + 0.75)
     figure = Figure(figsize=size, layout="constrained")
     figure.get_layout_engine().set(h_pad=0.02, w_pad=0.05, hspace=0.0)  # type: ignore[call-arg, union-attr]
     if title:
         figure.suptitle(title, fontsize=11)
     # One flat grid, so that the panels of a column are aligned.
-    grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
+    grid = figure.add_gridspec(lines * (rows + 1), columns, height_ratios=(*heights, between) * lines)
 
     def blocks() -> Iterator[tuple[int, list[Axes]]]:
         for place, joint in enumerate(chosen):
             line, column = divmod(place, columns)
-            block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
+            block = [figure.add_subplot(grid[line * (rows + 1) + row, column]) for row in range(rows)]
             last = place + columns >= len(chosen)
             for axes in block:
                 axes.tick_params(labelsize=panels.SMALL, length=2)
@@ -215,6 +216,11 @@ def _name(axes: Axes, traces: Traces, joint: int) -> None:
 
 
 def _legend(figure: Figure, handles: list[Any]) -> None:
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=len(handles), fontsize=7.5, frameon=False
+    # As many side by side as the figure is wide enough for: an entry of n letters takes about n + 8 of them.
+    letters = figure.get_figwidth() * 17
+    columns = max(
+        1, min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles))))
     )
+    if sum(len(handle.get_label()) + 8 for handle in handles) < letters:
+        columns = len(handles)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False)

@@ -75,7 +75,8 @@ def main(options: Options) -> None:
         for flag in (*FLAGS, f"--window-size={options.width},{options.height}", f"--user-data-dir={profile}"):
             chrome.add_argument(flag)
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
-        page.get(view.url)
+        # A browser that is slow draws fewer pixels by and by; not so for a picture.
+        page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
         for process in psutil.Process().children(recursive=True):
             if process.pid not in before:
                 process.nice(19)
