@@ -30,6 +30,9 @@ class View:
     """Robots in each group; 64 in all at most."""
     control: tuple[Literal["pid", "drive"], ...] = ("pid",)
     """What moves them: pid, drive, or both side by side."""
+    params: OptionalStr = None
+    """Gains of the PID to begin with: a file that `batchpid tune` or batchpid.save_params wrote, or one of tuned,
+    designed, tutorial. Default: designed ones, per unit of effort."""
     compensate: Literal["gravity+coriolis", "gravity", "none"] = "gravity+coriolis"
     """Passive force added to the joints."""
     physics: Literal["accurate", "fast"] = "accurate"
@@ -51,6 +54,7 @@ class View:
         """Run it."""
         import sys
 
+        from batchpid.cli.gainsets import gain_set
         from batchpid.errors import InvalidArgumentError
         from sim import Robot
         from sim.arguments import integer
@@ -65,6 +69,11 @@ class View:
             source = _recorded(self.play, self.robot, 1 / self.fps)
         else:
             robot = Robot.load(self.robot or "panda")
+            gains = {} if self.params is None else gain_set(robot, self.params).options
+            if "control" in gains:
+                raise InvalidArgumentError(
+                    "params", "are the PID's", value=self.params, remedy="use --control drive for a drive"
+                )
             live = Live(
                 robot,
                 self.num_envs,
@@ -73,6 +82,7 @@ class View:
                 compensate=self.compensate,
                 physics=self.physics,
                 workers=self.workers,
+                **gains,
             )
             if robot.settings is not None:
                 live.go_to(robot.settings.target)

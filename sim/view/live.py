@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 
 from ..arguments import choice, integer, number
+from ..control import check_params
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..runner import Runner
@@ -50,6 +51,10 @@ class Live:
         Of start poses and random setpoints.
     workers
         Processes in all; default one for each core.
+    params
+        Of the PID, one row, in whatever gain units; default the robot's designed gains, and the tutorial's to choose.
+    measurement_rate
+        As :class:`sim.Runner` takes it, for the PID.
     options
         Of :class:`sim.Runner`: physics, compensate, timestep, ...
     """
@@ -64,6 +69,8 @@ class Live:
         spread: float = 0.2,
         seed: int = 0,
         workers: int | None = None,
+        params: bp.PIDParams | None = None,
+        measurement_rate: bool = False,
         **options: Any,
     ) -> None:
         self.robot = robot
@@ -81,6 +88,7 @@ class Live:
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
         self.start = np.clip(robot.start + offsets, low, high)
         self._low, self._high = np.maximum(low, -np.pi), np.minimum(high, np.pi)
+        self._base = None if params is None else _one_row(params, robot)
         self._sets = {control: self._gain_sets(control) for control in self.groups}
         self.gains: dict[str, dict[str, Float64]] = {}
         for control in self.groups:
@@ -105,6 +113,7 @@ class Live:
                         control=control,
                         substeps=substeps,
                         workers=share,
+                        measurement_rate=measurement_rate and control == "pid",
                         **options,
                     )
                 )
@@ -250,8 +259,23 @@ class Live:
         )
 
     def _gain_sets(self, control: str) -> dict[str, dict[str, Float64]]:
-        """Return named gains: those designed from the robot's inertia, and the tutorial's for a robot that has them."""
+        """Return named gains: those designed from the robot's inertia, and the tutorial's for a robot that has them.
+
+        Given ones stand alone: in other units no other set means the same.
+        """
         robot, settings = self.robot, self.robot.settings
+        if control == "pid" and self._base is not None:
+            rows = self._base.options()
+            rows["effort_limit"] = rows.get("effort_max", np.inf)
+            unset = {"setpoint_weight": 1.0}
+            return {
+                "given": {
+                    gain: np.broadcast_to(rows.get(gain, unset.get(gain, 0.0)), (1, robot.dof))[0].astype(
+                        float
+                    )
+                    for gain in GAINS
+                }
+            }
         limit = np.full(robot.dof, np.inf) if control == "drive" else robot.effort_limit
         plain = {"ki": 0.0, "derivative_filter_time": 0.0, "setpoint_weight": 1.0, "effort_limit": limit}
         sets: dict[str, dict[str, Any]] = {}
@@ -286,13 +310,23 @@ class Live:
         gains = self.gains[control]
         limit = gains["effort_limit"]
         shift = 0.0 if disturbance is None or control == "drive" else disturbance
-        return self.robot.params(
-            kp=gains["kp"],
-            ki=gains["ki"],
-            kd=gains["kd"],
-            derivative_filter_time=np.maximum(gains["derivative_filter_time"], _LEAST_FILTER),
-            setpoint_weight=np.minimum(gains["setpoint_weight"], _MOST_WEIGHT),
-            weight_origin="start",
-            effort_min=shift - limit,
-            effort_max=shift + limit,
-        )
+        chosen: dict[str, Any] = {
+            "kp": gains["kp"],
+            "ki": gains["ki"],
+            "kd": gains["kd"],
+            "derivative_filter_time": np.maximum(gains["derivative_filter_time"], _LEAST_FILTER),
+            "setpoint_weight": np.minimum(gains["setpoint_weight"], _MOST_WEIGHT),
+            "effort_min": shift - limit,
+            "effort_max": shift + limit,
+        }
+        if control == "pid" and self._base is not None:
+            return self._base.replace(**chosen)
+        return self.robot.params(**chosen, weight_origin="start")
+
+
+def _one_row(params: bp.PIDParams, robot: Robot) -> bp.PIDParams:
+    """Return ``params`` if the sliders can stand for them: one row, of the robot's joints."""
+    params = check_params(params, robot, 1, "pid")
+    if params.weight_origin is None and params.setpoint_weight is None:
+        return params.replace(weight_origin="start")  # of no effect until the weight is moved
+    return params

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import batchpid as bp
 from sim import Robot, Rollout
 
 pytest.importorskip("viser")
@@ -28,6 +29,15 @@ def test_ctrl_c_is_how_it_ends(batchpid, monkeypatch):
     assert (status, err) == (0, "")
     assert "http://127.0.0.1:" in said
     assert "x real time" in said
+
+
+def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
+    robot = Robot.load("panda")
+    bp.save_params(tmp_path / "plain.yaml", robot.params(kp=50.0), robot.joint_names)
+    for params in ("tuned", "tutorial", tmp_path / "plain.yaml"):
+        status, _, err = batchpid("view", *SHORT, "--params", params, "--seconds", 0.1)
+        assert (status, err) == (0, "")
+    assert "--control drive" in batchpid("view", *SHORT, "--params", "drive:20,5")[2]
 
 
 def test_of_many_recorded_robots_those_are_shown_that_fit(batchpid, tmp_path):

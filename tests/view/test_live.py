@@ -146,6 +146,30 @@ def test_sets_of_gains_are_the_designed_and_the_tutorials(live):
     assert np.abs(run(live, 2.5).qpos - live.robot.settings.target)[:, :7].max() < 0.02
 
 
+def test_given_params_run_as_they_are_until_a_slider_moves():
+    """Tuned ones too, which are per unit of the mass matrix."""
+    robot = Robot.load("panda")
+    live = Live(robot, 2, workers=0, physics="fast", **robot.tuned())
+    tuned = robot.tuned()["params"]
+    assert live.gain_sets("pid") == ("given",)
+    live.go_to(robot.settings.target)
+    with Runner(robot, 2, workers=0, physics="fast", **robot.tuned()) as runner:
+        runner.reset(live.start)
+        for _ in range(3):
+            live.advance()
+            obs = runner.step(live.setpoint, substeps=round(live.period * 2000))
+    np.testing.assert_array_equal(live.frame().qpos, obs.qpos)
+    np.testing.assert_array_equal(live._params("pid", None).kp, tuned.kp)
+    live.tune("pid", "kp", 0, 300.0)
+    live.payload = 1.0
+    run(live, 1.5)
+    changed = live._runners[0].params
+    assert changed.kp[0, 0] == 300.0
+    assert type(changed.gain_units) is type(tuned.gain_units)
+    assert np.abs(live.frame().qpos - robot.settings.target)[:, :7].max() < 0.05
+    live.close()
+
+
 def test_bad_wishes_are_named():
     robot = Robot.load("panda")
     for options, named in (
