@@ -6,7 +6,8 @@ from .limits import SetpointWarning
 from .observation import Observation, Rollout
 from .physics import Physics
 from .pool import RecoveryWarning
-from .recording import Recorder, Recording, read_recording
+from .recorded import Recording, read_recording
+from .recording import Recorder
 from .robot import Robot
 from .runner import Runner
 from .snapshot import Snapshot

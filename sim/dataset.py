@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
 from .observation import Rollout
-from .recording import read_recording
+from .recorded import read_recording
 from .robot import Robot
 
 if TYPE_CHECKING:

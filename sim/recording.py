@@ -17,10 +17,10 @@ import json
 import math
 import os
 import platform
+import re
 import tempfile
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError, MissingDependencyError
-
-from .arguments import integer
 
 if TYPE_CHECKING:
     import h5py
@@ -45,7 +43,7 @@ _LAG = 0.75  # seconds by which what is on disk may lag behind what is recorded
 _BUFFER = 64 << 20  # bytes that may wait to be written
 _CHUNK = 1 << 18  # bytes of a chunk of the file, about
 
-_FIELDS = {
+FIELDS = {
     "setpoint": np.float64,
     "qpos": np.float32,
     "qvel": np.float32,
@@ -53,7 +51,7 @@ _FIELDS = {
     "saturated": np.bool_,
     "ok": np.bool_,
 }
-_PER_JOINT = ("joint_names", "units", "lower", "upper")  # attributes
+PER_JOINT = ("joint_names", "units", "lower", "upper")  # attributes
 
 
 class RecordingError(BatchPIDError, OSError):
@@ -164,34 +162,40 @@ class Recorder:
     def _check(self) -> None:
         if self._error is not None:
             raise RecordingError(
-                f"{self.partial}: cannot be written: {self._error}; what was recorded before can be read"
+                f"{self.partial}: cannot be written: {_cause(self._error)}; what was recorded before can be read"
             ) from self._error
 
     def _create(self, seed: int | None) -> tuple[h5py.File, dict[str, h5py.Dataset]]:
-        h5py, runner = _h5py(), self._runner
+        h5py, runner = load_h5py(), self._runner
         shape = (runner.num_envs, runner.robot.dof)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=_CHUNK, rdcc_w0=1.0)
         except OSError as error:
-            raise RecordingError(f"{self.partial}: cannot be made: {error}") from error
-        for name, value in _attributes(runner, seed).items():
-            file.attrs[name] = value
-        datasets = {
-            "time": file.create_dataset(
-                "time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan
-            )
-        }
-        for name, dtype in _FIELDS.items():
-            table = shape[:1] if name == "ok" else shape
-            rows = max(1, _CHUNK // (int(np.prod(table)) * np.dtype(dtype).itemsize))
-            datasets[name] = file.create_dataset(
-                name, (0, *table), dtype, maxshape=(None, *table), chunks=(rows, *table)
-            )
-        for name, unit in _units(runner).items():
-            datasets[name].attrs["unit"] = unit
-        file.flush()
-        file.swmr_mode = True
+            raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
+        try:
+            for name, value in _attributes(runner, seed).items():
+                file.attrs[name] = value
+            datasets = {
+                "time": file.create_dataset(
+                    "time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan
+                )
+            }
+            for name, dtype in FIELDS.items():
+                table = shape[:1] if name == "ok" else shape
+                rows = max(1, _CHUNK // (int(np.prod(table)) * np.dtype(dtype).itemsize))
+                datasets[name] = file.create_dataset(
+                    name, (0, *table), dtype, maxshape=(None, *table), chunks=(rows, *table)
+                )
+            for name, unit in _units(runner).items():
+                datasets[name].attrs["unit"] = unit
+            file.flush()
+            file.swmr_mode = True
+        except (OSError, RuntimeError) as error:
+            _let_go(file)
+            file.close()
+            self.partial.unlink()
+            raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
         return file, datasets
 
     def _write_rows(self) -> None:
@@ -210,6 +214,7 @@ class Recorder:
                 if rows:
                     self._write(rows)
             except Exception as error:
+                _let_go(self._file)
                 with self._wake:
                     self._error = error
                     self._wake.notify_all()
@@ -239,9 +244,14 @@ class Recorder:
     def _finish(self, complete: bool) -> None:
         faults = [fault._asdict() for fault in self._runner.faults]
         try:
-            with _h5py().File(self.partial, "r+") as file:
-                file.attrs["complete"] = complete
-                file.attrs["faults"] = json.dumps(faults)
+            with load_h5py().File(self.partial, "r+") as file:
+                try:
+                    file.attrs["complete"] = complete
+                    file.attrs["faults"] = json.dumps(faults)
+                    file.flush()
+                except BaseException:
+                    _let_go(file)
+                    raise
             with self.partial.open("rb") as whole:
                 os.fsync(whole.fileno())
             if complete and self._overwrite:
@@ -254,101 +264,10 @@ class Recorder:
                 raise RecordingError(
                     f"{self.path} was made by someone else meanwhile; the recording is in {self.partial}"
                 ) from None
-        except OSError as error:
-            raise RecordingError(f"{self.partial}: cannot be completed: {error}") from error
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording, read: arrays as in :class:`sim.Rollout`, and what they belong to. See :func:`read_recording`."""
-
-    path: Path
-    time: NDArray[np.float64]
-    setpoint: NDArray[np.float64]
-    qpos: NDArray[np.float32]
-    qvel: NDArray[np.float32]
-    effort: NDArray[np.float32]
-    saturated: NDArray[np.bool_]
-    ok: NDArray[np.bool_]
-    attributes: dict[str, Any]
-
-    @property
-    def complete(self) -> bool:
-        """Whether the run came to its end."""
-        return bool(self.attributes["complete"])
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints."""
-        return tuple(map(str, self.attributes["joint_names"]))
-
-    @property
-    def params(self) -> bp.PIDParams:
-        """The params at the start of the recording."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "params.json"
-            path.write_text(str(self.attributes["params"]))
-            return bp.load_params(path, self.joint_names)[0]
-
-
-def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording:
-    """Read a recording: complete, cut short by a kill, or one that is still being written.
-
-    Parameters
-    ----------
-    every
-        Take every so-manieth tick.
-
-    Raises
-    ------
-    RecordingError
-        The file is missing, or no recording.
-    """
-    if not isinstance(path, str | os.PathLike):
-        raise InvalidArgumentError("path", "must be a path", value=path, remedy="pass the file's name")
-    every = integer("every", every, 1, 10**9)
-    h5py, path = _h5py(), Path(path)
-    try:
-        found = path.is_file()
-    except (OSError, ValueError) as error:  # no name that a file can have
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
-    if not found:
-        raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
-    try:
-        try:
-            file = h5py.File(path, "r")
-        except OSError:
-            file = h5py.File(
-                path, "r", swmr=True, libver="latest"
-            )  # someone writes it, or was killed while doing so
-        with file:
-            attributes = dict(file.attrs)
-            if attributes.get("format") != FORMAT:
-                raise ValueError(f"its format is {attributes.get('format')!r}, not {FORMAT!r}")
-            lacking = {"complete", "faults", "params", *_PER_JOINT} - set(attributes)
-            if lacking:
-                raise ValueError(f"it does not say its {', '.join(sorted(lacking))}")
-            times = file["time"][:]
-            count = int(np.isfinite(times).sum())
-            arrays = {name: file[name][:count:every] for name in _FIELDS}
-            _check_shapes(arrays, attributes)
-    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
-        raise RecordingError(f"{path}: cannot be read as a recording: {error}") from error
-    return Recording(path=path, time=times[:count:every], attributes=attributes, **arrays)
-
-
-def _check_shapes(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:
-    ticks, envs = arrays["ok"].shape
-    dof = len(attributes["joint_names"])
-    for name, rows in arrays.items():
-        shape = (ticks, envs) if name == "ok" else (ticks, envs, dof)
-        if rows.shape != shape or rows.dtype != _FIELDS[name]:
-            raise ValueError(
-                f"its {name} is {rows.dtype} {rows.shape}, not {np.dtype(_FIELDS[name])} {shape}"
-            )
-    for name in _PER_JOINT:
-        if np.shape(attributes[name]) != (dof,):
-            raise ValueError(f"its {name} are {np.shape(attributes[name])}, not one for each of {dof} joints")
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(
+                f"{self.partial}: cannot be completed: {_cause(error)}; all that was recorded is in it"
+            ) from error
 
 
 def check_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -375,6 +294,23 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path
     return path
 
 
+def _cause(error: Exception) -> str:
+    """What the system said; HDF5 puts a lot around it."""
+    said = re.search(r"error message = '([^']+)'", str(error))
+    return said[1] if said else str(error)
+
+
+def _let_go(file: h5py.File) -> None:
+    """Leave what is on disk of ``file`` as it is, when no more can be written to it.
+
+    HDF5 writes the rest when it closes a file, and can crash the process where it cannot: it gets memory to write to.
+    """
+    with contextlib.suppress(Exception):
+        memory = os.memfd_create("batchpid-rest", os.MFD_CLOEXEC)
+        os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
+        os.close(memory)
+
+
 def _free_name(path: Path) -> Path:
     """A name beside ``path`` that no file has: what an earlier run left behind is kept."""
     partial, number = path.with_name(path.name + ".partial"), 1
@@ -384,7 +320,8 @@ def _free_name(path: Path) -> Path:
     return partial
 
 
-def _h5py() -> Any:
+def load_h5py() -> Any:
+    """The package, or an error that says how to get it."""
     try:
         import h5py
     except ImportError:

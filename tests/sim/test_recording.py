@@ -160,22 +160,57 @@ def test_faults_are_told(tmp_path):
     assert recording.ok.tolist() == [[True] * 3] * 2 + [[True, False, True]] * 2
 
 
-def test_a_full_disk_is_told(tmp_path):
-    with make() as runner:
-        recorder = Recorder(tmp_path / "run.h5", runner)
+FULL = """
+import os, sys, time, warnings
+warnings.simplefilter("ignore")
+from sim import Robot, Runner, Recorder, read_recording
+robot = Robot.load("panda")
+with Runner(robot, 3, workers=0, substeps=2) as runner:
+    recorder = Recorder(sys.argv[1], runner)
+    for _ in range(50):
+        runner.step(robot.start)
+    while len(read_recording(recorder.partial).time) < 50:
+        time.sleep(0.02)
+    os.dup2(os.open("/dev/full", os.O_RDWR), recorder._file.id.get_vfd_handle())  # from here on there is no space
+    try:
+        while True:
+            runner.step(robot.start)
+    except OSError as error:
+        print(error)
+    try:
+        recorder.close()
+    except OSError as error:
+        print(error)
+    print(runner.step(robot.start).ok.all())
+"""
 
-        def full(rows):
+
+def test_a_disk_that_fills_up_crashes_nothing_and_what_was_recorded_can_be_read(tmp_path):
+    path = tmp_path / "run.h5"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, path],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    told = f"{path}.partial: cannot be written: No space left on device; what was recorded before can be read"
+    assert done.stdout.splitlines() == [told, told, "True"]
+    assert len(read_recording(tmp_path / "run.h5.partial").time) == 50
+
+
+def test_no_space_from_the_start(tmp_path, monkeypatch):
+    with make() as runner:
+
+        def full(self, *arguments, **options):
             raise OSError(28, "No space left on device")
 
-        recorder._write = full
-        runner.step(ROBOT.start)
-        with pytest.raises(RecordingError, match=r"partial: cannot be written.*No space left"):  # noqa: PT012
-            for _ in range(1000):
-                runner.step(ROBOT.start)
-                time.sleep(0.01)
-        with pytest.raises(RecordingError):
-            recorder.close()
-        runner.step(ROBOT.start)
+        monkeypatch.setattr(h5py.Group, "create_dataset", full)
+        with pytest.raises(RecordingError, match=r"partial: cannot be made: .*No space"):
+            Recorder(tmp_path / "run.h5", runner)
+        assert not os.listdir(tmp_path)
+        assert runner.recorder is None
 
 
 @pytest.mark.parametrize("path", ["run.csv", "run", 3, None])
