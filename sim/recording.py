@@ -244,7 +244,8 @@ class Recorder:
     def _finish(self, complete: bool) -> None:
         faults = [fault._asdict() for fault in self._runner.faults]
         try:
-            with load_h5py().File(self.partial, "r+") as file:
+            # Without a lock: someone may be watching, and nobody else writes.
+            with load_h5py().File(self.partial, "r+", locking=False) as file:
                 try:
                     file.attrs["complete"] = complete
                     file.attrs["faults"] = json.dumps(faults)

@@ -86,6 +86,21 @@ def test_it_can_be_read_while_it_grows(tmp_path):
         assert not read_recording(recorder.partial).complete
 
 
+def test_whoever_watches_it_grow_does_not_keep_it_from_its_end(tmp_path):
+    watch = (
+        "import h5py, sys; file = h5py.File(sys.argv[1], 'r', swmr=True, libver='latest'); "
+        "print('open', flush=True); sys.stdin.read()"
+    )
+    with make() as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
+        runner.rollout(table(5))
+        command = [sys.executable, "-c", watch, recorder.partial]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout.readline() == b"open\n"
+            recorder.close()
+            process.stdin.close()
+    assert len(read_recording(tmp_path / "run.h5").time) == 5
+
+
 def test_no_earlier_file_is_destroyed(tmp_path):
     path = tmp_path / "run.h5"
     path.write_text("precious")
