@@ -32,11 +32,14 @@ class Inspect:
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
         print(_joints(robot, self.all) + "\n")
-        findings = robot.check(setpoint=None if robot.settings is None else robot.settings.target)
-        if not findings:
-            print("Nothing odd about it.")
-        for finding in findings:
-            print(finding)
+        setpoint = None if robot.settings is None else robot.settings.target
+        findings = robot.check(setpoint=setpoint)
+        of_robot = robot.check(setpoint=setpoint, control="drive")  # the PID's gains left aside
+        of_gains = [finding for finding in findings if finding not in of_robot]
+        print("\n".join(map(str, of_robot)) or "Nothing odd about it.")
+        if of_gains:
+            print("\nUnder the tutorial's gains, robot.params(); those of robot.tuned() keep the bound:")
+            print("\n".join(map(str, of_gains)))
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 
