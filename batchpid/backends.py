@@ -12,6 +12,9 @@ from batchpid.errors import MissingDependencyError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
+LARGE = 2**18
+"""Envs from which JAX's CPU backend does them block by block: its own buffers then come from the system each time."""
+
 
 class NumPyBackend:
     """Runs the law on NumPy, with the coefficients at hand and spread over all envs."""
@@ -60,7 +63,10 @@ class JAXBackend:
             import jax
         except ImportError:
             raise MissingDependencyError("jax", "backend='jax'", "jax") from None
-        self.jax = jax
+        from batchpid.blocks import advance_in_blocks
+
+        self.jax, self.terms = jax, terms
+        self._spare: PIDState | None = None  # the state before the last, to write over
 
         def step(
             params: PIDParams, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
@@ -68,6 +74,10 @@ class JAXBackend:
             k = discretise(params, dt)
             new, effort, *shown = law.advance(k, state, r, y, y_rate, r_rate, ff, terms)
             return new, effort, shown[0] if shown else None
+
+        def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:
+            out = (spare, jax.numpy.zeros_like(inputs[1]))
+            return advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
 
         def reset(params: PIDParams, state: PIDState, y: Any, mask: Any) -> PIDState:
             return law.reset(params, state, y, mask)
@@ -83,6 +93,7 @@ class JAXBackend:
 
         self._init = self._compiled(law.init)
         self._step = self._compiled(step, donate_argnums=3)
+        self._step_in_blocks = self._compiled(step_in_blocks, donate_argnums=3)
         self._reset, self._reset_but_integral = self._compiled(reset), self._compiled(reset_but_integral)
         self._track = self._compiled(track)
 
@@ -106,7 +117,7 @@ class JAXBackend:
         own = [jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one]
         stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
         self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
-        self.dtype = self.packed[1].dtype
+        self.dtype, self._spare = self.packed[1].dtype, None
 
     def array(self, value: Any) -> Any:
         """Return ``value`` as an array that the backend steps on."""
@@ -122,7 +133,16 @@ class JAXBackend:
         self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
     ) -> tuple[PIDState, Any, Terms | None]:
         """Return the new state, the effort, and the terms where they are kept."""
-        return self._step(*self.packed, state, r, y, y_rate, r_rate, ff)
+        if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
+            return self._step(*self.packed, state, r, y, y_rate, r_rate, ff)
+        spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
+        new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, y_rate, r_rate, ff)
+        self._spare = state
+        return new, effort, None
+
+    def _on_one_cpu(self, y: Any) -> bool:
+        devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]
+        return [device.platform for device in devices] == ["cpu"]
 
     def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
         """Return the state with the envs of ``mask`` begun anew."""

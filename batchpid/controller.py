@@ -31,7 +31,8 @@ class BatchPID:
     dt
         Time between calls [s].
     backend
-        "numpy", or "jax": compiled once, with the state's buffers donated from call to call.
+        "numpy", or "jax": compiled once, with the state's buffers donated from call to call, and on a CPU block by
+        block where the batch is large.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names

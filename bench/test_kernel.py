@@ -5,7 +5,8 @@ each input read once and each output written once: setpoint, measurement, feedfo
 filtered rate in, and effort, integral, measurement and filtered rate out, 10 arrays of envs x joints. Bandwidth is
 that over the best time of a step; ``of triad`` is its share of a[i] = b[i] + s c[i] over arrays of the same size,
 counted as 3 arrays, measured next to it on all cores (numba), or of a copy on the GPU where JAX has one. Compilation
-is never timed.
+is never timed. "jax" is :class:`batchpid.BatchPID`; "jax in blocks" is :func:`batchpid.blocks.advance_in_blocks` under
+shard_map with a device for each core, whose efforts are written over those of the step before last.
 """
 
 import os
@@ -18,9 +19,11 @@ import pytest
 import simple_pid
 
 import batchpid as bp
+from batchpid.blocks import advance_in_blocks
 from batchpid.oracle import SimplePID
 
 numba = pytest.importorskip("numba")
+jax.config.update("jax_num_cpu_devices", os.cpu_count())
 
 JOINTS, DT = 9, 1 / 2000
 GAINS = {"kp": 40.0, "ki": 5.0, "kd": 2.0}
@@ -110,6 +113,34 @@ def jax_step(envs):
     return call
 
 
+def jax_step_in_blocks(envs):
+    """Each device has its own envs; the state and the effort are written over those before the last."""
+    mesh = jax.make_mesh((jax.device_count(),), ("envs",), axis_types=(jax.sharding.AxisType.Auto,))
+    by_env = jax.P("envs")
+    r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(envs))
+    k = jax.tree.map(jnp.asarray, bp.discretise(PARAMS, DT))
+
+    def step(out, k, state, r, y, ff):
+        return advance_in_blocks(k, state, r, y, feedforward=ff, out=out)
+
+    sharded = jax.shard_map(
+        step, mesh=mesh, in_specs=(by_env, jax.P(), *[by_env] * 4), out_specs=by_env, check_vma=False
+    )
+    step = jax.jit(sharded, donate_argnums=0)
+    params = jax.tree.map(jnp.asarray, PARAMS)
+    state, turn = bp.init(params, y1), [y0, y1]
+    out = (bp.init(params, y1), jnp.zeros_like(y1))
+
+    def call():
+        nonlocal state, out
+        turn.reverse()
+        new, effort = jax.block_until_ready(step(out, k, state, r, turn[0], ff))
+        state, out = new, (state, effort)
+        return effort
+
+    return call
+
+
 def numba_step(envs):
     r, y0, y1, ff = inputs(envs)
     k = bp.discretise(PARAMS, DT)
@@ -160,13 +191,20 @@ def simple():
     return compute
 
 
-KERNELS = {"numpy": numpy_step, "jax": jax_step, "numba by hand": numba_step}
+KERNELS = {
+    "numpy": numpy_step,
+    "jax": jax_step,
+    "jax in blocks": jax_step_in_blocks,
+    "numba by hand": numba_step,
+}
 SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
 
 
 @pytest.mark.parametrize("envs", SIZES)
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_step(benchmark, kernel, envs):
+    if kernel == "jax in blocks" and envs < 2**16:
+        pytest.skip("for large batches")
     call = KERNELS[kernel](envs)
     first = np.array(call())
     assert np.isfinite(first).all()
@@ -182,7 +220,7 @@ def test_step(benchmark, kernel, envs):
         "GB/s": round(moved / least / 1e9, 2),
         "of triad": round(moved / least / bandwidth, 3),
         "triad GB/s": round(bandwidth / 1e9, 1),
-        "device": str(jax.devices()[0]) if kernel == "jax" else f"{os.cpu_count()} CPUs",
+        "device": str(jax.devices()[0]) if kernel.startswith("jax") else f"{os.cpu_count()} CPUs",
     }
 
 
@@ -195,10 +233,11 @@ def test_scalar_loop(benchmark, kernel, envs):
     benchmark.extra_info["ns per env"] = round(1e9 * benchmark.stats.stats.min / envs, 1)
 
 
-def test_against_the_scalar_loop_in_one_run(benchmark):
+@pytest.mark.parametrize("kernel", ["jax", "jax in blocks"])
+def test_against_the_scalar_loop_in_one_run(benchmark, kernel):
     """The JAX step at 2^20 x 9 against the tutorial's scalar loop, per env."""
     slow = best(SCALARS["tutorial"](4096)) / 4096
-    call = jax_step(2**20)
+    call = KERNELS[kernel](2**20)
     benchmark.pedantic(call, rounds=5, warmup_rounds=2)
     ratio = slow / (benchmark.stats.stats.min / 2**20)
     benchmark.extra_info["times the scalar loop"] = round(ratio)

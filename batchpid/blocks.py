@@ -1,0 +1,67 @@
+"""The law over a large batch on JAX's CPU backend, block by block.
+
+XLA compiles one kernel for each output there, and each reads the inputs again; over a large batch that is from memory,
+into buffers that the system hands out page by page. A block of some thousand rows stays in the cache between its
+kernels, and what it gives is written over arrays that are no longer needed. Flat, so that a row of 9 joints does not
+cut short the processor's vectors of 8 or 16.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from batchpid.coefficients import Coefficients
+from batchpid.law import advance
+from batchpid.state import PIDState
+
+ROWS = 1024
+"""Envs to a block."""
+
+
+def advance_in_blocks(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+    *,
+    out: tuple[PIDState, Any] | None = None,
+    rows: int = ROWS,
+) -> tuple[PIDState, Any]:
+    """Do one step as :func:`batchpid.advance` does, ``rows`` envs at a time: for jax.jit, with ``out`` donated.
+
+    ``out`` is a state and an effort, (envs, joints) each, to write over: those of the step before last, say, but not
+    ``state`` itself. None takes new ones. On several devices use it under ``jax.shard_map``, each with its own envs.
+    """
+    envs, joints = measurement.shape
+    inputs = (setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    if envs <= rows:
+        return advance(k, state, *inputs)
+    if out is None:
+        out = (jax.tree.map(jnp.zeros_like, state), jnp.zeros_like(measurement))
+    block, total = rows * joints, envs * joints
+
+    def flat(x: Any) -> Any:  # a row that all envs share is repeated over a block
+        if jnp.ndim(x) < 2:
+            return x
+        return (jnp.tile(x, (rows, 1)) if x.shape[0] == 1 else x).reshape(-1)
+
+    def step(n: Any, out: Any) -> Any:
+        start = jnp.minimum(
+            n * block, total - block
+        )  # the last block may do some rows of the one before again
+
+        def cut(x: Any) -> Any:
+            return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
+
+        done = advance(*jax.tree.map(cut, given))
+        return jax.tree.map(lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done)
+
+    given = jax.tree.map(flat, (k, state, *inputs))
+    out = jax.lax.fori_loop(0, -(-envs // rows), step, jax.tree.map(flat, out))
+    return jax.tree.map(lambda x: x.reshape(envs, joints), out)

@@ -1,0 +1,92 @@
+"""The law block by block is the law."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DT, ENVS, GAINS, JOINTS, LIMITED
+
+import batchpid as bp
+from batchpid import backends
+from batchpid.blocks import advance_in_blocks
+
+RATES = ("measurement_rate", "setpoint_rate", "feedforward")
+
+
+def compare(params, inputs, rows):
+    """Assert that steps in blocks, each written over the state before last, are those of plain steps."""
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
+    k = bp.discretise(params, DT)
+    blocks = jax.jit(lambda out, *given: advance_in_blocks(k, *given, out=out, rows=rows), donate_argnums=0)
+    plain = jax.jit(lambda *given: bp.advance(k, *given))
+    expected = state = bp.init(params, jnp.asarray(inputs.measurement[0], jnp.float32))
+    out = None
+    for t in range(4):
+        now = [jnp.asarray(getattr(inputs, n)[t], jnp.float32) for n in ("setpoint", "measurement", *RATES)]
+        now[0] = now[0][:1]  # for all envs alike
+        expected, effort = plain(expected, *now)
+        (new, again), before = blocks(out, state, *now), state
+        state, out = new, (before, again)
+        np.testing.assert_allclose(again, effort, rtol=1e-5, atol=1e-4)
+        assert jax.tree.structure(state) == jax.tree.structure(expected)
+        for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(expected), strict=True):
+            assert a.shape == (ENVS, JOINTS)
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
+
+
+def test_blocks_are_the_law_under_every_option(options, inputs):
+    """Four envs in blocks of three: the second block does two of the first's rows again."""
+    compare(bp.make_params(JOINTS, **options, dtype=np.float32), inputs, rows=3)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 4, 5])
+def test_blocks_of_any_size(rows, inputs):
+    params = bp.make_params(JOINTS, **LIMITED, anti_windup="back_calculation", dtype=np.float32)
+    compare(params, inputs, rows)
+
+
+def test_blocks_have_the_law_s_gradients(inputs):
+    params = bp.make_params(JOINTS, **GAINS, dtype=np.float32)
+    r, y = (jnp.asarray(x[0], jnp.float32) for x in (inputs.setpoint, inputs.measurement))
+
+    def total(step, kp, **how):
+        k = bp.discretise(jax.tree.map(jnp.asarray, params)._replace(kp=kp), DT)
+        return jnp.sum(step(k, bp.init(params, y), r, y, **how)[1])
+
+    kp = jnp.asarray(params.kp)
+    slopes = [jax.grad(lambda kp: total(bp.advance, kp))(kp)]
+    slopes.append(jax.grad(lambda kp: total(advance_in_blocks, kp, rows=3))(kp))
+    assert (slopes[0] != 0).any()
+    np.testing.assert_allclose(*slopes, rtol=1e-5)
+
+
+def test_a_large_batch_goes_in_blocks(monkeypatch, inputs):
+    """Through reset, track and a change of params, where the state that is written over must not be in use."""
+    params = bp.make_params(
+        JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32
+    )
+    pids = []
+    for large in (10**9, ENVS):
+        monkeypatch.setattr(backends, "LARGE", large)
+        pid, efforts = bp.BatchPID(params, ENVS, DT, "jax"), []
+        for t in range(12):
+            r, y = inputs.setpoint[t], inputs.measurement[t]
+            if t == 4:
+                pid.reset(y, np.arange(ENVS) == 1)
+            if t == 6:
+                pid.track(r, y, np.full_like(y, 0.3))
+            if t == 8:
+                pid.params = params.replace(derivative_filter_time=0.02)
+            efforts.append(pid(r, y, feedforward=inputs.feedforward[t]))
+        assert (pid._engine._spare is not None) == (large == ENVS)
+        pids.append((np.stack(efforts), pid.state))
+    np.testing.assert_allclose(pids[0][0], pids[1][0], rtol=1e-5, atol=1e-4)
+    for a, b in zip(*(jax.tree.leaves(state) for _, state in pids), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
+
+
+def test_a_batch_that_asks_for_terms_gets_them(monkeypatch):
+    monkeypatch.setattr(backends, "LARGE", ENVS)
+    pid = bp.BatchPID(bp.make_params(JOINTS, 3.0), ENVS, DT, "jax", terms=True)
+    pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
+    assert (np.asarray(pid.terms.p) == 3).all()
