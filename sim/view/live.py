@@ -158,6 +158,11 @@ class Live:
         """Return the names of the sets that :meth:`take_gains` knows; the first is in force at the start."""
         return tuple(self._sets[control])
 
+    @property
+    def gain_units(self) -> str:
+        """What the PID's gains are per: "effort", "inertia" or "mass_matrix"."""
+        return "effort" if self._base is None else str(self._base.options().get("gain_units", "effort"))
+
     def take_gains(self, control: str, name: str) -> None:
         """Give every joint of a group the gains of a named set."""
         chosen = self._sets[control][choice("name", name, self._sets[control])]

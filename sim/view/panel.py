@@ -87,7 +87,8 @@ class Panel:
         source = self._source
         lines = [
             f"**{source.per_group} x {source.robot.name}** · {' beside '.join(source.groups)}",
-            f"t = {frame.time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s",
+            f"t = {frame.time:.2f} s · "
+            + (f"{factor:.2f} x real time · {rate:.0f} frames/s" if self.playing else "paused"),
         ]
         dead, strained = int((~frame.ok).sum()), int(frame.saturated.sum())
         if dead:
@@ -162,7 +163,7 @@ class Panel:
     def _gains(self, live: Live) -> None:
         gui = self._gui
         control = gui.add_dropdown("Of", live.groups) if len(live.groups) > 1 else None
-        gui.add_markdown("Of the watched joint, on every robot:")
+        says = gui.add_markdown("")
         rows: dict[str, tuple[Any, float]] = {}
 
         def group() -> str:
@@ -186,8 +187,11 @@ class Panel:
         back = gui.add_button_group("All joints to", names)
 
         def show(_: Any = None) -> None:
+            joint = live.robot.joints[self.joint]
+            of_joint = f"Of **{self._names[self.joint]}**, on every robot"
+            says.content = f"{of_joint}. {_gain_units(live, group(), joint.unit, joint.effort_unit)}"
             for gain, (slider, factor) in rows.items():
-                value, top = (factor * number for number in live.gain_range(group(), gain, self.joint))
+                value, top = (_short(factor * n) for n in live.gain_range(group(), gain, self.joint))
                 slider.max, slider.step = max(value, top), _step(top)
                 slider.value = value
 
@@ -236,6 +240,18 @@ def short_names(robot: Robot) -> tuple[str, ...]:
 def _first_moving(robot: Robot) -> int:
     """Return the joint that the tutorial moves farthest, to begin with."""
     return 0 if robot.settings is None else int(np.argmax(np.abs(robot.settings.target - robot.start)))
+
+
+def _gain_units(live: Live, control: str, position: str, effort: str) -> str:
+    """Return the units of kp, ki and kd, in words."""
+    if control == "pid" and live.gain_units != "effort":
+        return "kp in 1/s², ki in 1/s³, kd in 1/s, times the inertia."
+    return f"kp in {effort}/{position}, ki in {effort}/({position} s), kd in {effort} s/{position}."
+
+
+def _short(value: float) -> float:
+    """Return a number of four digits to show: the box beside a slider holds no more."""
+    return float(f"{value:.4g}")
 
 
 def _step(width: float) -> float:
