@@ -84,7 +84,7 @@ def test_robots_are_there_and_a_slider_moves_them(live, open_page, until):
 def test_gains_pause_step_reset_and_push(live, open_page, until):
     live, view = live
     page = open_page(view.url)
-    until(lambda: "real time" in page.page_source, what="loading")
+    until(lambda: "no effort at its limit" in page.page_source, what="loading")
     press(page, "Step")
     until(lambda: live.time == pytest.approx(live.period), what="one step")
     press(page, "Gains")
