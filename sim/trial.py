@@ -63,6 +63,24 @@ def absolute_band(robot: Robot) -> Float64:
     return np.array([PRISMATIC_BAND if j.type == "prismatic" else REVOLUTE_BAND for j in robot.joints])
 
 
+def judge(robot: Robot, rollout: Rollout, start: NDArray[Any], *, efforts: bool = True) -> StepMetrics:
+    """Figures of merit of a ``rollout`` from rest at ``start`` (envs, dof); what diverged has inf.
+
+    Without ``efforts`` those of the efforts are undefined: PhysX keeps its drive's to itself.
+    """
+    tick = rollout.time[1] - rollout.time[0]
+    return step_metrics(
+        tick * np.arange(1, len(rollout.time) + 1),
+        rollout.setpoint,
+        np.where(rollout.ok[..., None], rollout.qpos, np.nan),
+        start=start,
+        effort=rollout.effort if efforts else None,
+        saturated=rollout.saturated if efforts else None,
+        absolute_band=absolute_band(robot),
+        continuous=robot.continuous,
+    )
+
+
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     """Which joints belong to the arm: on the way to the deepest branching, so not the fingers of a hand (dof,)."""
     parent = {joint.child_link: joint for joint in robot.all_joints}
@@ -112,16 +130,7 @@ def try_gains(
         runner.reset(moves.start)
         ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
         rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)))
-    metrics = step_metrics(
-        rollout.time - rollout.time[0] + rollout.time[1] - rollout.time[0],
-        moves.target,
-        rollout.qpos,
-        start=moves.start,
-        effort=None if control == "drive" else rollout.effort,  # PhysX keeps the drive's effort to itself
-        saturated=None if control == "drive" else rollout.saturated,
-        absolute_band=absolute_band(robot),
-        continuous=robot.continuous,
-    )
+    metrics = judge(robot, rollout, moves.start, efforts=control != "drive")
     shortest = fastest(robot, moves)
     return Trial(
         name=name,

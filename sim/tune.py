@@ -1,7 +1,8 @@
 r"""Black-box tuning on the real scenes: CMA-ES from the designed gains, in log space, many candidates at once.
 
-Every candidate runs every move in an env of its own, so a generation is one rollout. Its cost is the mean over joints,
-taken as the mean over moves plus the worst move, of::
+Every candidate runs every move in an env of its own, so a generation is one rollout, with a share of the effort limits
+kept back for moves that are harder than those searched. Its cost is the mean over joints, taken as the mean over moves
+plus the worst move, of::
 
     w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
         + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
@@ -33,23 +34,29 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.metrics import step_metrics
 from batchpid.stability import stability_bound
 
 from .arguments import integer, number
 from .limits import SetpointWarning
-from .moves import Moves, random_moves, smooth_effort, tutorial_move
+from .moves import Moves, search_moves, smooth_effort
 from .robot import Robot
 from .runner import Runner
-from .trial import SUBSTEPS, absolute_band
+from .trial import SUBSTEPS, absolute_band, judge
 from .variation import draw_variation
 
 Float64 = NDArray[np.float64]
-SHARED = ("kp", "ki", "kd", "setpoint_weight", "derivative_filter_time")
-"""What the search scales for all joints together; with ``per_joint`` each joint's inertia as well."""
-START_HZ = 2.25
-"""Bandwidth of the designed gains that a search begins with: a step settles in 0.9 s."""
-SPREAD = 0.25
+SHARED = ("bandwidth", "stiffness", "damping", "setpoint_weight", "derivative_filter_time")
+"""Factors that the search finds for all joints together; with ``per_joint`` one for each joint's inertia as well.
+
+By a bandwidth c the poles move out alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
+"""
+REACH = np.array([1.0, 1.0, 1.0, 2.0, 2.0])
+"""How far each is varied, in units of SPREAD: the last two matter less."""
+START_HZ = 1.5
+"""Bandwidth of the designed gains that a search begins with."""
+HEADROOM = 0.9
+"""Share of the effort limits that candidates may use: what the searched moves leave is for harder ones."""
+SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 SAFE_RATIO = 0.8
 """Share of the stability range beyond which a candidate pays."""
@@ -71,8 +78,24 @@ class Weights:
     """Of the error left at the end, as log(1 + error / settling band's least width)."""
     chatter: float = 0.3
     """Of the effort's variation beyond that of the smooth motion."""
-    saturation: float = 0.3
+    saturation: float = 3.0
     """Of the share of time in saturation."""
+
+
+def start_gains(robot: Robot, gain_units: str = "mass_matrix") -> bp.PIDParams:
+    """The designed gains that a search begins with.
+
+    With the mass matrix, the poles are those of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E. Thomson, "Delay
+    networks having maximally flat frequency characteristics", Proc. IEE 96, 1949): a step settles in 0.8 s, with 0.8 %
+    overshoot, and less than half of the effort that three equal poles take to be as fast. With other units joints
+    disturb each other, which those bear better.
+    """
+    if gain_units != "mass_matrix":
+        return bp.design_gains(robot, 2.25, gain_units=gain_units)
+    w = 2 * math.pi * START_HZ
+    return bp.design_gains(
+        robot, START_HZ, math.sqrt(0.6), integral_time=math.sqrt(15) / w, gain_units=gain_units
+    )
 
 
 class Tuning(NamedTuple):
@@ -125,7 +148,7 @@ def tune(
     weights
         Of the cost.
     moves
-        Default: the tutorial's, where there is one, one that starts near it, and four random ones, one of each kind.
+        Default: those of :func:`sim.moves.search_moves`.
     variation
         Options of :func:`sim.variation.draw_variation`, {} for its defaults: each move gets a robot of its own payload
         and friction, the same for all candidates. None: the robot as it is.
@@ -161,7 +184,7 @@ def tune(
     number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
     if moves is None:
-        moves = tutorial_move(robot, 1, seed) + random_moves(robot, 4, seed)
+        moves = search_moves(robot, seed)
     search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
     settings = {
         "robot": robot.name,
@@ -172,6 +195,7 @@ def tune(
         "moves": list(moves.names),
         "seconds": seconds,
         "weights": dataclasses.asdict(weights),
+        "headroom": HEADROOM,
         "variation": None if variation is None else dict(variation),
         "measurement_rate": measurement_rate,
         **{name: str(value) for name, value in runner_options.items()},
@@ -236,7 +260,7 @@ class _Search:
         self, robot: Robot, gain_units: str, per_joint: bool, moves: Moves, seconds: float, weights: Weights
     ) -> None:
         self.robot, self.moves, self.seconds, self.weights = robot, moves, seconds, weights
-        self.designed = bp.design_gains(robot, START_HZ, gain_units=gain_units)
+        self.designed = start_gains(robot, gain_units)
         self.dimension = len(SHARED) + (robot.dof if per_joint else 0)
         self._band = absolute_band(robot)
         smooth = [
@@ -251,38 +275,28 @@ class _Search:
 
     def params(self, points: Float64) -> bp.PIDParams:
         """Params with one row for each of ``points`` (n, dimension)."""
-        factors = np.exp(points[:, : len(SHARED)])
+        shared = np.exp(REACH * points[:, : len(SHARED)])
+        bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
         joints = np.exp(points[:, len(SHARED) :]) if self.dimension > len(SHARED) else 1.0
         d = self.designed
-        weight = d.setpoint_weight * factors[:, 3:4]
         return d.replace(
-            kp=d.kp * factors[:, 0:1] * joints,
-            ki=d.ki * factors[:, 1:2] * joints,
-            kd=d.kd * factors[:, 2:3] * joints,
-            setpoint_weight=np.minimum(weight, 1.0) + np.zeros_like(d.kp),
-            derivative_filter_time=d.derivative_filter_time * factors[:, 4:5],
+            kp=d.kp * bandwidth**2 * stiffness * joints,
+            ki=d.ki * bandwidth**3 * joints,
+            kd=d.kd * bandwidth * damping * joints,
+            setpoint_weight=np.minimum(d.setpoint_weight * weight, 1.0) + np.zeros_like(d.kp),
+            derivative_filter_time=d.derivative_filter_time * filter_time,
         )
 
     def costs(self, runner: Runner, points: Float64) -> list[float]:
         """Cost of each of ``points``, tried on ``runner``, whose envs are candidates x moves."""
         count, moves = len(points), self.moves
         table = self.params(points)
-        runner.params = table.for_envs(np.repeat(np.arange(count), len(moves.start)))
+        runner.params = _with_headroom(table).for_envs(np.repeat(np.arange(count), len(moves.start)))
         start, target = np.tile(moves.start, (count, 1)), np.tile(moves.target, (count, 1))
         runner.reset(start)
         ticks = max(10, round(self.seconds / (runner.timestep * runner.substeps)))
-        step = runner.timestep * runner.substeps
         rollout = runner.rollout(np.broadcast_to(target, (ticks, *target.shape)))
-        m = step_metrics(
-            step * np.arange(1, ticks + 1),
-            target,
-            rollout.qpos,
-            start=start,
-            effort=rollout.effort,
-            saturated=rollout.saturated,
-            absolute_band=self._band,
-            continuous=self.robot.continuous,
-        )
+        m = judge(self.robot, rollout, start)
         shape = (count, *moves.start.shape)
         w, horizon = self.weights, self.seconds
 
@@ -315,6 +329,14 @@ class _Search:
             for kp, kd, tau in zip(table.kp, table.kd, table.derivative_filter_time, strict=True)
         ]
         return 10 * np.maximum(np.array(ratios) - SAFE_RATIO, 0)
+
+
+def _with_headroom(params: bp.PIDParams) -> bp.PIDParams:
+    low, high = params.effort_min, params.effort_max
+    return params.replace(
+        effort_min=None if low is None else HEADROOM * low,
+        effort_max=None if high is None else HEADROOM * high,
+    )
 
 
 def _versions() -> dict[str, str]:

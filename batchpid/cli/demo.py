@@ -44,6 +44,7 @@ class Demo:
         from batchpid.cli.follow import duration, follow, start_poses
         from batchpid.errors import InvalidArgumentError
         from sim import Robot, Runner
+        from sim.trial import judge
 
         out = plots.check_path(self.out)
         if self.viewer:
@@ -77,7 +78,7 @@ class Demo:
                 flush=True,
             )
             run = follow(runner, settings.target, start, seconds, "simulating")
-        metrics = report.judge(robot, run.rollout, run.start)
+        metrics = judge(robot, run.rollout, run.start)
         print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall) + "\n")
         print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):

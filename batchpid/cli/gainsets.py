@@ -31,17 +31,16 @@ def gain_set(robot: Robot, name: str) -> GainSet:
     InvalidArgumentError
         No such name or file, or the robot carries no gains of that name.
     """
-    from batchpid import design_gains, load_about, load_params
+    from batchpid import load_about, load_params
     from batchpid.errors import InvalidArgumentError
-    from sim.tune import START_HZ
+    from sim.tune import start_gains
 
     if name == "tutorial":
         return GainSet(name, {"params": robot.params()})
     if name == "tuned":
         return GainSet(name, robot.tuned())
     if name == "designed":
-        params = design_gains(robot, START_HZ, gain_units="mass_matrix")
-        return GainSet(name, {"params": params, "measurement_rate": True})
+        return GainSet(name, {"params": start_gains(robot), "measurement_rate": True})
     if name.partition(":")[0] == "drive":
         try:
             stiffness, damping = (float(part) for part in (name.partition(":")[2] or "20,5").split(","))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.metrics import StepMetrics, step_metrics
+from batchpid.metrics import StepMetrics
 
 if TYPE_CHECKING:
     from sim import Robot, Rollout
@@ -30,25 +30,6 @@ def speed(num_envs: int, steps: int, timestep: float, wall: float) -> str:
         f"{num_envs * steps / wall:,.0f} env-steps/s: {steps * timestep:g} s of {num_envs} robots in {wall:.2f} s; "
         f"real-time factor {factor:.3g} ({num_envs * factor:.3g} robot-seconds a second)"
     )
-
-
-def judge(robot: Robot, rollout: Rollout, start: NDArray[Any]) -> StepMetrics:
-    """Figures of merit of a fresh runner's ``rollout`` from ``start`` (envs, dof); what diverged has inf."""
-    return step_metrics(
-        rollout.time,
-        rollout.setpoint,
-        np.where(rollout.ok[..., None], rollout.qpos, np.nan),
-        start=start,
-        effort=rollout.effort,
-        saturated=rollout.saturated,
-        absolute_band=least_band(robot),
-        continuous=robot.continuous,
-    )
-
-
-def least_band(robot: Robot) -> NDArray[np.float64]:
-    """Least half width of the settling band of each joint (dof,): 1e-3 rad, 1e-4 m."""
-    return np.array([1e-4 if joint.unit == "m" else 1e-3 for joint in robot.joints])
 
 
 def joint_table(robot: Robot, metrics: StepMetrics) -> str:

@@ -68,6 +68,7 @@ class Rollout:
         from batchpid.cli.gainsets import gain_set
         from sim import Robot, Runner
         from sim.arguments import array
+        from sim.trial import judge
 
         if self.out is not None:
             _check_out(self.out)
@@ -99,7 +100,7 @@ class Rollout:
             _recording(self.out, runner, self.seed),
         ):
             run = follow(runner, setpoint, start, seconds, "simulating")
-        metrics = report.judge(robot, run.rollout, run.start)
+        metrics = judge(robot, run.rollout, run.start)
         print(report.speed(self.num_envs, run.steps, self.timestep, run.wall) + "\n")
         print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):

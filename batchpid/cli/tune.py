@@ -42,7 +42,7 @@ class Tune:
     """Weight of the error left at the end."""
     chatter: float = 0.3
     """Weight of the effort's variation beyond the smooth move's."""
-    saturation: float = 0.3
+    saturation: float = 3.0
     """Weight of the time in saturation."""
     variation: bool = False
     """Payload, friction, coarse sensors and late efforts, drawn for each move."""

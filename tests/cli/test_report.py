@@ -7,6 +7,7 @@ import pytest
 
 from batchpid.cli import report
 from sim import Robot, Rollout
+from sim.trial import judge
 
 TICKS, ENVS = 200, 5
 
@@ -43,7 +44,7 @@ def rows(robot, metrics):
 
 def test_a_run_that_settles(robot):
     rollout, start = follow(robot, robot.settings.target)
-    metrics = report.judge(robot, rollout, start)
+    metrics = judge(robot, rollout, start)
     # exp(-t / 0.05) falls below 2 % after 0.196 s.
     np.testing.assert_allclose(metrics.settling_time, 0.05 * np.log(50), atol=2e-3)
     table = rows(robot, metrics)
@@ -59,7 +60,7 @@ def test_one_joint_that_rings_and_one_that_overshoots(robot):
     rollout, start = follow(robot, robot.settings.target)
     rollout.qpos[:, 2, 0] = 1 + 0.3 * np.sin(40 * rollout.time)
     rollout.qpos[50:, :, 5] += 0.5 * np.exp(-np.arange(150) / 10)[:, None]
-    metrics = report.judge(robot, rollout, start)
+    metrics = judge(robot, rollout, start)
     table = rows(robot, metrics)
     assert "never" in table["panda_joint1"]
     assert "4 of 5" in table["panda_joint1"]
@@ -74,7 +75,7 @@ def test_envs_that_diverged_are_named(robot):
     rollout, start = follow(robot, robot.settings.target)
     rollout.qpos[100:, 3] = np.nan
     rollout.ok[100:, 3] = False
-    metrics = report.judge(robot, rollout, start)
+    metrics = judge(robot, rollout, start)
     table = rows(robot, metrics)
     assert all("diverged" in row and "4 of 5" in row for row in table.values())
     said = list(report.verdicts(robot, rollout, metrics))
@@ -85,7 +86,7 @@ def test_envs_that_diverged_are_named(robot):
 def test_envs_held_at_a_finite_pose_after_diverging_count_as_diverged(robot):
     rollout, start = follow(robot, robot.settings.target)
     rollout.ok[100:] = False
-    metrics = report.judge(robot, rollout, start)
+    metrics = judge(robot, rollout, start)
     assert np.isinf(metrics.settling_time).all()
     assert "DIVERGED: 5 of 5" in next(report.verdicts(robot, rollout, metrics))
 

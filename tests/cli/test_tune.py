@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
 
 import batchpid as bp
+from batchpid.cli.tune import Tune
 from sim import Robot
+from sim.tune import Weights
 
 pytest.importorskip("cmaes")
 
@@ -62,6 +65,13 @@ def test_compare_tells_the_sets_apart(batchpid, tmp_path):
     assert "2 / 2 of 2" in rows["tuned"]
     assert "never" in rows["mine.yaml"]
     assert picture.stat().st_size > 10_000
+
+
+def test_the_flags_weigh_as_the_search_does_by_itself():
+    flags, weights = Tune(), Weights()
+    assert {field.name: getattr(flags, field.name) for field in dataclasses.fields(weights)} == (
+        dataclasses.asdict(weights)
+    )
 
 
 @pytest.mark.parametrize(
