@@ -159,7 +159,7 @@ def follow(robot: Robot, moves: Moves, steps: int, solver: Physics | None, finer
     control = make_control("pid", spec, options["params"], size, options["measurement_rate"])
     control.set_params(plant, options["params"])  # type: ignore[arg-type]
     control.reset(plant.read_qpos(), np.ones(size, bool))
-    control.begin(plant, moves.target, None)  # type: ignore[arg-type]
+    control.begin(plant, steps, moves.target)  # type: ignore[arg-type]
     table = np.empty((steps, *moves.start.shape))
     for step in range(steps):
         passive = plant.passive_force(True, True)

@@ -191,7 +191,7 @@ class Cell:
     def _run(self, substeps: int, setpoint: Any, setpoint_rate: Any, feedforward: Any) -> None:
         """At every sim step: compensate, control, write, step, read."""
         pack, control = self.pack, self._control
-        control.begin(pack, setpoint, setpoint_rate)
+        control.begin(pack, substeps, setpoint, setpoint_rate)
         for step in range(substeps):
             last = step == substeps - 1
             forward = self._feedforward(feedforward)

@@ -18,7 +18,7 @@ from .scenes import Pack, SceneSpec, probe
 Float64 = NDArray[np.float64]
 
 INERTIA_EVERY = 4
-"""Sim steps after which the mass matrix is taken anew within a tick, here and where the robot will be by then."""
+"""Sim steps for which a mass matrix is kept within a tick."""
 
 
 class Control:
@@ -50,9 +50,11 @@ class Control:
         else:
             self.state = bp.reset(self.params, self.state, qpos, mask)
 
-    def begin(self, pack: Pack, setpoint: Float64, setpoint_rate: Float64 | None) -> None:
-        """Take a tick's commands."""
-        self._setpoint, self._setpoint_rate = setpoint, setpoint_rate
+    def begin(
+        self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None
+    ) -> None:
+        """Take the commands of a tick of so many sim steps."""
+        self._substeps, self._setpoint, self._setpoint_rate = substeps, setpoint, setpoint_rate
 
     def effort(
         self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
@@ -87,11 +89,7 @@ class PIDControl(Control):
 
 
 class InertiaPIDControl(PIDControl):
-    """As :class:`PIDControl`, with gains per unit of inertia.
-
-    The mass matrix is interpolated between that of the present pose and that of the pose some sim steps ahead, at the
-    present velocity. Keeping one matrix so long would not do: where axes are nearly in line its inverse changes by a
-    tenth within 10 mrad.
+    """As :class:`PIDControl`, with gains per unit of inertia; the mass matrix is kept for some sim steps.
 
     With the whole matrix M the joints' own viscous damping B is made up for as well. The engine takes it
     implicitly, (M + dt B) (v+ - v) = dt (u - B v), so u = (M + dt B) a + B v gives exactly v+ = v + dt a.
@@ -110,13 +108,12 @@ class InertiaPIDControl(PIDControl):
     ) -> Float64 | None:
         """Advance the law by one sim step."""
         if step % INERTIA_EVERY == 0:
-            self._matrix = self._mass_matrix(qpos)
-            ahead = self._mass_matrix(qpos + INERTIA_EVERY * self.dt * pack.read_qvel())
-            self._change = (ahead - self._matrix) / INERTIA_EVERY
+            # Where the robot will be half-way through these steps, so that the error is zero on average: near upright,
+            # axes nearly in line, a jaco2 leaves its path by 18 mrad under matrices that are 0.3 steps ahead.
+            kept = min(INERTIA_EVERY, self._substeps - step)
+            self._matrix = self._mass_matrix(qpos + 0.5 * (kept - 1) * self.dt * pack.read_qvel())
             if self._damping is not None:
                 self._matrix += self.dt * np.diag(self._damping)
-        else:
-            self._matrix += self._change
         qvel = pack.read_qvel() if self._measurement_rate or self._damping is not None else None
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel
@@ -162,9 +159,11 @@ class DriveControl(Control):
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
         pack.write_drive(np.asarray(params.kp), np.asarray(damping), np.asarray(limit))
 
-    def begin(self, pack: Pack, setpoint: Float64, setpoint_rate: Float64 | None) -> None:
+    def begin(
+        self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None
+    ) -> None:
         """Take a tick's commands, and give them to the drives."""
-        super().begin(pack, setpoint, setpoint_rate)
+        super().begin(pack, substeps, setpoint, setpoint_rate)
         pack.write_drive_target(setpoint, np.zeros_like(setpoint) if setpoint_rate is None else setpoint_rate)
 
     def effort(

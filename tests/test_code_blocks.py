@@ -29,9 +29,10 @@ SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
     "view": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1", "--port", "8765"],
 }
-ONLY_PARSED = ("bench", "tune", "compare", "render")
+ONLY_PARSED = ("bench", "tune", "render")
 
 
 def name(page: Path) -> str:

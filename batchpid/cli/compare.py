@@ -56,7 +56,7 @@ class Compare:
             plots.check_path(self.picture)
             if len(self.gains) < 2:
                 raise InvalidArgumentError("gains", "is one set", remedy="name two for a picture")
-        robot = Robot.load(self.robot)
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         sets = [gain_set(robot, name) for name in self.gains]
         moves = tutorial_move(robot) + random_moves(robot, self.moves, self.seed)
         drawn = None

@@ -38,7 +38,7 @@ class Tune:
     """Weight of the settling time."""
     overshoot: float = 1.0
     """Weight of the overshoot."""
-    final: float = 1.0
+    final: float = 2.0
     """Weight of the error left at the end."""
     chatter: float = 0.3
     """Weight of the effort's variation beyond the smooth move's."""
