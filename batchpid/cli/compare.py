@@ -38,6 +38,8 @@ class Compare:
     """With variation: the largest payload [kg], less where the robot does not carry it."""
     friction: float = 0.1
     """With variation: the largest joint friction (PhysX's coefficient)."""
+    missing_meshes: Literal["error", "skip"] = "error"
+    """Go on without collision shapes whose mesh is missing."""
     picture: OptionalPath = None
     """The first two sets on the first move: .png or .svg."""
 
