@@ -96,7 +96,7 @@ def test_start_poses_are_near_inside_limits_and_do_not_depend_on_their_number(na
     assert poses.shape == (num_envs, robot.dof)
     np.testing.assert_array_equal(poses[0], robot.start)
     assert not robot.limit_violations(poses)
-    assert np.abs(poses - robot.start).max() <= spread
+    assert np.abs(poses - robot.start).max() <= spread + 1e-12
     np.testing.assert_array_equal(poses, start_poses(robot, num_envs + 3, spread, seed)[:num_envs])
 
 
