@@ -37,9 +37,10 @@ def same(first, second):
         np.testing.assert_array_equal(ours, theirs, name)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
-@pytest.mark.parametrize("workers", [0, 2])
+KINDS = [(name, control, 0) for name in ROBOTS for control in ("pid", "drive", "effort")]
+
+
+@pytest.mark.parametrize(("name", "control", "workers"), [*KINDS, ("jaco2", "pid", 2)])
 def test_restored_in_place_and_in_another_runner(name, control, workers, tmp_path):
     robot = ROBOTS[name]
     table = commands(robot, 40) if control != "effort" else 5 * (commands(robot, 40) - robot.settings.target)
