@@ -76,7 +76,8 @@ class Runner:
         of. A reset puts what it added back to where it left it.
     pack_size
         Scenes that share a PhysX system, at most: a matter of speed. In free motion nothing else depends on it; where
-        a robot touches something at several places at once, the last bits do. 1 gives every env a system of its own.
+        a robot touches something at several places at once, its last bits depend on the envs beside it, which contact
+        then magnifies. 1 gives every env a system of its own, and rules that out.
     on_fault
         What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it last
         was sound, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
@@ -94,7 +95,7 @@ class Runner:
         are the same bytes as if nothing had happened. Otherwise :class:`batchpid.errors.WorkerError` is raised.
     checkpoint_steps
         Sim steps after which all workers start from a snapshot anew, so that no replay is longer than that; None:
-        never. Results depend on it in the last bits after contacts, on nothing else said here about workers.
+        never, and all commands are kept. Results depend on it in the last bits after contacts, on nothing else said here about workers.
     timeout
         Seconds, beyond any time that its work can take, before a worker counts as stuck. One that is stopped or asleep
         amid a tick counts as stuck within a second.
