@@ -95,7 +95,8 @@ class Runner:
         are the same bytes as if nothing had happened. Otherwise :class:`batchpid.errors.WorkerError` is raised.
     checkpoint_steps
         Sim steps after which all workers start from a snapshot anew, so that no replay is longer than that; None:
-        never, and all commands are kept. Results depend on it in the last bits after contacts, on nothing else said here about workers.
+        never, and all commands are kept. Results depend on it in the last bits after contacts, on nothing else said
+        here about workers.
     timeout
         Seconds, beyond any time that its work can take, before a worker counts as stuck. One that is stopped or asleep
         amid a tick counts as stuck within a second.
