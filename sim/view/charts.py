@@ -11,13 +11,23 @@ from .source import Source
 _INK = {"setpoint": "#4a82ff", "limit": "#b6bcc6"}
 _COLOURS = ("#15803d", "#d97706", "#7c3aed")
 """The first group's curve, the second's, ..."""
-_FAR = 1e9
 _NEAR = 4.0
 """A limit is drawn once it is less than so many times the effort."""
-_LEAST = {"rad": 0.02, "m": 0.002}
-"""An axis of positions covers so much at least, [rad] or [m]: what is smaller would be drawn as if it mattered."""
+_LEAST = 0.012
+"""Every axis reaches from below minus so much to above it [rad, m, N m or N]: noise alone should not fill a chart."""
+_SHOWN = 1e-4
+"""Positions are drawn in steps of this [rad or m]; what is smaller makes a flat line jitter."""
 WINDOW = 8.0
 """How far back the time axis goes [s]: it counts from now."""
+_SCALES = {
+    "x": {"time": False, "range": (-WINDOW, 0.0)},  # a range of its own would drift in viser 1.1
+    "y": {
+        "range": {
+            "min": {"pad": 0.1, "soft": -_LEAST, "mode": 1},
+            "max": {"pad": 0.1, "soft": _LEAST, "mode": 1},
+        }
+    },
+}
 
 
 class Charts:
@@ -34,7 +44,7 @@ class Charts:
                 data,
                 ({"label": "s"}, *series),
                 title=title,
-                scales=_scales(0.0, 1.0),
+                scales=_SCALES,
                 legend={"show": True, "live": False},
                 height=168,
                 axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
@@ -70,35 +80,21 @@ class Charts:
         ago = keep[0][0] - keep[0][0][-1]
         bounds = source.effort_limits(robots[0], joint)
         peak = max(float(np.abs(trace[3]).max()) for trace in keep)
-        limits = tuple(np.full(len(ago), min(max(bound, -_FAR), _FAR)) for bound in bounds)
-        near = [
-            limit for limit in limits if abs(limit[0]) < _NEAR * peak
-        ]  # a far one would flatten the curve
-        efforts = [trace[3] for trace in keep]
+        # A far limit would flatten the curve, and a gap (NaN) would empty the chart: it lies under the curve instead.
+        limits = [np.full(len(ago), bound) if abs(bound) < _NEAR * peak else keep[0][3] for bound in bounds]
         positions = [*(trace[1] for trace in keep), keep[0][2]]
-        errors = [trace[2] - trace[1] for trace in keep]
-        least = 0.02 * min(abs(limits[0][0]), 100.0)
-        for chart, title, columns, seen, span in (
-            (self._position, f"{name} [{unit}]", positions, positions, _LEAST[unit]),
-            (self._error, f"setpoint - qpos [{unit}]", errors, errors, _LEAST[unit]),
-            (self._effort, f"effort [{force}]", [*limits, *efforts], [*near, *efforts], least),
+        for chart, title, columns in (
+            (
+                self._position,
+                f"{name} [{unit}]",
+                [_SHOWN * np.round(column / _SHOWN) for column in positions],
+            ),
+            (self._error, f"setpoint - qpos [{unit}]", [trace[2] - trace[1] for trace in keep]),
+            (self._effort, f"effort [{force}]", [*limits, *(trace[3] for trace in keep)]),
         ):
             if chart.title != title:
                 chart.title = title
-            self._fit(chart, min(map(np.min, seen)), max(map(np.max, seen)), span)
             chart.data = (ago, *columns)
-
-    def _fit(self, chart: Any, low: float, high: float, least: float) -> None:
-        """Let a chart's axis cover ``low`` to ``high``; it stays as it is while that fits, for a calmer picture."""
-        room = max(0.1 * (high - low), (least - (high - low)) / 2)
-        below, above = chart.scales["y"]["range"]
-        if low < below or high > above or 2.5 * (high - low + 2 * room) < above - below:
-            chart.scales = _scales(low - room, high + room)
-
-
-def _scales(low: float, high: float) -> dict[str, Any]:
-    # A range of its own would make the time axis drift in viser 1.1, and what is not finite would empty the chart.
-    return {"x": {"time": False, "range": (-WINDOW, 0.0)}, "y": {"range": (float(low), float(high))}}
 
 
 def _dashed(label: str, colour: str) -> dict[str, Any]:
