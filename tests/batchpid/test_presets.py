@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import simple_pid
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
@@ -60,6 +60,47 @@ def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_me
         peer.setpoint = r
         expected.append(peer(y, dt=DT))
     close(run(presets.simple_pid(1, kp, ki, kd, **options), path), expected)
+
+
+@given(
+    series,
+    st.lists(st.tuples(gain, gain, gain), min_size=25, max_size=25),
+    st.lists(st.floats(1e-3, 0.1), min_size=25, max_size=25),
+    st.floats(-9, 9),
+    st.integers(1, 24),
+    st.booleans(),
+)
+def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, differential_on_measurement):
+    """Starting output, gains and time steps that change at every step, a reset, and the terms on the way."""
+    options = {"output_limits": (-5, 7), "differential_on_measurement": differential_on_measurement}
+    peer = simple_pid.PID(sample_time=None, starting_output=starting_output, **options)
+    y = np.array([[path[0][1]]])
+    state = bp.init(presets.simple_pid(1, **options), y)
+    state = state._replace(integral=np.clip([[starting_output]], -5, 7))
+    for t, (r, y) in enumerate(path):
+        params = presets.simple_pid(1, *tunings[t], **options)
+        peer.tunings, peer.setpoint = tunings[t], r
+        if t == restart:
+            peer.reset()
+            state = bp.reset(params, state, np.full((1, 1), y), np.array([True]))
+        expected = peer(y, dt=steps[t])
+        state, effort, terms = bp.step(
+            params, state, np.full((1, 1), r), np.full((1, 1), y), steps[t], aux=True
+        )
+        close(effort.item(), expected)
+        close([terms.p.item(), terms.i.item(), terms.d.item()], peer.components)
+
+
+@given(series, gain, gain)
+def test_simple_pid_maps_the_errors_of_angles_as_ours_wraps_them(path, kp, ki):
+    """P and I; its D spikes, see below."""
+    assume(all(abs(math.remainder(r - y, 2 * math.pi)) < math.pi - 1e-6 for r, y in path))
+    peer = simple_pid.PID(kp, ki, sample_time=None, error_map=lambda e: math.remainder(e, 2 * math.pi))
+    expected = []
+    for r, y in path:
+        peer.setpoint = r
+        expected.append(peer(y, dt=DT))
+    close(run(presets.simple_pid(1, kp, ki, continuous=True), path), expected)
 
 
 def test_simple_pid_goes_from_manual_to_automatic_as_ours():
