@@ -24,6 +24,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cloudpickle
@@ -89,22 +90,19 @@ class ProcessWorker:
         self._owner = os.getpid()
         self.ticks = Arrays.of_ticks(shared.arrays, slice(self.envs.start, self.envs.stop))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
-        ours, theirs = socket.socketpair()
-        descriptors = (theirs.fileno(), shared.fd, self._trace)
-        with theirs, _without_interrupts():
-            self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-c",
-                    _BOOT,
-                    json.dumps(sys.path),
-                    str(os.getpid()),
-                    *map(str, descriptors),
-                ],
-                pass_fds=descriptors,
-                stdin=subprocess.DEVNULL,
-                env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
-            )
+        try:
+            with contextlib.ExitStack() as undo:
+                undo.callback(os.close, self._trace)
+                ours, theirs = socket.socketpair()
+                undo.enter_context(ours)
+                with theirs:
+                    self._process = _spawn(theirs.fileno(), shared.fd, self._trace)
+                undo.pop_all()
+        except OSError as error:
+            raise WorkerError(
+                f"worker {index} (envs {self.envs.start} to {self.envs.stop - 1}) cannot be started: {error}; "
+                "pass a smaller workers=, 0 for none"
+            ) from error
         self._pulse = Pulse(self.pid)
         self._channel = Channel(ours, lambda: self.check_alive(*_TAKE_LIMITS))
         try:
@@ -214,6 +212,21 @@ class ProcessWorker:
             time.sleep(0.05)
         trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
         return WorkerLost(f"{self._name()} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
+    """Start a process that serves, as :func:`main`, by these file descriptors: a socket, memory, and its last stack."""
+    if not sys.executable:
+        raise OSError("sys.executable does not say which Python to run")
+    paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
+    paths.append(str(Path(__file__).parents[1]))  # where "" led to, before the caller went to another folder
+    with _without_interrupts():
+        return subprocess.Popen(
+            [sys.executable, "-c", _BOOT, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
+            pass_fds=descriptors,
+            stdin=subprocess.DEVNULL,
+            env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
+        )
 
 
 @contextlib.contextmanager

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from batchpid.errors import ClosedError, InUseError
 from sim import Robot, Runner
 
 ROBOT = Robot.load("panda")
+ROOT = Path(__file__).resolve().parents[2]
 LONG = 100_000  # substeps that nobody waits for
 NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
 
@@ -146,3 +151,61 @@ def test_a_stopped_worker_does_not_hang_whoever_has_much_to_send():
             obs = runner.reset(qpos=np.tile(NEAR, (64, 1)))
         assert runner.recoveries == 1
     np.testing.assert_allclose(obs.qpos, np.tile(NEAR, (64, 1)), atol=1e-6)
+
+
+def run(program, *arguments, **options):
+    """What a program prints that is not installed, but found where it was started."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    paths = [path for path in sys.path if path and Path(path) != ROOT]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+        env=environment | {"PYTHONPATH": os.pathsep.join(paths)},
+        cwd=ROOT,
+        timeout=120,
+        **options,
+    )
+    return done.stdout.splitlines() or done.stderr
+
+
+def test_from_another_folder_and_with_odd_paths():
+    program = """
+import os, pathlib, sys, warnings
+warnings.simplefilter("ignore")
+from sim import Robot, Runner
+os.chdir("/")
+sys.path.append(pathlib.Path("/tmp"))
+robot = Robot.load("panda")
+with Runner(robot, 1, workers=1) as runner:
+    print(runner.step(robot.start).ok.all())
+"""
+    assert run(program) == ["True"]
+
+
+def test_workers_that_cannot_be_started_leave_nothing_behind():
+    program = """
+import os, resource, sys, warnings
+warnings.simplefilter("ignore")
+from batchpid.errors import WorkerError
+from sim import Robot, Runner
+robot = Robot.load("panda")
+before = len(os.listdir("/proc/self/fd"))
+for limit in (before + 5, before + 12):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, 4096))
+    try:
+        Runner(robot, 64, workers=8)
+    except WorkerError as error:
+        print(error)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (4096, 4096))
+    assert len(os.listdir("/proc/self/fd")) <= before + 1, os.listdir("/proc/self/fd")
+sys.executable = ""
+try:
+    Runner(robot, 1, workers=1)
+except WorkerError as error:
+    print(error)
+"""
+    first, second, third = run(program)
+    assert re.match(r"worker \d .*cannot be started: .*Too many open files; pass a smaller workers=", first)
+    assert re.match(r"worker \d .*cannot be started: .*Too many open files; pass a smaller workers=", second)
+    assert "sys.executable" in third
