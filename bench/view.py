@@ -77,16 +77,18 @@ def main(options: Options) -> None:
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
         # A browser that is slow draws fewer pixels by and by; not so for a picture.
         page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
-        for process in psutil.Process().children(recursive=True):
-            if process.pid not in before:
-                process.nice(19)
+        browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
+        for process in browser:
+            process.nice(19)
         time.sleep(8)
         page.execute_script(COUNT)
+        spent = _spent(browser)
         frames, simulated, began = live.time / live.period, live.time, time.monotonic()
         time.sleep(options.seconds)
         drawn = page.execute_script("return window.drawn")
         wall = time.monotonic() - began
         served, factor = (live.time / live.period - frames) / wall, (live.time - simulated) / wall
+        spent = _spent(browser) - spent
         moved = np.abs(live.frame().qpos - first).max()
         if options.picture is not None:
             _picture(page, live, target, options.picture)
@@ -97,8 +99,15 @@ def main(options: Options) -> None:
     print(
         f"{options.num_envs} x {robot.name}, {' beside '.join(options.control)}, {options.physics}, "
         f"{options.width} x {options.height}: "
-        f"{served:.1f} frames/s served, {min(served, drawn / wall):.1f} drawn, {factor:.2f} x real time"
+        f"{served:.1f} frames/s served, {min(served, drawn / wall):.1f} drawn, {factor:.2f} x real time, "
+        f"{1e3 * spent / max(1.0, min(served * wall, drawn)):.0f} ms of processor time in the browser for each drawn"
     )
+
+
+def _spent(processes: list[psutil.Process]) -> float:
+    """Processor time so far [s]."""
+    times = [process.cpu_times() for process in processes if process.is_running()]
+    return sum(time.user + time.system for time in times)
 
 
 def _picture(page: webdriver.Chrome, live: Live, target: np.ndarray, path: Path) -> None:
