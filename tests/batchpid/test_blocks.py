@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DT, ENVS, GAINS, JOINTS, LIMITED
+from conftest import DT, ENVS, GAINS, JOINTS, LIMITED, OPTIONS
 
 import batchpid as bp
 from batchpid import backends
@@ -34,9 +34,10 @@ def compare(params, inputs, rows):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
 
 
-def test_blocks_are_the_law_under_every_option(options, inputs):
+@pytest.mark.parametrize("case", ["p", "per env", "mixed per env", "zero effort", "everything"])
+def test_blocks_are_the_law(case, inputs):
     """Four envs in blocks of three: the second block does two of the first's rows again."""
-    compare(bp.make_params(JOINTS, **options, dtype=np.float32), inputs, rows=3)
+    compare(bp.make_params(JOINTS, **OPTIONS[case], dtype=np.float32), inputs, rows=3)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 4, 5])
