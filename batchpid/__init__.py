@@ -6,11 +6,12 @@ from batchpid.controller import BatchPID
 from batchpid.design import design_gains
 from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.law import advance, init, reset, step, track
+from batchpid.law import advance, init, reset, step
 from batchpid.params import PIDParams, make_params
 from batchpid.serialization import load_about, load_params, save_params
 from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
+from batchpid.transfer import track
 
 __all__ = [
     "BatchPID",

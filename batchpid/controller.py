@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from batchpid import law
 from batchpid.backends import JAXBackend, NumPyBackend
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
+from batchpid.transfer import no_integral
 
 BACKENDS = ("numpy", "jax")
 
@@ -196,7 +196,7 @@ class BatchPID:
     ) -> None:
         """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
         if self.params.ki is None:
-            raise law.no_integral()
+            raise no_integral()
         r, y = self._array("setpoint", setpoint), self._measurement(measurement)
         u = self._array("effort", effort)
         y_rate = None if measurement_rate is None else self._array("measurement_rate", measurement_rate)

@@ -25,7 +25,6 @@ from typing import Any
 
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.elementwise import clip, flush, namespace, wrap
-from batchpid.errors import InvalidArgumentError
 from batchpid.markers import Everywhere, HoldEffort
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
@@ -131,9 +130,9 @@ def advance(
             None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
         )
 
-    error = _error(k, r, y, xp)
-    origin = _origin(k, state, y, xp)
-    p = _proportional(k, error, y, origin)
+    error = wrapped_error(k, r, y, xp)
+    origin = turned_origin(k, state, y, xp)
+    p = proportional(k, error, y, origin)
     u = p
 
     integral = state.integral
@@ -227,72 +226,13 @@ def reset(
     )
 
 
-def track(
-    params: PIDParams,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    effort: Any,
-    *,
-    dt: Any = None,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
-) -> PIDState:
-    """Set the integral so that the next step, on these same inputs, gives ``effort``: bumpless transfer.
-
-    Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
-    effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
-    reproduced: the limits hold. ``dt`` is needed where the params integrate first.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the params have no integral (ki is None), or integrate first and dt is missing.
-    """
-    if params.ki is None:
-        raise no_integral()
-    if params.integration is not None and dt is None:
-        raise InvalidArgumentError(
-            "dt", "is needed where the params integrate first", remedy="give dt in seconds"
-        )
-    xp = namespace(*params, *state, setpoint, measurement, effort)
-    k = discretise(params, 1.0 if dt is None else dt)
-    zero = xp.zeros_like(measurement)
-    error = _error(k, setpoint, measurement, xp)
-    origin = _origin(k, state, measurement, xp)
-    rate = zero if measurement_rate is None else -measurement_rate
-    if setpoint_rate is not None:
-        rate = rate + (setpoint_rate if k.c is None else k.c * setpoint_rate)
-    integral = effort - _proportional(k, error, measurement, origin)
-    integral = integral if k.kd is None else integral - k.kd * rate
-    integral = integral if feedforward is None else integral - feedforward
-    integral = integral if params.integration is None else integral - k.ki_dt * error
-    return PIDState(
-        integral=clip(integral, k.integral_min, k.integral_max, xp),
-        measurement=None if state.measurement is None else measurement.copy(),
-        derivative=None if state.derivative is None else rate,
-        setpoint=None if state.setpoint is None else zero + setpoint,
-        setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
-        effort=None if state.effort is None else zero + effort,
-        origin=origin,
-    )
-
-
-def no_integral() -> InvalidArgumentError:
-    """Return the error of tracking without an integral."""
-    return InvalidArgumentError(
-        "params.ki", "is off, so nothing can carry the effort over", remedy="give ki; 0 is allowed"
-    )
-
-
-def _error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
+def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
     return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
 
 
-def _origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
+def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
     """Return the origin of setpoint weighting, turned along where y jumped by whole turns."""
     if state.origin is None or k.turns is None:
         return state.origin
@@ -300,6 +240,6 @@ def _origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
     return state.origin + (moved - wrap(moved, k.turns, xp))
 
 
-def _proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
+def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
     """Return kp (b e - (1 - b) (y - o)): no spike in it where y wraps."""
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))
