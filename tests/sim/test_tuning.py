@@ -10,7 +10,7 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.moves import Moves, fastest, random_moves, smooth_effort, tutorial_move
+from sim.moves import Moves, fastest, random_moves, search_moves, smooth_effort, tutorial_move
 from sim.trial import arm_joints, try_gains
 from sim.tune import tune
 from sim.variation import Variation, capacity, draw_variation
@@ -35,6 +35,14 @@ def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
         assert not panda.probe().touches(line).any()
     assert sum("alone" in name for name in moves.names) == 2
     np.testing.assert_array_equal(random_moves(panda, 3, 3).start, moves.start[:3])
+
+
+def test_moves_to_search_on_are_the_tutorials_one_of_each_kind_and_the_hardest_of_more(panda):
+    moves, drawn = search_moves(panda, 4), random_moves(panda, 32, 4)
+    assert moves.names[:2] == ("tutorial", "near the tutorial's")
+    np.testing.assert_array_equal(moves.start[2:6], drawn.start[:4])
+    assert fastest(panda, moves)[-1] == fastest(panda, drawn.take(range(4, 32))).max()
+    assert fastest(panda, moves)[1] > fastest(panda, moves)[0]
 
 
 def test_probe_sees_contact(panda):
