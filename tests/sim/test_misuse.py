@@ -124,6 +124,7 @@ def test_closed_by_another_thread():
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # of JAX, which other tests may have loaded
 def test_in_a_forked_child(runner):
     before = runner.step(ROBOT.settings.target)
     read, write = os.pipe()
