@@ -109,7 +109,9 @@ def run(words: list[str]) -> None:
             re.search(rf"^{name} = \[", project, re.MULTILINE) for part in extras for name in part.split(",")
         )
     elif program == "python":
-        assert (ROOT / rest[0]).is_file(), words
+        files = rest[2:] if rest[:2] == ["-m", "pytest"] else rest[:1]
+        assert files, words
+        assert all((ROOT / file).is_file() for file in files), words
     else:
         assert program == "batchpid", words
         command(*rest)
