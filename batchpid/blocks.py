@@ -52,9 +52,8 @@ def advance_in_blocks(
         return (jnp.tile(x, (rows, 1)) if x.shape[0] == 1 else x).reshape(-1)
 
     def step(n: Any, out: Any) -> Any:
-        start = jnp.minimum(
-            n * block, total - block
-        )  # the last block may do some rows of the one before again
+        # The last block may do some rows of the one before again.
+        start = jnp.minimum(n * block, total - block)
 
         def cut(x: Any) -> Any:
             return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
