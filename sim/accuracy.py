@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from batchpid.errors import InvalidArgumentError
 
 from .arguments import choice, integer, number
+from .building import SceneSpec, parse
 from .control import make_control
 from .moves import Moves, random_moves
 from .physics import PHYSICS, Physics
+from .probe import Probe
 from .robot import Robot
-from .scenes import Pack, Probe, SceneSpec, parse
+from .scenes import Pack
 
 Float64 = NDArray[np.float64]
 

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 
 from .arrays import Arrays
+from .building import SceneSpec
 from .hands import Hand, run_by_hand
 from .loop import Loop, LoopSpec
 from .peers import Stepper, make_peer, run_peer
 from .physics import PHYSICS
 from .robot import Robot
 from .runner import Runner
-from .scenes import SceneSpec
 
 Float64 = NDArray[np.float64]
 DISTANCE = 0.3

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 import batchpid as bp
 
 from .arrays import Arrays
+from .building import SceneSpec
 from .control import make_control
 from .faults import Containment, finite
-from .scenes import Pack, SceneSpec
+from .scenes import Pack
 from .snapshot import EnvStates
 
 
@@ -112,6 +113,7 @@ class Cell:
             effort=pack.qf.copy(),
             root=pack.read_root(),
             content=pack.read_content(),
+            isolated=pack.isolated.copy(),
             saturated=self._control.saturated,
             controller={
                 name: leaf for name, leaf in self._control.state._asdict().items() if leaf is not None
@@ -125,6 +127,7 @@ class Cell:
         self._control.set_params(pack, self._control.params)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
+        pack.isolate(np.flatnonzero(states.isolated).tolist())
         self._watch.write(states.containment)
         pack.hold(self._watch.stopped)
         pack.write_qf(states.effort)

@@ -12,8 +12,10 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.inertia import advance_with_mass_matrix, check_gain_units, per_inertia
 from batchpid.markers import PerMassMatrix
 
+from .building import SceneSpec
+from .probe import probe
 from .robot import Robot
-from .scenes import Pack, SceneSpec, probe
+from .scenes import Pack
 
 Float64 = NDArray[np.float64]
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .building import parse
 from .pool import cores_of_their_own
-from .scenes import Pack, parse
+from .scenes import Pack
 from .tutorial import TutorialLoop
 from .worker import ONE_THREAD
 

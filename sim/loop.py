@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 import batchpid as bp
 
 from .arrays import Arrays
+from .building import SceneSpec, parse
 from .cell import Cell
-from .scenes import Pack, SceneSpec, parse, probe
+from .probe import probe
+from .scenes import Pack
 from .snapshot import EnvStates, Snapshot
 from .variation import Variation, VariedPack
 

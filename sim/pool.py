@@ -325,8 +325,8 @@ def _on_purpose(error: Exception) -> bool:
 def packing(num_envs: int, pack_size: int) -> int:
     """Scenes to a PhysX system: ``pack_size``, or less where that leaves fewer than 8 packs for the workers to share.
 
-    It does not ask for the number of workers, and packs are never cut in two: the last bits of a contact depend on
-    what else its system holds, and so would, otherwise, on the number of workers.
+    It does not ask for the number of workers, and packs are never cut in two, so that results could not depend on that
+    number even where :mod:`sim.isolation` foresees too little.
     """
     return min(pack_size, max(1, num_envs // 8))
 

@@ -23,7 +23,7 @@ from .physics import DISSIPATION, PHYSICS
 from .urdf import Joint, Link, read_urdf
 
 if TYPE_CHECKING:
-    from .scenes import Probe
+    from .probe import Probe
 
 Float64 = NDArray[np.float64]
 _ASSETS = Path(assets.__file__).parent
@@ -268,7 +268,8 @@ class Robot:
 
     def probe(self, ground: bool = True) -> Probe:
         """Return what answers questions about poses: mass matrix, inverse dynamics, contact. Loads SAPIEN."""
-        from .scenes import SceneSpec, probe
+        from .building import SceneSpec
+        from .probe import probe
 
         return probe(SceneSpec(self.urdf, self.srdf, self.joints, 1e-3, PHYSICS["fast"], ground=ground))
 

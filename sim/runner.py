@@ -18,6 +18,7 @@ from batchpid.errors import ClosedError, InvalidArgumentError
 
 from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
 from .arrays import Arrays
+from .building import SceneSpec
 from .command import Call, Run, Worker
 from .control import CONTROLS, check_params, default_params
 from .faults import ACTIONS, Fault, FaultLog
@@ -28,7 +29,6 @@ from .physics import PHYSICS, Physics
 from .pool import WorkerPool, packing
 from .recording import Recorder
 from .robot import Robot
-from .scenes import SceneSpec
 from .snapshot import EnvStates, Snapshot
 from .variation import Variation
 from .worker import ProcessWorker
@@ -75,9 +75,8 @@ class Runner:
         it asks for are left out, so tutorial code runs as it is. It may return the entities that :meth:`poses` tells
         of. A reset puts what it added back to where it left it.
     pack_size
-        Scenes that share a PhysX system, at most: a matter of speed. In free motion nothing else depends on it; where
-        a robot touches something at several places at once, its last bits depend on the envs beside it, which contact
-        then magnifies. 1 gives every env a system of its own, and rules that out.
+        Scenes that share a PhysX system, at most: a matter of speed. A robot that may be touched at several places at
+        once gets a system of its own before, so that nothing else depends on it (docs/reliability.md).
     on_fault
         What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it last
         was sound, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with

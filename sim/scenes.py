@@ -1,194 +1,39 @@
-"""A pack of scenes in one process, read and written as arrays. The only module that touches SAPIEN.
+"""A pack of scenes in one process, read and written as arrays.
 
 A pack is M scenes, one robot each, in step with each other, some of them to a PhysX system. All stand at the origin;
 the shapes of each scene carry a collision group of their own, so that scenes never meet. That is bit-identical to one
-system per scene, and a fifth to a third cheaper.
+system per scene, and a fifth to a third cheaper. A robot that may be touched at several places gets a system of its own
+before (:mod:`sim.isolation`).
 
 The loop needs a dozen calls and no more (:class:`Pack`); another gateway to the engine has only these to provide.
 """
 
 from __future__ import annotations
 
-import os
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import sapien
 from numpy.typing import NDArray
+from sapien import physx
+from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.errors import RobotError
-
-from .content import Build, Content, HeadlessScene
-from .physics import DISSIPATION, Physics
-from .urdf import Joint
-
-with warnings.catch_warnings():
-    # Without a system Vulkan SAPIEN warns that it falls back to its own; nothing here renders.
-    warnings.filterwarnings("ignore", message=".*libvulkan.*")
-    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
-    import sapien
-    from sapien import physx
-    from sapien.wrapper.articulation_builder import ArticulationBuilder
-
-GRAVITY = (0.0, 0.0, -9.81)
+from .building import SceneSpec, bare_scene, build_robot, engine_settings, link_extents, separate
+from .content import Content
+from .isolation import WORLD, Crowding, Gap
+from .probe import probe
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
 Float32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class SceneSpec:
-    """Everything that decides how a scene is built, picklable.
-
-    ``urdf`` is sanitised text (see :mod:`sim.urdf`); ``joints`` the degrees of freedom in SAPIEN's order.
-    """
-
-    urdf: str
-    srdf: str | None
-    joints: tuple[Joint, ...]
-    timestep: float
-    physics: Physics
-    dissipation: str = "urdf"
-    ground: bool = True
-    fixed_base: bool = True
-    build: Build | None = None
-    gravity: tuple[float, float, float] = GRAVITY
-
-
-def parse(spec: SceneSpec) -> ArticulationBuilder:
-    """Parse the robot once; the builder makes any number of copies.
-
-    Raises
-    ------
-    RobotError
-        SAPIEN's loader refuses the description, or numbers its joints in another order than ours.
-    """
-    loader = _bare_scene(physx.PhysxCpuSystem()).create_urdf_loader()
-    loader.fix_root_link = spec.fixed_base
-    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
-        try:
-            builders, actors, _ = loader.parse(urdf, srdf)
-        except Exception as error:
-            raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
-    if len(builders) != 1 or actors:
-        raise RobotError(
-            "the URDF does not describe one articulated robot; it needs at least one moving joint"
-        )
-    _part(builders[0])
-    return builders[0]
-
-
-def _part(builder: ArticulationBuilder) -> None:
-    """Let links that fixed joints tie together not touch: they cannot move apart, and the solver would shake them.
-
-    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit
-    of the third word never touch; each such group is given one that no pair of the .srdf uses, while there are any.
-    """
-    body: dict[str, str] = {}
-    groups: dict[str, list[Any]] = {}
-    for link in builder.link_builders:
-        tied = link.parent is not None and link.joint_record.joint_type == "fixed"
-        body[link.name] = body[link.parent.name] if tied else link.name
-        groups.setdefault(body[link.name], []).append(link)
-    used = 0
-    for link in builder.link_builders:
-        used |= link.collision_groups[2]
-    free = (1 << bit for bit in range(32) if not used >> bit & 1)
-    for links in groups.values():
-        solid = [link for link in links if link.collision_records]
-        if len(links) > 2 and len(solid) > 1:
-            bit = next(free, 0)
-            for link in solid:
-                link.collision_groups[2] |= bit
-
-
-@contextmanager
-def _in_memory(text: str | None) -> Iterator[str]:
-    """Path of a file that holds ``text``, for a loader that takes no text; whoever is killed leaves none behind."""
-    if text is None:
-        yield ""
-        return
-    with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        yield f"/proc/self/fd/{file.fileno()}"
-
-
-class Probe:
-    """One robot by itself on a fixed base, asked about poses qpos (n, dof); nothing of it moves in time.
-
-    The dynamics are Pinocchio's, on the model that SAPIEN derives.
-    """
-
-    def __init__(self, spec: SceneSpec) -> None:
-        with _global_config(spec):
-            self._system = physx.PhysxCpuSystem()
-            self._system.timestep = 1e-6
-            self._scene = _bare_scene(self._system)
-            self._robot = _build_robot(parse(spec), self._scene, spec)
-            if spec.ground:
-                self._scene.add_ground(0.0, render=False)
-        self._dof = self._robot.dof
-        self._model = self._robot.create_pinocchio_model()
-        # Links that fixed joints tie together are one body; its number, per link name. The base and the ground are 0.
-        self._body: dict[str, int] = {}
-        for number, link in enumerate(self._robot.links):
-            tied = link.parent is not None and link.joint.type == "fixed"
-            self._body[link.name] = self._body[link.parent.name] if tied else number
-
-    def mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
-        """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
-        matrices = np.empty((len(qpos), self._dof, self._dof))
-        for matrix, row in zip(matrices, np.asarray(qpos, np.float64), strict=True):
-            matrix[...] = self._model.compute_generalized_mass_matrix(row)
-        return matrices
-
-    def inverse_dynamics(
-        self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]
-    ) -> NDArray[np.float64]:
-        """Efforts (n, dof) [N m or N] of a motion, gravity included, friction and damping left out."""
-        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, qacc)), strict=True)
-        return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
-
-    def forward_dynamics(
-        self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]
-    ) -> NDArray[np.float64]:
-        """Accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included, damping left out."""
-        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, effort)), strict=True)
-        return np.array([self._model.compute_forward_dynamics(*row) for row in rows])
-
-    def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
-        """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,).
-
-        Links that fixed joints tie together do not count, nor the base and what is tied to it with the ground.
-        """
-        return np.array([self._touches(row.astype(np.float32), clearance) for row in np.asarray(qpos)])
-
-    def _touches(self, qpos: Float32, clearance: float) -> bool:
-        self._robot.set_qpos(qpos)
-        self._robot.set_qvel(np.zeros_like(qpos))
-        self._system.step()
-        for contact in self._system.get_contacts():
-            if len({self._body.get(body.entity.name, 0) for body in contact.bodies}) == 1:
-                continue
-            if any(point.separation < clearance for point in contact.points):
-                return True
-        return False
-
-
-@lru_cache(maxsize=8)
-def probe(spec: SceneSpec) -> Probe:
-    """Return the probe of this scene, built at most once."""
-    return Probe(spec)
-
-
 class Pack:
-    """M scenes of one robot, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units."""
+    """M scenes of one robot, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
+
+    ``isolated`` (M,) tells which robots have got a system of their own.
+    """
 
     def __init__(
         self,
@@ -198,52 +43,127 @@ class Pack:
         first_env: int = 0,
         system_size: int = 8,
     ) -> None:
-        with _global_config(spec):
-            # PhysX solves the contacts of free bodies in an order that depends on what else its system holds, so
-            # scenes with content of their own do not share one: that would cost the last bits.
-            shared = system_size if spec.build is None else 1
-            self._systems = [physx.PhysxCpuSystem() for _ in range(-(-size // shared))]
-            for system in self._systems:
-                system.timestep = spec.timestep
+        self._builder, self._spec = builder, spec
+        # A robot that stands on the ground is touched at several places from the start, and so are free bodies.
+        self._shares = spec.fixed_base and spec.build is None
+        shared = system_size if self._shares else 1
+        with engine_settings(spec):
+            systems = [_system(spec) for _ in range(-(-size // shared))]
+            self._homes = [systems[row // shared] for row in range(size)]
+            self._systems = list(self._homes)
+            built = [self._build(row, system) for row, system in enumerate(self._homes)]
             # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
-            self._scenes = [_bare_scene(self._systems[index // shared]) for index in range(size)]
-            self._robots = [_build_robot(builder, scene, spec) for scene in self._scenes]
-            if spec.ground:
-                for scene in self._scenes:
-                    scene.add_ground(0.0, render=False)
+            self._scenes, self._robots = map(list, zip(*built, strict=True))
             build = spec.build
             self._contents = (
                 []
                 if build is None
                 else [Content(build, scene, env) for env, scene in enumerate(self._scenes, start=first_env)]
             )
-        for group, scene in enumerate(self._scenes, start=1):
-            _separate(scene, group)
+        for row, scene in enumerate(self._scenes):
+            separate(scene, row + 1)
         self.size, self.dof = size, self._robots[0].dof
-        self._joints = [robot.active_joints for robot in self._robots]
-        self._damping = np.array([[joint.damping for joint in self._joints[0]]])
-        self._get_qpos = [robot.get_qpos for robot in self._robots]
-        self._get_qvel = [robot.get_qvel for robot in self._robots]
-        self._passive = [robot.compute_passive_force for robot in self._robots]
-        # set_qf from a kept row view costs half of what a fresh one does.
+        self.isolated = np.zeros(size, bool)
+        self._crowding = Crowding(link_extents(self._robots[0]), self.dof, spec.timestep)
+        self._damping = np.array([[joint.damping for joint in self._robots[0].active_joints]])
         self._qf = np.zeros((size, self.dof), np.float32)
-        self._set_qf = [(robot.set_qf, row) for robot, row in zip(self._robots, self._qf, strict=True)]
         self._held: NDArray[np.bool_] = np.zeros(size, bool)
-        self._steps = [system.step for system in self._systems]
+        self._bind()
+
+    def _build(self, row: int, system: Any) -> tuple[Any, Any]:
+        """A scene in ``system`` and the robot in it, for ``row``."""
+        scene = bare_scene(system)
+        robot = build_robot(self._builder, scene, self._spec)
+        if self._spec.ground:
+            scene.add_ground(0.0, render=False)
+        return scene, robot
+
+    def _bind(self) -> None:
+        """Keep the calls that every sim step makes, which is cheaper than to look them up."""
+        robots = self._robots
+        self._joints = [robot.active_joints for robot in robots]
+        self._get_qpos = [robot.get_qpos for robot in robots]
+        self._get_qvel = [robot.get_qvel for robot in robots]
+        self._passive = [robot.compute_passive_force for robot in robots]
+        # set_qf from a kept row view costs half of what a fresh one does.
+        rows = zip(robots, self._qf, self._held, strict=True)
+        self._set_qf = [(robot.set_qf, row) for robot, row, held in rows if not held]
+        self._steps = [system.step for system in dict.fromkeys(self._systems)]
+        shared = [row for row in range(self.size) if self._shares and not self.isolated[row]]
+        self._get_contacts = [s.get_contacts for s in dict.fromkeys(self._systems[row] for row in shared)]
+        self._links = {link: (row, i) for row in shared for i, link in enumerate(robots[row].links)}
 
     def step(self) -> None:
         """One sim step of every scene."""
         for step in self._steps:
             step()
+        for get_contacts in self._get_contacts:
+            contacts = get_contacts()
+            if len(contacts) > 1:
+                self.isolate(self._crowded(contacts))
 
-    def alter(self, row: int, link: str, mass: float, friction: float) -> None:
-        """Add ``mass`` [kg] to a link of robot ``row``, and ``friction`` to each of its joints."""
-        robot = self._robots[row]
-        for body in robot.links:
-            if body.name == link:
-                body.set_mass(body.mass + mass)
-        for joint in robot.active_joints:
-            joint.set_friction(joint.friction + friction)
+    def _crowded(self, contacts: Iterable[Any]) -> list[int]:
+        """Robots that share a system and may be touched at two places in the next step."""
+        near: dict[int, list[tuple[int, int, Any]]] = {}
+        nobody = (None, WORLD)
+        for contact in contacts:
+            first, second = (self._links.get(body, nobody) for body in contact.bodies)
+            row = second[0] if first[0] is None else first[0]
+            if row is not None and not self._held[row]:
+                near.setdefault(row, []).append((first[1], second[1], contact.points))
+        return [
+            row
+            for row, pairs in near.items()
+            if len(pairs) > 1
+            and self._crowding.foresees(
+                [Gap(a, b, min(point.separation for point in points)) for a, b, points in pairs],
+                self._get_qvel[row](),
+            )
+        ]
+
+    def isolate(self, rows: Iterable[int]) -> None:
+        """Give each robot of ``rows`` that shares a system one of its own, in the state in which it is."""
+        self._move({row: _system(self._spec) for row in rows if self._shares and not self.isolated[row]})
+
+    def _start_over(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
+        """Let robots that were placed anew share a system again, or start in a new one of their own.
+
+        So nothing that touched a robot before matters any more.
+        """
+        crowded: dict[bytes, bool] = {}
+        systems = {}
+        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+            state = position.tobytes() + velocity.tobytes()
+            if state not in crowded:
+                crowded[state] = self._crowding.foresees(probe(self._spec).gaps(position), velocity)
+            if crowded[state]:
+                systems[row] = _system(self._spec)
+            elif self.isolated[row]:
+                systems[row] = self._homes[row]
+        self._move(systems)
+
+    def _move(self, systems: dict[int, Any]) -> None:
+        """Build the robots of some rows anew in these systems, in the state in which they are."""
+        for row, system in systems.items():
+            old, past = self._robots[row], self._scenes[row]
+            with engine_settings(self._spec):
+                scene, new = self._build(row, system)
+            separate(scene, row + 1)
+            new.set_qpos(old.get_qpos())
+            new.set_qvel(old.get_qvel())
+            new.set_qf(self._qf[row])
+            for ours, theirs in zip(new.active_joints, old.active_joints, strict=True):
+                gains = theirs.stiffness, theirs.damping, theirs.force_limit, theirs.drive_mode
+                ours.set_drive_properties(*gains)
+                ours.set_drive_target(theirs.drive_target)
+                ours.set_drive_velocity_target(theirs.drive_velocity_target)
+            if self._held[row]:
+                _let_float(new, True)
+            past.clear()
+            self._systems[row], self._scenes[row], self._robots[row] = system, scene, new
+            self.isolated[row] = system is not self._homes[row]
+        if systems:
+            self._bind()
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions [rad or m], a new array."""
@@ -289,6 +209,8 @@ class Pack:
             robot.set_qf(self._qf[row])
             if self._contents:
                 self._contents[row].reset()
+        if self._shares:
+            self._start_over(rows, qpos, qvel)
 
     def read_root(self) -> Float32:
         """Each robot's root link (M, 13): position, quaternion w, x, y, z, linear and angular velocity."""
@@ -322,11 +244,9 @@ class Pack:
         if (mask == self._held).all():
             return
         for robot, held in zip(self._robots, mask, strict=True):
-            for link in robot.links:
-                link.disable_gravity = bool(held)
+            _let_float(robot, bool(held))
         self._held = mask.copy()
-        rows = zip(self._robots, self._qf, mask, strict=True)
-        self._set_qf = [(robot.set_qf, row) for robot, row, held in rows if not held]
+        self._bind()
 
     def read_poses(self) -> list[Float32]:
         """Poses of each scene's watched entities, (watched, 7) each."""
@@ -358,76 +278,17 @@ class Pack:
     def close(self) -> None:
         """Free the scenes. The pack cannot be used afterwards."""
         self._set_qf, self._get_qpos, self._get_qvel, self._passive = [], [], [], []
+        self._get_contacts, self._links = [], {}
         self._joints, self._robots, self._contents = [], [], []
-        self._scenes, self._systems, self._steps = [], [], []
+        self._scenes, self._systems, self._homes, self._steps = [], [], [], []
 
 
-def _bare_scene(system: Any) -> Any:
-    # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
-    return HeadlessScene([system])
-
-
-@contextmanager
-def _global_config(spec: SceneSpec) -> Iterator[None]:
-    """SAPIEN's process-wide settings, ours while a pack is built, then the caller's again.
-
-    Every setting is given, so that a result depends on nothing that the caller's process did before.
-    """
-    scene, body = physx.get_scene_config(), physx.get_body_config()
-    shape, material = physx.get_shape_config(), physx.get_default_material()
-    physx.set_scene_config(
-        gravity=np.array(spec.gravity, np.float32),
-        bounce_threshold=2.0,
-        enable_pcm=True,
-        enable_tgs=spec.physics.solver == "TGS",
-        enable_ccd=False,
-        enable_enhanced_determinism=False,
-        enable_friction_every_iteration=True,
-        cpu_workers=0,
-    )
-    physx.set_body_config(
-        solver_position_iterations=spec.physics.position_iterations,
-        solver_velocity_iterations=spec.physics.velocity_iterations,
-        sleep_threshold=0.0,
-    )
-    physx.set_shape_config(contact_offset=0.01, rest_offset=0.0)
-    physx.set_default_material(0.3, 0.3, 0.1)
-    try:
-        yield
-    finally:
-        physx.set_scene_config(scene)
-        physx.set_body_config(body)
-        physx.set_shape_config(shape)
-        physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
-
-
-def _build_robot(builder: ArticulationBuilder, scene: Any, spec: SceneSpec) -> Any:
-    builder.set_scene(scene)
-    robot = builder.build()
-    names = [joint.name for joint in robot.active_joints]
-    if names != [joint.name for joint in spec.joints]:
-        raise RobotError(f"SAPIEN numbers the joints {names}, not {[joint.name for joint in spec.joints]}")
-    robot.set_sleep_threshold(0.0)
-    dissipation = DISSIPATION[spec.dissipation]
+def _let_float(robot: Any, floats: bool) -> None:
     for link in robot.links:
-        link.set_linear_damping(dissipation.link_damping)
-        link.set_angular_damping(dissipation.link_damping)
-    for joint, ours in zip(robot.active_joints, spec.joints, strict=True):
-        # SAPIEN parses <dynamics friction> and never applies it.
-        friction = dissipation.joint_friction
-        joint.set_friction(ours.friction if friction is None else friction)
-    return robot
+        link.disable_gravity = floats
 
 
-def _separate(scene: Any, group: int) -> None:
-    """Give every shape of ``scene`` the collision group ``group``: shapes of different groups never touch.
-
-    PhysX's filter, as SAPIEN sets it up, compares the upper 16 bits of the fourth word.
-    """
-    for entity in scene.entities:
-        for component in entity.components:
-            if isinstance(component, physx.PhysxRigidBaseComponent):
-                for shape in component.collision_shapes:
-                    words = list(shape.get_collision_groups())
-                    words[3] = (words[3] & 0xFFFF) | (group << 16)
-                    shape.set_collision_groups(words)
+def _system(spec: SceneSpec) -> Any:
+    system = physx.PhysxCpuSystem()
+    system.timestep = spec.timestep
+    return system

@@ -25,7 +25,7 @@ from batchpid.markers import MARKERS
 
 from .faults import CAUSES, Containment
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class EnvStates:
     """Position, quaternion w, x, y, z, linear and angular velocity of the root link (envs, 13)."""
     content: NDArray[np.float32]
     """What the caller's content needs (envs, numbers); NaN where an env needs fewer than another."""
+    isolated: NDArray[np.bool_]
+    """Whether the robot has a PhysX system of its own (:mod:`sim.isolation`)."""
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
@@ -59,7 +61,12 @@ class EnvStates:
         """
         row, table = np.zeros((num_envs, 13), np.float32), np.zeros((num_envs, dof), np.float32)
         wanted: dict[str, Any] = dict.fromkeys(("qpos", "qvel", "effort"), table)
-        wanted |= {"root": row, "saturated": table > 0, "content": self.content[:num_envs]}
+        wanted |= {
+            "root": row,
+            "isolated": row[:, 0] > 0,
+            "saturated": table > 0,
+            "content": self.content[:num_envs],
+        }
         known = Containment(num_envs, dof, "hold", None).read()
         wanted |= {f"containment.{name}": rows for name, rows in known.items()}
         found = dict(_flatten(self))

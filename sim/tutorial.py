@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sapien
 from numpy.typing import NDArray
 
 from batchpid.oracle import SimplePID
 
 from .robot import Robot
-from .scenes import sapien
 
 
 class TutorialLoop:

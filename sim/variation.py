@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 
+from .building import SceneSpec
 from .kinematics import Kinematics
+from .probe import Probe
 from .robot import Robot
-from .scenes import Pack, Probe, SceneSpec
+from .scenes import Pack
 
 if TYPE_CHECKING:
     from sapien.wrapper.articulation_builder import ArticulationBuilder
@@ -101,14 +103,20 @@ class VariedPack(Pack):
         variation: Variation,
         model: Probe,
     ) -> None:
-        self._late: NDArray[Any] | None = None
-        self._resolution = 0.0
+        self._variation, self._model, self._resolution = variation, model, variation.resolution
         super().__init__(builder, spec, size, first_env, system_size)
-        for row, (payload, friction) in enumerate(zip(variation.payload, variation.friction, strict=True)):
-            self.alter(row, variation.link, float(payload), float(friction))
-        self._resolution, self._model = variation.resolution, model
-        if variation.late:
-            self._late = np.zeros((size, self.dof))
+        self._late = np.zeros((size, self.dof)) if variation.late else None
+
+    def _build(self, row: int, system: Any) -> tuple[Any, Any]:
+        """A scene and its robot, with its payload and its friction."""
+        scene, robot = super()._build(row, system)
+        variation = self._variation
+        for link in robot.links:
+            if link.name == variation.link:
+                link.set_mass(link.mass + float(variation.payload[row]))
+        for joint in robot.active_joints:
+            joint.set_friction(joint.friction + float(variation.friction[row]))
+        return scene, robot
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions as the sensors give them."""

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
+from sim.building import SceneSpec, parse
 from sim.kinematics import Kinematics
 from sim.physics import PHYSICS
 from sim.rotations import about, from_rpy, multiply, rotate
-from sim.scenes import Pack, SceneSpec, parse
+from sim.scenes import Pack
 
 ODD = """<robot name="odd">
   <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>
