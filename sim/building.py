@@ -183,7 +183,7 @@ def link_extents(robot: Any) -> list[Link]:
         joint, slides = link.joint, link.joint.type == "prismatic"
         offset = np.linalg.norm(joint.pose_in_parent.p) + np.linalg.norm(joint.pose_in_child.p)
         if slides:
-            offset += np.abs(joint.limits).max(initial=0.0)
+            offset += np.abs(np.clip(joint.limits, -10.0, 10.0)).max(initial=0.0)  # a rail may have no end
         radius = 0.0
         if link.collision_shapes:
             corners = np.abs(link.compute_global_aabb_tight() - link.entity_pose.p)

@@ -135,7 +135,7 @@ class _Engine:
         self._substeps = setup.substeps
         builder = parse(spec)
         sizes = [min(size, share - first) for first in range(0, share, size)]
-        self._packs = [Pack(builder, spec, count, system_size=size) for count in sizes]
+        self._packs = [Pack(builder, spec, count, system_size=size, isolates=False) for count in sizes]
         self._start, self._share = setup.start, share
         for pack in self._packs:
             stiffness, damping = setup.robot.settings.drive_stiffness, setup.robot.settings.drive_damping

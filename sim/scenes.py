@@ -32,7 +32,7 @@ Float32 = NDArray[np.float32]
 class Pack:
     """M scenes of one robot, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
 
-    ``isolated`` (M,) tells which robots have got a system of their own.
+    ``isolated`` (M,) tells which robots have got a system of their own; none do with ``isolates`` False.
     """
 
     def __init__(
@@ -42,11 +42,12 @@ class Pack:
         size: int,
         first_env: int = 0,
         system_size: int = 8,
+        isolates: bool = True,
     ) -> None:
         self._builder, self._spec = builder, spec
         # A robot that stands on the ground is touched at several places from the start, and so are free bodies.
-        self._shares = spec.fixed_base and spec.build is None
-        shared = system_size if self._shares else 1
+        shares = spec.fixed_base and spec.build is None
+        shared, self._isolates = system_size if shares else 1, shares and isolates
         with engine_settings(spec):
             systems = [_system(spec) for _ in range(-(-size // shared))]
             self._homes = [systems[row // shared] for row in range(size)]
@@ -89,7 +90,7 @@ class Pack:
         rows = zip(robots, self._qf, self._held, strict=True)
         self._set_qf = [(robot.set_qf, row) for robot, row, held in rows if not held]
         self._steps = [system.step for system in dict.fromkeys(self._systems)]
-        shared = [row for row in range(self.size) if self._shares and not self.isolated[row]]
+        shared = [row for row in range(self.size) if self._isolates and not self.isolated[row]]
         self._get_contacts = [s.get_contacts for s in dict.fromkeys(self._systems[row] for row in shared)]
         self._links = {link: (row, i) for row in shared for i, link in enumerate(robots[row].links)}
 
@@ -123,19 +124,19 @@ class Pack:
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Give each robot of ``rows`` that shares a system one of its own, in the state in which it is."""
-        self._move({row: _system(self._spec) for row in rows if self._shares and not self.isolated[row]})
+        self._move({row: _system(self._spec) for row in rows if self._isolates and not self.isolated[row]})
 
     def _start_over(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
         """Let robots that were placed anew share a system again, or start in a new one of their own.
 
         So nothing that touched a robot before matters any more.
         """
-        crowded: dict[bytes, bool] = {}
+        model, crowded = probe(self._spec), dict[bytes, bool]()
         systems = {}
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
             state = position.tobytes() + velocity.tobytes()
             if state not in crowded:
-                crowded[state] = self._crowding.foresees(probe(self._spec).gaps(position), velocity)
+                crowded[state] = self._crowding.foresees(model.gaps(position), velocity)
             if crowded[state]:
                 systems[row] = _system(self._spec)
             elif self.isolated[row]:
@@ -209,7 +210,7 @@ class Pack:
             robot.set_qf(self._qf[row])
             if self._contents:
                 self._contents[row].reset()
-        if self._shares:
+        if self._isolates:
             self._start_over(rows, qpos, qvel)
 
     def read_root(self) -> Float32:
