@@ -86,6 +86,19 @@ def test_falling_limply_onto_the_ground(name):
     same(fall(8), first)
 
 
+def test_a_floating_base():
+    """It lies on the ground from the start, so it has a system of its own, like any other that does."""
+    model = Robot.load("panda", fixed_base=False)
+    effort = np.random.default_rng(0).normal(size=(TICKS, N, model.dof)) * model.effort_limit
+    runs = []
+    for pack_size, workers in ((1, 0), (8, 0), (4, 2)):
+        options = {"control": "effort", "params": model.params(**OPEN_LOOP), "workers": workers}
+        with Runner(model, N, pack_size=pack_size, **options) as runner:
+            runs.append(runner.rollout(effort))
+    same(runs[1], runs[0])
+    same(runs[2], runs[0])
+
+
 def test_an_env_alone_and_among_others():
     model, alone = robot("jaco2"), reference().qpos[:, :1]
     effort = np.random.default_rng(0).normal(size=(TICKS, N, model.dof)) * model.effort_limit
