@@ -1,13 +1,14 @@
-"""When a robot needs a PhysX system of its own: before it can be touched at two places at once.
+"""When a robot needs a PhysX system of its own: before something touches it.
 
 Robots that share a system never meet, and each moves to the last bit as it would alone, as long as at most one contact
 acts on it. PhysX solves contacts one after another, each with what the one before left over (Gauss-Seidel), and their
 order depends on what else the system holds: PGS sorts those of articulations by their index in a pool that all share
 (``ArticulationSortPredicate`` in ``DyDynamics.cpp`` of PhysX 5.3.1), TGS takes them as they began. Its flag for
-enhanced determinism changes neither. So a robot is taken out while its contacts do not act yet; from then on its own
-past alone decides the order.
+enhanced determinism changes neither. In a system of its own a robot's past alone decides the order.
 
-The engine lists a pair of shapes from 0.02 m apart (twice the contact offset), long before they push each other.
+It has to be there before a second contact acts, and had better be before the first: a robot that is built anew loses
+what the engine remembers of a contact, as where friction holds. The engine lists a pair of shapes from 0.02 m apart
+(twice the contact offset), long before they push each other.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Gap(NamedTuple):
 
 
 class Crowding:
-    """Whether a robot made of ``links``, parents first, may be touched at two places in the next time step."""
+    """Whether a robot made of ``links``, parents first, may be touched in the next time step."""
 
     def __init__(self, links: Sequence[Link], dof: int, timestep: float) -> None:
         reach = np.zeros(
@@ -68,14 +69,16 @@ class Crowding:
         self._ahead, self._surge = AHEAD * timestep, SURGE * timestep
 
     def foresees(self, gaps: Iterable[Gap], qvel: NDArray[np.floating]) -> bool:
-        """Whether two of ``gaps`` may close within AHEAD time steps at joint velocities ``qvel`` (dof,).
+        """Whether one of ``gaps`` may close within AHEAD steps at joint velocities ``qvel`` (dof,), or two suddenly.
 
-        A gap closes no faster than sum_j r_j |qvel_j| + SURGE timestep, over the joints between its links, with r_j the
-        reach of the links about joint j, or 1 where it slides.
+        A gap closes no faster than sum_j r_j |qvel_j|, over the joints between its links, with r_j the reach of the
+        links about joint j, or 1 where it slides; suddenly, than that and SURGE timestep. Fingers that rest a
+        millimetre apart and spring together touch at one place first, which has no order.
         """
-        speed = np.abs(qvel)
-        closing = (
-            gap.distance <= self._ahead * (self._arm[gap.first, gap.second] @ speed + self._surge)
-            for gap in gaps
-        )
-        return sum(map(bool, closing)) > 1
+        speed, sudden = np.abs(qvel), 0
+        for gap in gaps:
+            closing = self._arm[gap.first, gap.second] @ speed
+            if gap.distance <= self._ahead * closing:
+                return True
+            sudden += gap.distance <= self._ahead * (closing + self._surge)
+        return sudden > 1

@@ -2,8 +2,8 @@
 
 A pack is M scenes, one robot each, in step with each other, some of them to a PhysX system. All stand at the origin;
 the shapes of each scene carry a collision group of their own, so that scenes never meet. That is bit-identical to one
-system per scene, and a fifth to a third cheaper. A robot that may be touched at several places gets a system of its own
-before (:mod:`sim.isolation`).
+system per scene, and a fifth to a third cheaper. A robot gets a system of its own before something touches it
+(:mod:`sim.isolation`).
 
 The loop needs a dozen calls and no more (:class:`Pack`); another gateway to the engine has only these to provide.
 """
@@ -45,13 +45,13 @@ class Pack:
         isolates: bool = True,
     ) -> None:
         self._builder, self._spec = builder, spec
-        # A robot that stands on the ground is touched at several places from the start, and so are free bodies.
+        # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates
+        systems = [_system(spec) for _ in range(-(-size // shared))]
+        self._homes = [systems[row // shared] for row in range(size)]
+        self._systems = list(self._homes)
         with engine_settings(spec):
-            systems = [_system(spec) for _ in range(-(-size // shared))]
-            self._homes = [systems[row // shared] for row in range(size)]
-            self._systems = list(self._homes)
             built = [self._build(row, system) for row, system in enumerate(self._homes)]
             # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
             self._scenes, self._robots = map(list, zip(*built, strict=True))
@@ -100,11 +100,11 @@ class Pack:
             step()
         for get_contacts in self._get_contacts:
             contacts = get_contacts()
-            if len(contacts) > 1:
+            if contacts:
                 self.isolate(self._crowded(contacts))
 
     def _crowded(self, contacts: Iterable[Any]) -> list[int]:
-        """Robots that share a system and may be touched at two places in the next step."""
+        """Robots that share a system and may be touched in the next step."""
         near: dict[int, list[tuple[int, int, Any]]] = {}
         nobody = (None, WORLD)
         for contact in contacts:
@@ -115,8 +115,7 @@ class Pack:
         return [
             row
             for row, pairs in near.items()
-            if len(pairs) > 1
-            and self._crowding.foresees(
+            if self._crowding.foresees(
                 [Gap(a, b, min(point.separation for point in points)) for a, b, points in pairs],
                 self._get_qvel[row](),
             )
@@ -127,7 +126,7 @@ class Pack:
         self._move({row: _system(self._spec) for row in rows if self._isolates and not self.isolated[row]})
 
     def _start_over(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Let robots that were placed anew share a system again, or start in a new one of their own.
+        """Let robots that were placed anew share a system again, or start in a new one of their own where they touch.
 
         So nothing that touched a robot before matters any more.
         """
@@ -290,6 +289,7 @@ def _let_float(robot: Any, floats: bool) -> None:
 
 
 def _system(spec: SceneSpec) -> Any:
-    system = physx.PhysxCpuSystem()
+    with engine_settings(spec):  # the solver and gravity are the system's
+        system = physx.PhysxCpuSystem()
     system.timestep = spec.timestep
     return system

@@ -1,4 +1,4 @@
-"""Which robots get a PhysX system of their own: those that may be touched at two places in the next time step."""
+"""Which robots get a PhysX system of their own: those that may be touched in the next time step."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim import Robot
+from sim.accuracy import contact_moves, follow
 from sim.building import SceneSpec, link_extents, parse
 from sim.isolation import AHEAD, SURGE, WORLD, Crowding, Gap, Link
 from sim.kinematics import Kinematics
@@ -31,14 +32,16 @@ def crowding(timestep=DT):
     return Crowding(HAND, 4, timestep)
 
 
-def test_one_contact_has_no_order():
-    assert not crowding().foresees([Gap(2, 3, -0.001)], np.full(4, 1e3))
-
-
 @pytest.mark.parametrize(("far", "expected"), [(0.9, True), (1.1, False)])
-def test_two_gaps_at_rest_count_when_both_are_near(far, expected):
-    gaps = [Gap(2, 3, 0.0), Gap(2, WORLD, far * STILL)]
-    assert crowding().foresees(gaps, np.zeros(4)) is expected
+def test_from_rest_two_gaps_count(far, expected):
+    gaps = [Gap(2, 3, 0.5 * STILL), Gap(2, WORLD, far * STILL)]
+    assert crowding().foresees(gaps, np.zeros(4)) == expected
+    assert not crowding().foresees(gaps[:1], np.zeros(4))
+
+
+def test_what_touches_already_counts():
+    assert crowding().foresees([Gap(2, 3, 0.0)], np.zeros(4))
+    assert not crowding().foresees([], np.full(4, 1e3))
 
 
 @pytest.mark.parametrize(
@@ -54,10 +57,11 @@ def test_a_gap_closes_as_fast_as_the_joints_between_its_links_move(pair, arms):
     """A link turns about a joint with its farthest point, a sliding joint's full travel apart."""
     qvel = np.array([1.0, -2.0, 3.0, -4.0])
     speed = float(np.abs(qvel) @ arms)
-    closes = AHEAD * DT * (speed + SURGE * DT)
-    beside = Gap(2, 3, -1.0)
-    assert crowding().foresees([beside, Gap(*pair, closes * 0.999)], qvel)
-    assert not crowding().foresees([beside, Gap(*pair, closes * 1.001)], qvel)
+    closes = AHEAD * DT * speed
+    assert crowding().foresees([Gap(*pair, closes * 0.999)], qvel)
+    assert not crowding().foresees([Gap(*pair, closes * 1.001)], qvel)
+    two = Gap(*pair, closes + 0.99 * STILL)
+    assert crowding().foresees([two, two], qvel)
 
 
 @given(
@@ -95,3 +99,61 @@ def test_no_link_outruns_its_reach(name):
     bound = np.abs(qvel) @ arm.T
     assert (speed <= bound * (1 + 1e-4) + 1e-6).all()
     assert (bound[:, 1:].max(1) < 20 * speed.max(1)).all()  # not a bound that says nothing
+
+
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_a_system_of_its_own_is_like_the_shared_one(physics):
+    """Solver, gravity and time step; and what is set on the robot: friction, damping, drive, qf, weightlessness."""
+    robot = Robot.load("jaco2")
+    spec = SceneSpec(
+        robot.urdf, robot.srdf, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0)
+    )
+    pack = Pack(parse(spec), spec, 4, system_size=4)
+    pack.write_state(range(4), np.tile(robot.start, (4, 1)), np.full((4, robot.dof), 0.1))
+    pack.write_drive(np.array(30.0), np.array(2.0), np.array(9.0))
+    pack.write_drive_target(np.tile(robot.start, (4, 1)), np.full((4, robot.dof), 0.3))
+    pack.write_qf(np.full((4, robot.dof), 0.5))
+    pack.hold(np.array([False, True, False, False]))
+    pack.isolate([0, 1])
+    assert pack.isolated.tolist() == [True, True, False, False]
+    home, own = pack._systems[2], pack._systems[0]
+    assert own is not home
+    assert own.timestep == home.timestep == pytest.approx(DT)
+    settings = [name for name in dir(home.config) if not name.startswith("_")]
+    assert "enable_tgs" in settings
+    for name in settings:
+        assert np.all(getattr(own.config, name) == getattr(home.config, name)), name
+    assert own.config.enable_tgs == (physics == "accurate")
+    for row, other in ((0, 2), (1, 3)):
+        ours, theirs = pack._robots[row], pack._robots[other]
+        for name in ("qpos", "qvel", "qf") if row == 0 else ("qpos", "qvel"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
+        for joint, like in zip(ours.active_joints, theirs.active_joints, strict=True):
+            for name in ("stiffness", "damping", "force_limit", "drive_mode", "drive_target"):
+                assert getattr(joint, name) == getattr(like, name), name
+            assert joint.drive_velocity_target == like.drive_velocity_target
+            assert joint.friction == like.friction == pytest.approx(0.05)
+        for link, like in zip(ours.links, theirs.links, strict=True):
+            assert link.mass == like.mass
+            assert link.linear_damping == like.linear_damping == pytest.approx(0.05)
+            assert link.disable_gravity == (row == 1)
+    for _ in range(20):
+        pack.step()
+    qpos = pack.read_qpos()
+    assert np.abs(qpos[0] - robot.start).max() > 1e-3
+    np.testing.assert_allclose(qpos[0], qpos[2], atol=1e-5)
+    pack.close()
+
+
+def test_leaving_before_the_touch_changes_no_path(monkeypatch):
+    """What the engine remembers of a contact would be lost with it; so robots leave before there is one."""
+    robot, left = Robot.load("panda"), []
+    moves = contact_moves(robot, 2)
+    move = Pack._move
+    monkeypatch.setattr(Pack, "_move", lambda pack, systems: (left.extend(systems), move(pack, systems)))
+    ours = follow(robot, moves, 1500, PHYSICS["fast"])
+    assert sorted(left) == [0, 1]
+    monkeypatch.setattr(Crowding, "foresees", lambda *_: False)
+    theirs = follow(robot, moves, 1500, PHYSICS["fast"])
+    assert len(left) == 2
+    np.testing.assert_allclose(ours, theirs, atol=2e-3)
