@@ -3,7 +3,7 @@
     python bench/contact.py
 
 64 robots, four to a PhysX system, against the same robots with a system each; once with systems of their own for robots
-that may be touched at several places at once (:mod:`sim.isolation`), and once without.
+that something touches (:mod:`sim.isolation`), and once without.
 """
 
 from __future__ import annotations

@@ -75,8 +75,8 @@ class Runner:
         it asks for are left out, so tutorial code runs as it is. It may return the entities that :meth:`poses` tells
         of. A reset puts what it added back to where it left it.
     pack_size
-        Scenes that share a PhysX system, at most: a matter of speed. A robot that may be touched at several places at
-        once gets a system of its own before, so that nothing else depends on it (docs/reliability.md).
+        Scenes that share a PhysX system, at most: a matter of speed. A robot gets a system of its own before
+        something touches it, so that nothing else depends on it (docs/reliability.md).
     on_fault
         What becomes of an env that fails, while the others go on undisturbed: ``"hold"`` it at rest where it last
         was sound, with ``ok`` False until it is reset; or ``"reset"`` it to where it last started, with
