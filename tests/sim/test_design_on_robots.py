@@ -76,7 +76,7 @@ def test_designed_gains_settle_within_two_seconds(name, units, record_property):
         workers=0,
     )
     worst = trial.metrics.settling_time.max()
-    record_property("settling_time", worst)
+    record_property("settling_time", float(worst))
     print(f"{name:52s} {ROBOTS[name]:32s} {units:12s} {robot.dof:3d} joints settle within {worst:.2f} s")
     assert trial.rollout.ok.all()
     assert np.isfinite(trial.metrics.overshoot[~np.isnan(trial.metrics.overshoot)]).all()
