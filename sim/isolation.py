@@ -53,9 +53,8 @@ class Crowding:
     """Whether a robot made of ``links``, parents first, may be touched in the next time step."""
 
     def __init__(self, links: Sequence[Link], dof: int, timestep: float) -> None:
-        reach = np.zeros(
-            (len(links) + 1, dof)
-        )  # of each link about each joint above it; the last row is the world's
+        # Of each link about each joint above it; the last row is the world's.
+        reach = np.zeros((len(links) + 1, dof))
         for row, link in zip(reach, links, strict=False):
             radius, at = link.radius, link
             while at.parent is not None:
