@@ -1,6 +1,7 @@
 """Joint-level PID control for many robots at once: arrays in, arrays out."""
 
 from batchpid import presets
+from batchpid.bumpless import track
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.controller import BatchPID
 from batchpid.design import design_gains
@@ -11,7 +12,6 @@ from batchpid.params import PIDParams, make_params
 from batchpid.serialization import load_about, load_params, save_params
 from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
-from batchpid.transfer import track
 
 __all__ = [
     "BatchPID",

@@ -1,6 +1,6 @@
 """``python -m batchpid`` is the command ``batchpid``."""
 
-from batchpid.cli import main
+from sim.cli import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid import law, transfer
+from batchpid import bumpless, law
 from batchpid.coefficients import discretise
 from batchpid.errors import MissingDependencyError
 from batchpid.params import PIDParams
@@ -49,7 +49,7 @@ class NumPyBackend:
     def track(self, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any) -> PIDState:
         """Return the state whose next step gives the effort ``u``."""
         rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-        return transfer.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
+        return bumpless.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
 
 
 class JAXBackend:
@@ -89,7 +89,7 @@ class JAXBackend:
             params: PIDParams, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any
         ) -> PIDState:
             rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-            return transfer.track(params, state, r, y, u, dt=dt, feedforward=ff, **rates)
+            return bumpless.track(params, state, r, y, u, dt=dt, feedforward=ff, **rates)
 
         self._init = self._compiled(law.init)
         self._step = self._compiled(step, donate_argnums=3)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from batchpid.backends import JAXBackend, NumPyBackend
+from batchpid.bumpless import no_integral
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
-from batchpid.transfer import no_integral
 
 BACKENDS = ("numpy", "jax")
 

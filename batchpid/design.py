@@ -23,8 +23,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
-from batchpid.markers import CHOICES
 from batchpid.params import PIDParams
 from batchpid.stability import stability_bound
 
@@ -123,7 +123,7 @@ def design_gains(
         (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded ones within the
         limits.
     gain_units
-        "effort", "inertia" or "mass_matrix": what the gains are per (:mod:`batchpid.inertia`).
+        "effort", "inertia" or "mass_matrix": what the gains are per (:mod:`batchpid.computed_torque`).
     margin
         Share of the stability range that may be used, below 1.
     options

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.markers import MARKERS
+from batchpid.choices import MARKERS
 
 TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *MARKERS})

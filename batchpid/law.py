@@ -23,9 +23,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from batchpid.choices import Everywhere, HoldEffort
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.elementwise import clip, flush, namespace, wrap
-from batchpid.markers import Everywhere, HoldEffort
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 

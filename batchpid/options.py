@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
-from batchpid.markers import CHOICES
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.choices import CHOICES, Everywhere
 from batchpid.errors import InvalidArgumentError
-from batchpid.markers import CHOICES, Everywhere
 from batchpid.options import LeafBuilder
 
 
@@ -221,7 +221,7 @@ def make_params(
         command "zero" effort, or "hold" the last effort.
     gain_units
         "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
-        which :class:`sim.Runner` turns into an effort at the robot's pose (see :mod:`batchpid.inertia`).
+        which :class:`sim.Runner` turns into an effort at the robot's pose (see :mod:`batchpid.computed_torque`).
     joint_names
         Used in error messages.
     dtype

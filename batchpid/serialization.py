@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
-from batchpid.markers import CHOICES
 from batchpid.params import PIDParams, make_params
 
 FORMAT = "batchpid-params-1"

@@ -12,9 +12,9 @@ from typing import Any
 
 import tyro
 
-from batchpid.cli.report import table
 from sim import Robot
-from sim.accuracy import REFERENCES, TIMESTEP, measure
+from sim.benchmark.accuracy import REFERENCES, TIMESTEP, measure
+from sim.cli.report import table
 
 THINNED = 20
 

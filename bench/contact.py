@@ -3,7 +3,7 @@
     python bench/contact.py
 
 64 robots, four to a PhysX system, against the same robots with a system each; once with systems of their own for robots
-that something touches (:mod:`sim.isolation`), and once without.
+that something touches (:mod:`sim.engine.contact_prediction`), and once without.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from sim import Robot, Runner
-from sim.isolation import Crowding
+from sim.engine.contact_prediction import Crowding
 
 ENVS, SECONDS = 64, 2.0
 JOBS = {

@@ -16,7 +16,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from batchpid.plots import save
+from sim.plots.figures import save
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SETUPS = {

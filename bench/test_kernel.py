@@ -20,7 +20,7 @@ import simple_pid
 
 import batchpid as bp
 from batchpid.blocks import advance_in_blocks
-from batchpid.oracle import SimplePID
+from batchpid.reference import SimplePID
 
 numba = pytest.importorskip("numba")
 jax.config.update("jax_num_cpu_devices", os.cpu_count())

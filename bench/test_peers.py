@@ -7,8 +7,9 @@ import pytest
 from test_throughput import ROUNDS, record
 
 from sim import Robot
-from sim.benchmark import Setup, check_motion
-from sim.peers import PEERS, make_peer
+from sim.benchmark.benchmark import check_motion
+from sim.benchmark.peers import PEERS, make_peer
+from sim.benchmark.setup import Setup
 
 
 @pytest.mark.parametrize("peer", PEERS)

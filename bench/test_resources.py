@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim import Robot, Runner
-from sim.benchmark import Setup
+from sim.benchmark.setup import Setup
 
 FEW, MANY = 64, 1024
 

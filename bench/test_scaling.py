@@ -5,7 +5,7 @@ import pytest
 from test_throughput import ROUNDS, record
 
 from sim import Robot, Runner
-from sim.benchmark import Setup
+from sim.benchmark.setup import Setup
 
 
 @pytest.mark.parametrize("num_envs", [1, 8, 64, 512, 2048])

@@ -7,8 +7,9 @@ simulated second; ``extra_info`` has env-steps per second. ``batchpid bench`` pr
 import pytest
 
 from sim import Robot, Runner
-from sim.benchmark import CASES, Setup, check_motion, run_closed_loop
-from sim.hands import Hand, run_by_hand
+from sim.benchmark.baselines import BaselineProcess, run_baseline
+from sim.benchmark.benchmark import CASES, check_motion, run_closed_loop
+from sim.benchmark.setup import Setup
 
 ROUNDS = 3
 
@@ -31,12 +32,14 @@ class TestThroughput:
     def test_by_hand(self, benchmark, setups, name, physics, case):
         setup = setups[name, physics]
         benchmark.group = f"{name}, {physics}"
-        hands = [Hand(setup, index) for index in range(1 if case == "tutorial" else setup.workers)]
+        processes = [
+            BaselineProcess(setup, index) for index in range(1 if case == "tutorial" else setup.workers)
+        ]
         try:
-            _, steps, final = benchmark.pedantic(run_by_hand, (case, hands, setup), rounds=ROUNDS)
+            _, steps, final = benchmark.pedantic(run_baseline, (case, processes, setup), rounds=ROUNDS)
         finally:
-            for hand in hands:
-                hand.close()
+            for process in processes:
+                process.close()
         check_motion(case, final, setup)
         record(benchmark, steps)
 

@@ -12,8 +12,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from batchpid import plots
-from sim import Robot, Runner
+from sim import Robot, Runner, plots
 
 VARIANTS = (
     # control, compensate, label, colour, filled

@@ -1,16 +1,20 @@
 """The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control."""
 
-from .check import Finding
-from .faults import Fault, FaultWarning
-from .limits import SetpointWarning
-from .observation import Observation, Rollout
-from .physics import Physics
-from .pool import RecoveryWarning
-from .recorded import Recording, read_recording
-from .recording import Recorder
-from .robot import Robot
-from .runner import Runner
-from .snapshot import Snapshot
+from sim.engine.dynamics import robot_dynamics
+from sim.engine.physics import Physics
+from sim.loop.faults import Fault, FaultWarning
+from sim.loop.snapshot import Snapshot
+from sim.observation import Observation, Rollout
+from sim.recording.reader import Recording, read_recording
+from sim.recording.recorder import Recorder
+from sim.robot.description import register_dynamics
+from sim.robot.limits import SetpointWarning
+from sim.robot.preflight import Finding
+from sim.robot.robot import Robot
+from sim.runner import Runner
+from sim.workers.pool import RecoveryWarning
+
+register_dynamics(robot_dynamics)
 
 __all__ = [
     "Fault",

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-
-from .arguments import choice, integer, number
-from .robot import Robot
-from .runner import Runner
+from batchpid.validate import choice, integer, number
+from sim.robot.robot import Robot
+from sim.runner import Runner
 
 try:
     import gymnasium

@@ -7,37 +7,45 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import astuple
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
-
-from .arguments import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
-from .arrays import Arrays
-from .building import SceneSpec
-from .command import Call, Run, Worker
-from .control import CONTROLS, check_params, default_params
-from .faults import ACTIONS, Fault, FaultLog
-from .limits import LimitWatch
-from .loop import COMPENSATE, LoopSpec
-from .observation import Observation, Rollout
-from .physics import PHYSICS, Physics
-from .pool import WorkerPool, packing
-from .recording import Recorder
-from .robot import Robot
-from .snapshot import EnvStates, Snapshot
-from .variation import Variation
-from .worker import ProcessWorker
+from batchpid.validate import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
+from sim.engine.building import SceneSpec
+from sim.engine.physics import PHYSICS, Physics
+from sim.engine.variation import Variation
+from sim.loop.arrays import Arrays
+from sim.loop.control import CONTROLS, check_params, default_params
+from sim.loop.faults import ACTIONS, Fault, FaultLog
+from sim.loop.loop import COMPENSATE, LoopSpec
+from sim.loop.snapshot import EnvStates, Snapshot
+from sim.observation import Observation, Rollout
+from sim.robot.limits import LimitWatch
+from sim.robot.robot import Robot
+from sim.workers.pool import WorkerPool, packing
+from sim.workers.requests import Call, Run, Worker
+from sim.workers.worker import ProcessWorker
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 _FAR = 1e6  # rad or m, and per second
 _AHEAD = 8000  # sim steps of envs that a worker of a rollout is sent at once: a fifth of a second
+
+
+class TickRecorder(Protocol):
+    """Receives every tick of a runner; :class:`sim.Recorder` is one."""
+
+    path: Path
+
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof)."""
 
 
 class Runner:
@@ -84,8 +92,8 @@ class Runner:
     speed_limit
         Joint speed at which an env fails, one for all joints or (dof,) [rad/s or m/s]; default none.
     variation
-        How each env's robot differs from the model: :func:`sim.variation.draw_variation`. It is not part of snapshots,
-        so with it there is no recovery and no checkpoint.
+        How each env's robot differs from the model: :func:`sim.tuning.randomization.draw_variation`. It is not part
+        of snapshots, so with it there is no recovery and no checkpoint.
     non_finite
         What a NaN or infinity in a setpoint, its rate, a feedforward or a pose to reset to does: ``"raise"`` an
         error, or ``"contain"`` it: the env that it is for fails.
@@ -181,7 +189,7 @@ class Runner:
         )
         self._steps = self._since_checkpoint = 0
         self._faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, on_fault)
-        self.recorder: Recorder | None = None
+        self.recorder: TickRecorder | None = None
         """What records every tick; :class:`sim.Recorder` sets it."""
         self.work_seconds = np.zeros(0)
         """Seconds that each worker worked in the last tick; in a rollout, the mean of those it did at a time."""

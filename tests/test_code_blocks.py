@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 import batchpid as bp
-from batchpid.cli import COMMANDS, main, parse
 from sim import Robot
+from sim.cli import COMMANDS, main, parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md")])

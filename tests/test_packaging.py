@@ -7,8 +7,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from setuptools import find_packages
 
-from batchpid.cli import COMMANDS
+from sim.cli import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -16,13 +17,13 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("asse
 
 
 def test_every_package_is_shipped():
-    tops = {name.partition(".")[0] for name in PROJECT["tool"]["setuptools"]["packages"]}
-    found = {
+    include = PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]
+    packages = {
         ".".join(path.parent.relative_to(ROOT).parts)
-        for top in tops
-        for path in (ROOT / top).rglob("__init__.py")
+        for top in ("batchpid", "sim", "assets")
+        for path in (ROOT / top).rglob("*.py")
     }
-    assert set(PROJECT["tool"]["setuptools"]["packages"]) == found
+    assert set(find_packages(str(ROOT), include=include)) == packages
 
 
 def test_every_data_file_is_shipped():

@@ -3,8 +3,8 @@
 Nothing here touches the simulation's loop: link poses are computed beside it, from qpos.
 """
 
-from .live import Live
-from .playback import Playback
-from .session import View
+from sim.view.playback import Playback
+from sim.view.session import View
+from sim.view.simulation import Live
 
 __all__ = ["Live", "Playback", "View"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .source import Source
+from sim.view.data import Source
 
 _INK = {"setpoint": "#4a82ff", "limit": "#b6bcc6"}
 _COLOURS = ("#15803d", "#d97706", "#7c3aed")

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..robot import Robot
-from .live import Live
-from .playback import Playback
-from .source import Frame, Source
+from sim.robot.robot import Robot
+from sim.view.data import Frame, Source
+from sim.view.playback import Playback
+from sim.view.simulation import Live
 
 
 class Panel:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.errors import InvalidArgumentError
-
-from ..observation import Rollout
-from ..robot import Robot
-from .source import Frame, Traces
+from sim.observation import Rollout
+from sim.robot.robot import Robot
+from sim.view.data import Frame, Traces
 
 
 class Playback:

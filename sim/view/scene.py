@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kinematics import Kinematics, Poses
-from ..robot import Robot
-from ..shapes import surfaces
-from ..staging import FIELD_OF_VIEW, stage
-from .source import Frame
+from sim.robot.kinematics import Kinematics, Poses
+from sim.robot.robot import Robot
+from sim.robot.shapes import surfaces
+from sim.view.data import Frame
+from sim.view.layout import FIELD_OF_VIEW, stage
 
 Float64 = NDArray[np.float64]
 

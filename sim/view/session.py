@@ -12,11 +12,10 @@ from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 from batchpid.errors import MissingDependencyError
-
-from .charts import Charts
-from .panel import Panel
-from .scene import RobotScene
-from .source import Frame, Source
+from sim.view.charts import Charts
+from sim.view.data import Frame, Source
+from sim.view.panel import Panel
+from sim.view.scene import RobotScene
 
 CHARTS_EVERY = 5
 """Frames from one drawing of the charts to the next."""

@@ -5,7 +5,7 @@ import pytest
 from conftest import DT, ENVS, JOINTS, Backend, read_only
 
 import batchpid as bp
-from batchpid.oracle import ScalarPID, SimplePID, scalar_pids
+from batchpid.reference import ScalarPID, SimplePID, scalar_pids
 
 ALL = ("measurement_rate", "setpoint_rate", "feedforward")
 SOME = [("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]

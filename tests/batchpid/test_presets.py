@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid import presets
-from batchpid.oracle import SimplePID
+from batchpid.reference import SimplePID
 
 DT = 0.01
 series = st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25)

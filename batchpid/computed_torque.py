@@ -1,0 +1,131 @@
+r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
+
+With kp = w^2 and kd = 2 zeta w, all joints of all robots then respond alike, in every pose. Two ways:
+
+- "inertia": each gain is multiplied by its joint's M_jj(q), as PhysX's drives do in mode "acceleration". The law is
+  otherwise untouched: integral, limits and anti-windup are in effort units.
+- "mass_matrix": u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar,
+  Robot Modeling and Control, 2nd ed., section 9.3). The joints no longer disturb each other.
+
+When the limits cut u, cutting each joint by itself would turn the acceleration aside and couple the joints again. So a
+is shortened as a whole::
+
+    u = s M a + passive,   s = the largest in [0, 1] with all of u within its limits
+
+which keeps its direction (P. J. Campo and M. Morari, "Robust control of processes subject to saturation
+nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot then stays on the straight line to
+its setpoint, however hard it is limited. A joint whose passive force is beyond its limit by itself is clipped, and left
+out of s. While s < 1, conditional integration does not integrate further into the direction of a.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.choices import Everywhere, PerMassMatrix
+from batchpid.coefficients import Coefficients
+from batchpid.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.law import advance
+from batchpid.params import PIDParams
+from batchpid.state import PIDState, Terms
+
+
+def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
+    """Return the coefficients of an effort law from those of an acceleration law, at ``inertia`` (envs, joints)."""
+    return k._replace(
+        kp=k.kp * inertia,
+        ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
+        kd=None if k.kd is None else k.kd * inertia,
+    )
+
+
+def advance_with_mass_matrix(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    mass_matrix: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+    aux: bool = False,
+) -> Any:
+    """Do one step of the law in accelerations; return efforts. Otherwise as :func:`batchpid.advance`.
+
+    Parameters
+    ----------
+    mass_matrix
+        (envs, joints, joints) at about the present positions [kg m^2 or kg].
+    feedforward
+        Effort [N m or N] beside the law: passive force and more.
+    """
+    xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
+    low, high = k.effort_min, k.effort_max
+    free = k._replace(effort_min=None, effort_max=None)
+    new, a, *terms = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, None, aux)
+    wanted = _multiply(mass_matrix, a)
+    passive = 0.0 if feedforward is None else feedforward
+    share = None
+    effort = unsaturated = wanted + passive
+    if low is not None or high is not None:
+        share = _share(wanted, passive, low, high, xp)
+        effort = clip(share * wanted + passive, low, high, xp)
+    if share is not None and k.ki_dt is not None and k.conditional is not None:
+        deeper = (share < 1) & (a * (new.integral - state.integral) > 0)
+        if not isinstance(k.conditional, Everywhere):
+            deeper = deeper & (k.conditional > 0)
+        new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
+    if not aux:
+        return new, effort
+    t = terms[0]
+    efforts = Terms(
+        p=_multiply(mass_matrix, t.p),
+        i=_multiply(mass_matrix, t.i),
+        d=_multiply(mass_matrix, t.d),
+        feedforward=xp.zeros_like(wanted) + passive,
+        unsaturated=unsaturated,
+        effort=effort.copy(),
+        saturated=effort != unsaturated,
+        finite=t.finite,
+    )
+    return new, effort, efforts
+
+
+def check_gain_units(params: PIDParams) -> None:
+    """Refuse options that have no meaning for accelerations.
+
+    Raises
+    ------
+    InvalidArgumentError
+        gain_units "mass_matrix" with back-calculation, an effort rate limit or a policy for non-finite inputs.
+    """
+    if not isinstance(params.gain_units, PerMassMatrix):
+        return
+    for option, leaf in (
+        ("tracking_time", params.tracking_time),
+        ("effort_rate_limit", params.effort_rate_limit),
+        ("non_finite", params.non_finite),
+    ):
+        if leaf is not None:
+            raise InvalidArgumentError(
+                option,
+                "is not available with gain_units 'mass_matrix'",
+                remedy="use anti_windup 'conditional', no effort rate limit and non_finite 'propagate', or gain_units "
+                "'inertia'",
+            )
+
+
+def _multiply(matrix: Any, vector: Any) -> Any:
+    """Return matrix @ vector for each env; the sum of each row is taken in one order, whatever the number of envs."""
+    return (matrix * vector[:, None, :]).sum(-1)
+
+
+def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:
+    """Return s (envs, 1): how much of ``wanted`` fits between ``passive`` and the limits."""
+    infinity = xp.inf
+    above = infinity if high is None else high - passive
+    below = infinity if low is None else passive - low
+    room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
+    limited = (size > room) & (room > 0)
+    return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1, keepdims=True)

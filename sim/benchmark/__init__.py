@@ -1,0 +1,1 @@
+"""What ``batchpid bench`` measures, and the baselines beside it."""

@@ -1,0 +1,240 @@
+r"""What error the engine makes at the runner's timestep, beside a reference that steps 20 times as often.
+
+The robots of engine and reference are under the same controller, which works at the runner's rate in both: between two
+of its efforts the reference makes 20 steps. So the error is the engine's, as it remains under feedback.
+
+In free motion the reference is the equation of motion itself, in double precision, by a Runge-Kutta method::
+
+    M(q) q'' + C(q, q') q' + B q' + g(q) = u
+
+In contact it is the engine with a twentieth of the timestep. It has two solvers, which resolve friction differently
+where links slide, however fine the steps; so there are two references, and each error is told against both.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice, integer, number
+from sim.engine.building import SceneSpec, parse
+from sim.engine.pack import Pack
+from sim.engine.physics import PHYSICS, Physics
+from sim.loop.control import make_control
+from sim.robot.description import Dynamics
+from sim.robot.robot import Robot
+from sim.tuning.moves import Moves, random_moves
+
+Float64 = NDArray[np.float64]
+
+TIMESTEP = 1 / 2000
+FINER = 20
+"""Steps of the reference in one of the engine's."""
+REFERENCES: dict[str, dict[str, Physics | None]] = {
+    # motion: name of each reference -> its solver; None is the equation of motion
+    "free": {"equation of motion": None},
+    "contact": {"PGS, finer": Physics("PGS", 50), "TGS, finer": Physics("TGS", 10)},
+    "limit": {"PGS, finer": Physics("PGS", 50)},
+}
+"""What the engine is compared with."""
+APPROACH, PRESS = 0.2, 0.02
+"""A move into contact begins this far before the first touch, and its target is this far behind it [rad or m]."""
+BEYOND = 0.1
+"""How far beyond its limit a joint is sent [rad]."""
+_LINE = 60
+_TRIES = 100
+
+
+class Plant(Protocol):
+    """What is under control: the part of :class:`sim.engine.pack.Pack` that a loop needs. Arrays are (M, dof)."""
+
+    def read_qpos(self) -> Float64: ...  # noqa: D102
+    def read_qvel(self) -> Float64: ...  # noqa: D102
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64: ...  # noqa: D102
+    def write_qf(self, effort: Float64) -> None: ...  # noqa: D102
+    def step(self) -> None: ...  # noqa: D102
+
+
+class EquationOfMotion:
+    """Robots without contact and joint limits in double precision, by steps of the Runge-Kutta method of order 4."""
+
+    def __init__(self, probe: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
+        self._probe, self._damping, self._h = probe, damping, timestep
+        self._qpos, self._qvel = qpos.copy(), np.zeros_like(qpos)
+        self._effort = np.zeros_like(qpos)
+
+    def read_qpos(self) -> Float64:
+        """Joint positions [rad or m]."""
+        return self._qpos
+
+    def read_qvel(self) -> Float64:
+        """Joint velocities [rad/s or m/s]."""
+        return self._qvel
+
+    def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
+        """Joint efforts that cancel gravity and Coriolis and centrifugal forces [N m or N]."""
+        still, dynamics = np.zeros_like(self._qpos), self._probe.inverse_dynamics
+        bias = dynamics(self._qpos, self._qvel if coriolis else still, still)
+        return bias if gravity else bias - dynamics(self._qpos, still, still)
+
+    def write_qf(self, effort: Float64) -> None:
+        """Apply joint efforts [N m or N] from now on."""
+        self._effort = effort
+
+    def step(self) -> None:
+        """One step."""
+        q, v, h = self._qpos, self._qvel, self._h
+        a1 = self._acceleration(q, v)
+        a2 = self._acceleration(q + h / 2 * v, v + h / 2 * a1)
+        a3 = self._acceleration(q + h / 2 * v + h**2 / 4 * a1, v + h / 2 * a2)
+        a4 = self._acceleration(q + h * v + h**2 / 2 * a2, v + h * a3)
+        self._qpos = q + h * v + h**2 / 6 * (a1 + a2 + a3)
+        self._qvel = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+    def _acceleration(self, qpos: Float64, qvel: Float64) -> Float64:
+        return self._probe.forward_dynamics(qpos, qvel, self._effort - self._damping * qvel)
+
+
+class Accuracy(NamedTuple):
+    """Errors of one solver on one kind of motion, over revolute joints, envs and sim steps."""
+
+    largest: float
+    """[rad]"""
+    rms: float
+    """[rad]"""
+    over_time: Float64
+    """Largest over joints and envs at each sim step (steps,) [rad]."""
+
+
+def measure(
+    robot: Robot, motion: str, physics: dict[str, Physics] = PHYSICS, count: int = 8, seconds: float = 1.0
+) -> dict[tuple[str, str], Accuracy]:
+    """Errors of each solver of ``physics`` under the robot's tuned gains, against each reference, by their names.
+
+    Parameters
+    ----------
+    motion
+        "free": to random poses, touching nothing; "contact": until a link presses on the ground or on another;
+        "limit": a joint against its limit.
+    count
+        How many moves, run side by side.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument is out of range, the robot carries no tuned gains, or it has no room for such moves.
+    """
+    references = REFERENCES[choice("motion", motion, REFERENCES)]
+    steps = round(number("seconds", seconds, TIMESTEP, 1e3, "seconds") / TIMESTEP)
+    moves = _MOVES[motion](robot, integer("count", count, 1, 10_000))
+    revolute = np.array([joint.type != "prismatic" for joint in robot.joints])
+    turn = 2 * np.pi * robot.continuous[revolute]
+    runs = {name: follow(robot, moves, steps, solver) for name, solver in physics.items()}
+    result = {}
+    for other, solver in references.items():
+        reference = follow(robot, moves, steps, solver, FINER)
+        for name, run in runs.items():
+            error = (run - reference)[..., revolute]
+            error -= turn * np.round(error / (2 * np.pi))
+            result[name, other] = Accuracy(
+                float(np.abs(error).max()),
+                float(np.sqrt((error**2).mean())),
+                np.abs(error).max((1, 2)),
+            )
+    return result
+
+
+def follow(robot: Robot, moves: Moves, steps: int, solver: Physics | None, finer: int = 1) -> Float64:
+    """Positions (steps, moves, dof) after each period of the controller, from rest at the moves' starts.
+
+    ``solver`` None is the equation of motion. ``finer`` steps are made in each period.
+    """
+    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
+    size, plant = len(moves.start), _plant(robot, moves, solver, TIMESTEP / finer)
+    options = robot.tuned()
+    control = make_control("pid", spec, options["params"], size, options["measurement_rate"])
+    control.set_params(plant, options["params"])  # type: ignore[arg-type]
+    control.reset(plant.read_qpos(), np.ones(size, bool))
+    control.begin(plant, steps, moves.target)  # type: ignore[arg-type]
+    table = np.empty((steps, *moves.start.shape))
+    for step in range(steps):
+        passive = plant.passive_force(True, True)
+        plant.write_qf(control.effort(plant, plant.read_qpos(), passive, step, False))  # type: ignore
+        for _ in range(finer):
+            plant.step()
+        table[step] = plant.read_qpos()
+    return table
+
+
+def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) -> Plant:
+    if solver is None:
+        return EquationOfMotion(robot.dynamics(), robot.damping, moves.start, timestep)
+    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, timestep, solver)
+    pack = Pack(parse(spec), spec, len(moves.start), system_size=4)
+    pack.write_state(range(pack.size), moves.start, np.zeros_like(moves.start))
+    return pack
+
+
+def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
+    """``count`` seeded moves from free poses until some link presses on the ground or on another link, gently."""
+    probe, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+
+    def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
+        here, there = robot.sample(2, seed=int(rng.integers(2**31)))
+        touches = probe.touches(here + line * (there - here))
+        touch = here + line[np.argmax(touches)] * (there - here)
+        if touches[0] or not touches.any() or np.abs(touch - here).max() < APPROACH:
+            return None
+        way = (there - here) / np.abs(there - here).max()
+        return touch - APPROACH * way, np.clip(touch + PRESS * way, robot.lower, robot.upper)
+
+    return _draw(robot, "contact", count, seed, draw)
+
+
+def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
+    """``count`` seeded moves, each of one revolute joint to beyond one of its limits, touching nothing."""
+    probe, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+    joints = [
+        index
+        for index, joint in enumerate(robot.joints)
+        if joint.type != "prismatic" and np.isfinite([joint.lower, joint.upper]).all()
+    ]
+
+    def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
+        start = robot.sample(1, seed=int(rng.integers(2**31)))[0]
+        joint = rng.choice(joints)
+        limit, sign = (robot.upper[joint], 1) if rng.integers(2) else (robot.lower[joint], -1)
+        start[joint] = limit - sign * APPROACH
+        target = start.copy()
+        target[joint] = limit + sign * BEYOND
+        return None if probe.touches(start + line * (target - start)).any() else (start, target)
+
+    return _draw(robot, "limit", count, seed, draw if joints else lambda rng: None)
+
+
+def _draw(
+    robot: Robot,
+    what: str,
+    count: int,
+    seed: int,
+    draw: Callable[[np.random.Generator], tuple[Float64, Float64] | None],
+) -> Moves:
+    rng = np.random.default_rng(seed)
+    drawn = (draw(rng) for _ in range(_TRIES * count))
+    pairs = list(itertools.islice((pair for pair in drawn if pair is not None), count))
+    if len(pairs) < count:
+        raise InvalidArgumentError(
+            "robot",
+            f"{robot.name!r} has hardly a move of kind {what!r}: {len(pairs)} of {count} were found",
+            remedy="look at its collision shapes and limits with: batchpid inspect",
+        )
+    starts, targets = zip(*pairs, strict=True)
+    return Moves(np.array(starts), np.array(targets), (what,) * count)
+
+
+_MOVES = {"free": random_moves, "contact": contact_moves, "limit": limit_moves}

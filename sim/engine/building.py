@@ -1,0 +1,204 @@
+"""Scenes of one robot: the engine's settings, the robot from its URDF, its collision group."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from batchpid.errors import RobotError
+from sim.engine.contact_prediction import Link
+from sim.engine.physics import Physics
+from sim.engine.user_content import Build, HeadlessScene
+from sim.robot.dissipation import DISSIPATION
+from sim.robot.urdf import Joint
+
+with warnings.catch_warnings():
+    # Without a system Vulkan SAPIEN warns that it falls back to its own; nothing here renders.
+    warnings.filterwarnings("ignore", message=".*libvulkan.*")
+    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
+    from sapien import physx
+    from sapien.wrapper.articulation_builder import ArticulationBuilder
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Everything that decides how a scene is built, picklable.
+
+    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` the degrees of freedom in SAPIEN's order.
+    """
+
+    urdf: str
+    srdf: str | None
+    joints: tuple[Joint, ...]
+    timestep: float
+    physics: Physics
+    dissipation: str = "urdf"
+    ground: bool = True
+    fixed_base: bool = True
+    build: Build | None = None
+    gravity: tuple[float, float, float] = GRAVITY
+
+
+def parse(spec: SceneSpec) -> ArticulationBuilder:
+    """Parse the robot once; the builder makes any number of copies.
+
+    Raises
+    ------
+    RobotError
+        SAPIEN's loader refuses the description, or numbers its joints in another order than ours.
+    """
+    loader = bare_scene(physx.PhysxCpuSystem()).create_urdf_loader()
+    loader.fix_root_link = spec.fixed_base
+    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
+        try:
+            builders, actors, _ = loader.parse(urdf, srdf)
+        except Exception as error:
+            raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
+    if len(builders) != 1 or actors:
+        raise RobotError(
+            "the URDF does not describe one articulated robot; it needs at least one moving joint"
+        )
+    _part(builders[0])
+    return builders[0]
+
+
+def _part(builder: ArticulationBuilder) -> None:
+    """Let links that fixed joints tie together not touch: they cannot move apart, and the solver would shake them.
+
+    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit
+    of the third word never touch; each such group is given one that no pair of the .srdf uses, while there are any.
+    """
+    body: dict[str, str] = {}
+    groups: dict[str, list[Any]] = {}
+    for link in builder.link_builders:
+        tied = link.parent is not None and link.joint_record.joint_type == "fixed"
+        body[link.name] = body[link.parent.name] if tied else link.name
+        groups.setdefault(body[link.name], []).append(link)
+    used = 0
+    for link in builder.link_builders:
+        used |= link.collision_groups[2]
+    free = (1 << bit for bit in range(32) if not used >> bit & 1)
+    for links in groups.values():
+        solid = [link for link in links if link.collision_records]
+        if len(links) > 2 and len(solid) > 1:
+            bit = next(free, 0)
+            for link in solid:
+                link.collision_groups[2] |= bit
+
+
+@contextmanager
+def _in_memory(text: str | None) -> Iterator[str]:
+    """Path of a file that holds ``text``, for a loader that takes no text; whoever is killed leaves none behind."""
+    if text is None:
+        yield ""
+        return
+    with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        yield f"/proc/self/fd/{file.fileno()}"
+
+
+def bare_scene(system: Any) -> Any:
+    """Return a new scene of ``system`` that needs no render device."""
+    # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
+    return HeadlessScene([system])
+
+
+@contextmanager
+def engine_settings(spec: SceneSpec) -> Iterator[None]:
+    """SAPIEN's process-wide settings, ours while a pack is built, then the caller's again.
+
+    Every setting is given, so that a result depends on nothing that the caller's process did before.
+    """
+    scene, body = physx.get_scene_config(), physx.get_body_config()
+    shape, material = physx.get_shape_config(), physx.get_default_material()
+    physx.set_scene_config(
+        gravity=np.array(spec.gravity, np.float32),
+        bounce_threshold=2.0,
+        enable_pcm=True,
+        enable_tgs=spec.physics.solver == "TGS",
+        enable_ccd=False,
+        enable_enhanced_determinism=False,
+        enable_friction_every_iteration=True,
+        cpu_workers=0,
+    )
+    physx.set_body_config(
+        solver_position_iterations=spec.physics.position_iterations,
+        solver_velocity_iterations=spec.physics.velocity_iterations,
+        sleep_threshold=0.0,
+    )
+    physx.set_shape_config(contact_offset=0.01, rest_offset=0.0)
+    physx.set_default_material(0.3, 0.3, 0.1)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
+        physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
+
+
+def build_robot(builder: ArticulationBuilder, scene: Any, spec: SceneSpec) -> Any:
+    """Build the robot in ``scene``, with the dissipation that ``spec`` asks for.
+
+    Raises
+    ------
+    RobotError
+        SAPIEN numbers the joints in another order than ours.
+    """
+    builder.set_scene(scene)
+    robot = builder.build()
+    names = [joint.name for joint in robot.active_joints]
+    if names != [joint.name for joint in spec.joints]:
+        raise RobotError(f"SAPIEN numbers the joints {names}, not {[joint.name for joint in spec.joints]}")
+    robot.set_sleep_threshold(0.0)
+    dissipation = DISSIPATION[spec.dissipation]
+    for link in robot.links:
+        link.set_linear_damping(dissipation.link_damping)
+        link.set_angular_damping(dissipation.link_damping)
+    for joint, ours in zip(robot.active_joints, spec.joints, strict=True):
+        # SAPIEN parses <dynamics friction> and never applies it.
+        friction = dissipation.joint_friction
+        joint.set_friction(ours.friction if friction is None else friction)
+    return robot
+
+
+def link_extents(robot: Any) -> list[Link]:
+    """Return the extents of a robot's links, parents first, for :mod:`sim.engine.contact_prediction`."""
+    links, dofs = robot.links, {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
+    places = {link: place for place, link in enumerate(links)}
+    extents = []
+    for link in links:
+        joint, slides = link.joint, link.joint.type == "prismatic"
+        offset = np.linalg.norm(joint.pose_in_parent.p) + np.linalg.norm(joint.pose_in_child.p)
+        if slides:
+            offset += np.abs(np.clip(joint.limits, -10.0, 10.0)).max(initial=0.0)  # a rail may have no end
+        radius = 0.0
+        if link.collision_shapes:
+            corners = np.abs(link.compute_global_aabb_tight() - link.entity_pose.p)
+            radius = float(np.linalg.norm(corners.max(0)))
+        parent = None if link.parent is None else places[link.parent]
+        extents.append(Link(parent, dofs.get(joint.name), slides, float(offset), radius))
+    return extents
+
+
+def separate(scene: Any, group: int) -> None:
+    """Give every shape of ``scene`` the collision group ``group``: shapes of different groups never touch.
+
+    PhysX's filter, as SAPIEN sets it up, compares the upper 16 bits of the fourth word.
+    """
+    for entity in scene.entities:
+        for component in entity.components:
+            if isinstance(component, physx.PhysxRigidBaseComponent):
+                for shape in component.collision_shapes:
+                    words = list(shape.get_collision_groups())
+                    words[3] = (words[3] & 0xFFFF) | (group << 16)
+                    shape.set_collision_groups(words)

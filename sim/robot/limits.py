@@ -1,0 +1,49 @@
+"""Positions outside a joint's limits: the joint cannot get there, which is worth one warning each."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robot.description import RobotDescription
+
+_TOLERANCE = 1e-6  # rad or m
+
+
+class SetpointWarning(UserWarning):
+    """A setpoint or start pose lies outside a joint's limits."""
+
+
+class LimitWatch:
+    """Warns once for each argument and joint whose positions leave the limits of ``robot``."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self._robot = robot
+        self._low, self._high = robot.lower - _TOLERANCE, robot.upper + _TOLERANCE
+        self._warned: set[tuple[str, int]] = set()
+
+    def check(self, argument: str, positions: NDArray[Any], stacklevel: int = 3) -> None:
+        """Warn of ``positions`` (..., dof) [rad or m]; the warning points ``stacklevel`` frames up.
+
+        What is not finite is a fault, which is told of elsewhere.
+        """
+        outside = (positions < self._low) | (positions > self._high)
+        if not outside.any():
+            return
+        positions = np.where(np.isfinite(positions), positions, np.nan)
+        outside &= np.isfinite(positions)
+        for index in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist():
+            if (argument, index) in self._warned:
+                continue
+            self._warned.add((argument, index))
+            joint, column = self._robot.joints[index], positions[..., index]
+            worst = column.flat[np.nanargmax(np.maximum(joint.lower - column, column - joint.upper))]
+            warnings.warn(
+                f"{argument} of joint {joint.name!r} is {worst:g} {joint.unit}, outside its limits "
+                f"[{joint.lower:g}, {joint.upper:g}]: the joint cannot reach it; move it inside",
+                SetpointWarning,
+                stacklevel=stacklevel,
+            )

@@ -1,0 +1,199 @@
+"""Robot: a URDF, parsed once, checked, headless."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from lxml import etree
+from numpy.typing import ArrayLike, NDArray
+
+import assets
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.validate import choice, flag
+from sim.robot.description import RobotDescription, Settings
+from sim.robot.dissipation import DISSIPATION
+from sim.robot.preflight import Finding, check
+from sim.robot.urdf import Joint, read_urdf
+from sim.robot.xml import parse_xml
+
+Float64 = NDArray[np.float64]
+_ASSETS = Path(assets.__file__).parent
+
+
+@dataclass(frozen=True, eq=False)
+class Robot(RobotDescription):
+    """A robot description. Load one with :meth:`load`."""
+
+    @classmethod
+    def load(
+        cls,
+        name_or_path: str | Path,
+        *,
+        package_dirs: Sequence[str | Path] = (),
+        missing_meshes: str = "error",
+        dissipation: str = "urdf",
+        fixed_base: bool = True,
+    ) -> Robot:
+        """Load a bundled robot by name (``Robot.bundled()``), or any URDF by path.
+
+        Parameters
+        ----------
+        package_dirs
+            Folders in which ``package://`` mesh paths are looked up first.
+        missing_meshes
+            ``"error"``, or ``"skip"`` to go on without collision shapes whose mesh is missing.
+        dissipation
+            ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: what SAPIEN
+            gives unasked, joint friction 0.05 and link damping 0.05, for comparing with its tutorial.
+        fixed_base
+            Whether the root link is fixed to the world.
+
+        Raises
+        ------
+        RobotNotFoundError
+            No bundled robot and no file of that name.
+        RobotError
+            The file is no usable URDF; the message names the element and the remedy.
+        InvalidArgumentError
+            An option is not one of those above.
+        """
+        for argument, value, known in (
+            ("missing_meshes", missing_meshes, ("error", "skip")),
+            ("dissipation", dissipation, tuple(DISSIPATION)),
+        ):
+            choice(argument, value, known)
+        if not isinstance(package_dirs, list | tuple) or not all(
+            isinstance(folder, str | Path) for folder in package_dirs
+        ):
+            raise InvalidArgumentError(
+                "package_dirs",
+                "must be folders",
+                value=package_dirs,
+                remedy="pass a list of paths",
+            )
+        fixed_base = flag("fixed_base", fixed_base)
+        path = _find(name_or_path)
+        urdf = read_urdf(path, package_dirs=tuple(map(Path, package_dirs)), missing_meshes=missing_meshes)
+        joints = tuple(joint for joint in urdf.joints if joint.moves)
+        if not joints:
+            raise RobotError(
+                f"{path}: a robot without moving joints has nothing to control; check the joint types"
+            )
+        srdf = path.with_suffix(".srdf")
+        bundled = path.parent == _ASSETS
+        return cls(
+            name=urdf.name,
+            path=path,
+            urdf=urdf.text,
+            srdf=etree.tostring(parse_xml(srdf), encoding="unicode") if srdf.is_file() else None,
+            joints=joints,
+            all_joints=urdf.joints,
+            links=urdf.links,
+            missing_meshes=urdf.missing_meshes,
+            dissipation=dissipation,
+            fixed_base=fixed_base,
+            settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
+        )
+
+    @staticmethod
+    def bundled() -> tuple[str, ...]:
+        """Names of the robots that ship with batchpid."""
+        return tuple(sorted(path.stem for path in _ASSETS.glob("*.urdf")))
+
+    def check(
+        self,
+        *,
+        params: bp.PIDParams | None = None,
+        qpos: ArrayLike | None = None,
+        setpoint: ArrayLike | None = None,
+        timestep: float = 1 / 2000,
+        control: str = "pid",
+    ) -> list[Finding]:
+        """Preflight: what is odd about this robot, and about running it this way.
+
+        Parameters
+        ----------
+        params
+            The PID's, to check them too; default those of :meth:`params` where the robot carries gains.
+        qpos, setpoint
+            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or m].
+        timestep
+            Of control and simulation [s].
+        control
+            As :class:`sim.Runner` takes it.
+
+        Returns
+        -------
+        Findings, most severe first; empty where nothing is odd.
+        """
+        if params is None and self.settings is not None and control == "pid":
+            params = self.params()
+        return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
+
+    def tuned(self) -> dict[str, Any]:
+        """Options of :class:`sim.Runner` with which a bundled robot settles: tuned params, and what they need.
+
+        ``Runner(robot, 64, **robot.tuned())``. See docs/choosing-gains.md.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not bundled.
+        """
+        path = self.path.with_name(f"{self.path.stem}.tuned.yaml")
+        if self.settings is None or not path.is_file():
+            raise InvalidArgumentError(
+                "robot",
+                f"{self.name!r} carries no tuned gains",
+                remedy="use batchpid.design_gains(robot), or make some with: batchpid tune",
+            )
+        params, _ = bp.load_params(path, self.joint_names)
+        return {
+            "params": params,
+            "measurement_rate": bool(bp.load_about(path).get("measurement_rate", False)),
+        }
+
+
+def _find(name_or_path: str | Path) -> Path:
+    if not isinstance(name_or_path, str | Path):
+        raise InvalidArgumentError(
+            "name_or_path",
+            "must be a string or Path",
+            value=name_or_path,
+            remedy="pass a robot's name or a URDF path",
+        )
+    bundled = _ASSETS / f"{name_or_path}.urdf"
+    if str(name_or_path) in Robot.bundled():
+        return bundled
+    path = Path(name_or_path).expanduser()
+    if "\0" not in str(path) and path.is_file():
+        return path.absolute()
+    raise RobotNotFoundError(
+        f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
+        "check the spelling, or pass the path of a URDF"
+    )
+
+
+def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
+    data = yaml.safe_load(path.read_text())
+
+    def column(key: str) -> Float64:
+        return np.array([float(data["joints"][joint.name][key]) for joint in joints])
+
+    return Settings(
+        start=column("start"),
+        target=column("target"),
+        kp=column("kp"),
+        ki=column("ki"),
+        kd=column("kd"),
+        drive_stiffness=float(data["drive"]["stiffness"]),
+        drive_damping=float(data["drive"]["damping"]),
+        rate_hz=float(data["rate_hz"]),
+        notes=tuple(data.get("notes", ())),
+    )

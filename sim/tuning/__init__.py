@@ -1,0 +1,1 @@
+"""Gains: the moves to judge them by, their evaluation, the search."""

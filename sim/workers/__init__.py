@@ -1,0 +1,1 @@
+"""Processes that run loops, and the pool that keeps them."""

@@ -1,0 +1,127 @@
+"""Gains per unit of inertia, against the equation, and against a robot made of arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia
+from batchpid.errors import InvalidArgumentError
+
+DT = 1e-3
+
+
+def mass(rng, envs, joints):
+    a = rng.normal(size=(envs, joints, joints))
+    return a @ a.transpose(0, 2, 1) + 0.1 * np.eye(joints)
+
+
+def params(joints, **options):
+    return bp.make_params(
+        joints, 100.0, 50.0, 20.0, anti_windup="conditional", gain_units="mass_matrix", **options
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 2**31), envs=st.integers(1, 4), joints=st.integers(1, 5), hard=st.booleans())
+def test_the_effort_is_within_limits_and_keeps_the_direction_of_the_acceleration(seed, envs, joints, hard):
+    rng = np.random.default_rng(seed)
+    matrix, passive = mass(rng, envs, joints), rng.uniform(-1, 1, (envs, joints))
+    limit = rng.uniform(1.1, 5 if hard else 1e5, joints)
+    p = params(joints, effort_limit=limit)
+    y, r = rng.normal(size=(2, envs, joints))
+    k = bp.discretise(p, DT)
+    state = bp.init(p, y)
+    new, effort, terms = advance_with_mass_matrix(k, state, r, y, matrix, feedforward=passive, aux=True)
+    free = k._replace(effort_min=None, effort_max=None)
+    _, acceleration = bp.advance(free, state, r, y)
+    np.testing.assert_allclose(terms.unsaturated, np.einsum("eij,ej->ei", matrix, acceleration) + passive)
+    np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated)
+    assert (np.abs(effort) <= limit * (1 + 1e-12)).all()
+    applied = np.linalg.solve(matrix, (effort - passive)[..., None])[..., 0]
+    share = (applied * acceleration).sum(1) / (acceleration**2).sum(1)
+    np.testing.assert_allclose(applied, share[:, None] * acceleration, rtol=1e-6, atol=1e-6)
+    assert ((share > 0) & (share <= 1 + 1e-9)).all()
+    # limited: some joint is at its limit; not limited: the equation itself
+    limited = share < 1 - 1e-9
+    assert (np.isclose(np.abs(effort), limit).any(1) == limited).all()
+    # conditional integration: frozen into the direction of a exactly where limited (here a and e agree from rest)
+    frozen = (new.integral == state.integral).all(1)
+    assert (frozen == limited).all()
+
+
+def test_a_joint_overloaded_by_its_passive_force_does_not_stop_the_others():
+    p = params(2, effort_limit=[1.0, 10.0])
+    state = bp.init(p, np.zeros((1, 2)))
+    _, effort = advance_with_mass_matrix(
+        bp.discretise(p, DT),
+        state,
+        np.full((1, 2), 0.01),
+        np.zeros((1, 2)),
+        np.eye(2)[None],
+        feedforward=np.array([[3.0, 0.0]]),
+    )
+    assert effort[0, 0] == 1.0
+    assert effort[0, 1] == pytest.approx(1.0)
+
+
+def test_every_joint_of_a_coupled_robot_responds_alike_and_on_a_straight_line():
+    """M q'' = u on arrays: with tight limits too, q(t) = q0 + z(t) (r - q0) for one z."""
+    rng = np.random.default_rng(3)
+    joints, envs = 4, 3
+    matrix = mass(rng, envs, joints)
+    inverse = np.linalg.inv(matrix)
+    for limit in (None, 5.0):
+        p = params(joints, effort_limit=limit, setpoint_weight=0.2, weight_origin="start")
+        k = bp.discretise(p, DT)
+        start, goal = rng.normal(size=(2, envs, joints))
+        q, v = start.copy(), np.zeros_like(start)
+        state = bp.init(p, q)
+        saturated = False
+        for _ in range(400):
+            state, effort, terms = advance_with_mass_matrix(k, state, goal, q, matrix, aux=True)
+            saturated |= bool(terms.saturated.any())
+            v = v + DT * np.einsum("eij,ej->ei", inverse, effort)
+            q = q + DT * v
+            progress = (q - start) / (goal - start)
+            np.testing.assert_allclose(progress, np.broadcast_to(progress[:, :1], progress.shape), atol=1e-7)
+        assert saturated == (limit is not None)
+        assert (progress > 0.02).all()
+
+
+def test_per_inertia_scales_every_gain_and_nothing_else():
+    p = bp.make_params(2, 10.0, 5.0, 2.0, effort_limit=3.0, derivative_filter_time=1e-3)
+    k = bp.discretise(p, DT)
+    inertia = np.array([[0.5, 2.0], [1.0, 4.0]])
+    scaled = per_inertia(k, inertia)
+    by_hand = bp.discretise(p.replace(kp=10.0 * inertia, ki=5.0 * inertia, kd=2.0 * inertia), DT)
+    for name in k._fields:
+        np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
+
+
+def test_jax_gives_what_numpy_gives():
+    jnp = pytest.importorskip("jax.numpy")
+    rng = np.random.default_rng(0)
+    p = params(3, effort_limit=4.0)
+    p = p._replace(**{n: v.astype(np.float32) for n, v in p._asdict().items() if isinstance(v, np.ndarray)})
+    y, r = rng.normal(size=(2, 2, 3)).astype(np.float32)
+    matrix = mass(rng, 2, 3).astype(np.float32)
+    on_numpy = advance_with_mass_matrix(bp.discretise(p, DT), bp.init(p, y), r, y, matrix)
+    on_jax = advance_with_mass_matrix(
+        bp.discretise(p, DT), bp.init(p, jnp.asarray(y)), jnp.asarray(r), jnp.asarray(y), jnp.asarray(matrix)
+    )
+    np.testing.assert_allclose(on_numpy[1], on_jax[1], rtol=1e-5, atol=1e-5)
+
+
+def test_options_without_meaning_are_refused_by_name():
+    for options in (
+        {"anti_windup": "back_calculation", "effort_limit": 1.0},
+        {"effort_rate_limit": 3.0},
+        {"non_finite": "hold"},
+    ):
+        with pytest.raises(InvalidArgumentError, match="mass_matrix"):
+            check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="mass_matrix", **options))
+        check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="inertia", **options))

@@ -1,0 +1,36 @@
+"""The Runner against SAPIEN's tutorial as it is written: one scene, one Python object a joint, float64."""
+
+import numpy as np
+
+import batchpid as bp
+from sim import Robot, Runner
+from sim.benchmark.tutorial import TutorialLoop
+
+ARM = slice(0, 7)
+
+
+def test_runner_follows_the_tutorials_loop():
+    robot = Robot.load("panda", dissipation="sapien")
+    settings = robot.settings
+    loop = TutorialLoop(robot, settings.target)
+    recorded = []
+    loop.run(2000, recorded.append)
+
+    params = bp.presets.tutorial(robot.dof, settings.kp, settings.ki, settings.kd)
+    with Runner(robot, 2, params=params, workers=0, substeps=1) as runner:
+        rollout = runner.rollout(np.broadcast_to(settings.target, (2000, robot.dof)))
+
+    moved = np.abs(rollout.qpos[-1, 0] - settings.start)[ARM]
+    assert moved.min() > 0.3, "the arm must have moved for the comparison to mean anything"
+    difference = np.abs(rollout.qpos[:, 0] - np.array(recorded))[:, ARM]
+    assert difference.max() < 1e-4
+
+
+def test_internal_drive_follows_the_tutorials():
+    robot = Robot.load("panda", dissipation="sapien")
+    target = robot.settings.target
+    expected = TutorialLoop(robot, target, external_pid=False, internal_drive=True).run(1000)
+    with Runner(robot, 1, control="drive", workers=0, substeps=1000) as runner:
+        obs = runner.step(target)
+    np.testing.assert_allclose(obs.qpos[0, ARM], expected[ARM], atol=2e-3)
+    assert np.abs(obs.qpos[0] - robot.start)[ARM].min() > 0.2

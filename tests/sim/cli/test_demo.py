@@ -1,0 +1,112 @@
+"""batchpid demo: runs, reports and draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot
+from sim.cli.follow import start_poses
+
+ROBOTS = {name: Robot.load(name) for name in ("panda", "jaco2")}
+
+
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
+    out = tmp_path / "new" / "demo.png"
+    status, said, _ = batchpid(
+        "demo", "--robot", name, "--num-envs", 3, "--workers", 2, "--seconds", 0.05, "--out", out
+    )
+    assert status == 0
+    for line in (
+        "env-steps/s",
+        "real-time factor",
+        "Setpoints out of limits: none.",
+        "NOT SETTLED",
+        str(out),
+    ):
+        assert line in said
+    for joint in ROBOTS[name].joint_names:
+        assert f"\n{joint} " in said
+    with Image.open(out) as picture:
+        assert picture.width > 1000
+        assert len(np.unique(np.asarray(picture))) > 20
+
+
+def test_demo_tells_where_it_leaves_the_tutorial(batchpid, tmp_path):
+    args = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02, "--out", tmp_path / "x.svg")
+    assert "panda_joint4 goes to -1 rad" in batchpid("demo", *args)[1]
+
+
+def test_demo_is_the_same_for_a_seed(batchpid, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "sim.plots.figures.save", lambda _, path: path
+    )  # drawing takes longer than the robots
+
+    def table(*flags):
+        args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--out", tmp_path / "x.png")
+        return batchpid("demo", *args, *flags)[1].partition("\n\n")[2]
+
+    assert table() == table("--seed", 0)
+    assert table() != table("--seed", 1)
+
+
+def test_a_picture_that_cannot_be_written_is_refused_first(batchpid):
+    status, said, err = batchpid("demo", "--out", "demo.jpg")
+    assert (status, said) == (2, "")
+    assert ".png or .svg" in err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--robot", "pander"), "no robot 'pander'"),
+        (("--num-envs", "0"), "num_envs: out of range (got 0)"),
+        (("--workers", "-1"), "workers: out of range (got -1)"),
+        (("--seconds", "nan"), "seconds: out of range (got nan)"),
+        (("--seed", "-1"), "seed: out of range (got -1)"),
+    ],
+)
+def test_bad_flags_are_named(flags, message, batchpid):
+    status, said, err = batchpid("demo", *flags)
+    assert (status, said) == (2, "")
+    assert err.startswith(f"batchpid: {message}")
+    assert err.count("\n") == 1
+
+
+def test_a_robot_without_tutorial_settings_is_sent_to_rollout(batchpid, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ROBOTS["panda"].path.read_text())
+    status, _, err = batchpid("demo", "--robot", path)
+    assert status == 2
+    assert "batchpid rollout" in err
+
+
+@given(
+    name=st.sampled_from(list(ROBOTS)),
+    num_envs=st.integers(1, 40),
+    spread=st.floats(0, 10),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_start_poses_are_near_inside_limits_and_do_not_depend_on_their_number(name, num_envs, spread, seed):
+    robot = ROBOTS[name]
+    poses = start_poses(robot, num_envs, spread, seed)
+    assert poses.shape == (num_envs, robot.dof)
+    np.testing.assert_array_equal(poses[0], robot.start)
+    assert not robot.limit_violations(poses)
+    assert np.abs(poses - robot.start).max() <= spread + 1e-12
+    np.testing.assert_array_equal(poses, start_poses(robot, num_envs + 3, spread, seed)[:num_envs])
+
+
+def test_start_poses_differ():
+    poses = start_poses(ROBOTS["panda"], 64, 0.3, 0)
+    assert len(np.unique(poses[:, 0])) == 64
+
+
+def test_spread_is_checked():
+    with pytest.raises(InvalidArgumentError, match="spread"):
+        start_poses(ROBOTS["panda"], 4, -0.1, 0)

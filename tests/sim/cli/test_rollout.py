@@ -1,0 +1,128 @@
+"""batchpid rollout: the flags reach the runner, and the file holds what it returned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from sim import Robot, Runner
+from sim.cli.follow import start_poses
+
+SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot.load("panda")
+
+
+def saved(batchpid, path, *flags):
+    status, _, err = batchpid("rollout", *SHORT, "--out", path, *flags)
+    assert status == 0, err
+    with np.load(path) as file:
+        return dict(file)
+
+
+def test_file_holds_the_runner_s_rollout(batchpid, tmp_path, robot):
+    file = saved(batchpid, tmp_path / "new" / "run.npz", "--workers", 2, "--seed", 7, "--substeps", 10)
+    start = start_poses(robot, 3, 0.3, 7)
+    with Runner(robot, 3, workers=0, substeps=10) as runner:
+        runner.reset(qpos=start)
+        expected = runner.rollout(np.broadcast_to(robot.settings.target, (10, robot.dof)))
+    for name, value in expected._asdict().items():
+        np.testing.assert_array_equal(file[name], value)
+    np.testing.assert_array_equal(file["start"], start)
+    assert tuple(file["joint_names"]) == robot.joint_names
+    assert list(file["units"]) == [joint.unit for joint in robot.joints]
+    np.testing.assert_array_equal(file["effort_limit"], robot.effort_limit)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--control", "drive"),
+        ("--compensate", "none"),
+        ("--physics", "fast"),
+        ("--dissipation", "sapien"),
+        ("--timestep", "0.001"),
+        ("--spread", "0.1"),
+        ("--setpoint", "0", "-0.5", "0", "-1", "0", "1", "0", "0", "0"),
+    ],
+    ids=lambda flags: flags[0],
+)
+def test_every_flag_changes_the_motion(flags, batchpid, tmp_path):
+    file = saved(batchpid, tmp_path / "a.npz")
+    other = saved(batchpid, tmp_path / "b.npz", *flags)
+    assert np.abs(file["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
+
+
+def test_params_from_a_file(batchpid, tmp_path, robot):
+    params = robot.params(kp=7.0, ki=0.0, kd=1.0)
+    bp.save_params(tmp_path / "gains.yaml", params, robot.joint_names)
+    file = saved(batchpid, tmp_path / "run.npz", "--params", tmp_path / "gains.yaml", "--spread", 0)
+    with Runner(robot, 3, workers=0, params=params) as runner:
+        expected = runner.rollout(np.broadcast_to(robot.settings.target, (5, robot.dof)))
+    np.testing.assert_array_equal(file["qpos"], expected.qpos)
+
+
+def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, robot):
+    """By name or from the file that tune wrote: with the units and the measured rate that the file tells of."""
+    path = robot.path.with_name("panda.tuned.yaml")
+    by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--params", each) for each in ("tuned", path))
+    with Runner(robot, 3, workers=0, **robot.tuned()) as runner:
+        runner.reset(start_poses(robot, 3, 0.3, 0))
+        expected = runner.rollout(np.broadcast_to(robot.settings.target, (5, robot.dof)))
+    np.testing.assert_array_equal(by_name["qpos"], expected.qpos)
+    np.testing.assert_array_equal(by_file["qpos"], expected.qpos)
+
+
+def test_gains_that_ring_are_told_of(batchpid):
+    assert "--params tuned" in batchpid("rollout", *SHORT)[1]
+    assert "--params tuned" not in batchpid("rollout", *SHORT, "--params", "tuned")[1]
+
+
+def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, robot):
+    path = tmp_path / "arm.urdf"
+    path.write_text(robot.path.read_text())
+    assert batchpid("rollout", *SHORT, "--robot", path)[0] == 0  # with gains designed from its inertia
+    bp.save_params(tmp_path / "gains.json", robot.params(), robot.joint_names)
+    file = saved(batchpid, tmp_path / "run.npz", "--robot", path, "--params", tmp_path / "gains.json")
+    # Without settings of its own it holds its start pose: zero, moved inside the limits.
+    np.testing.assert_allclose(file["setpoint"][0, 0], np.clip(np.zeros(9), robot.lower, robot.upper))
+
+
+def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
+    flags = ("--setpoint", *([0, 0, 0, 1] + [0] * 5))
+    _, said, err = batchpid("rollout", *SHORT, *flags)
+    assert said.count("OUT OF LIMITS: setpoint 1 rad of panda_joint4") == 1
+    assert "warning" not in err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--setpoint", "1", "2"), "setpoint: has shape (2,)"),
+        (("--setpoint", *["nan"] * 9), "setpoint, joint 'panda_joint1'"),
+        (("--out", "run.csv"), "out: unknown file format"),
+        (("--picture", "run.bmp"), "path: unknown picture format"),
+        (
+            ("--params", "/nowhere/gains.yaml"),
+            "gains: is neither a name nor a file (got '/nowhere/gains.yaml')",
+        ),
+        (("--seconds", "-1"), "seconds: out of range"),
+        (("--timestep", "0"), "timestep: out of range"),
+        (("--substeps", "0"), "substeps: out of range"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value[:2]),
+)
+def test_bad_flags_are_named(flags, message, batchpid):
+    status, said, err = batchpid("rollout", *SHORT, *flags)
+    assert (status, said) == (2, "")
+    assert err.startswith(f"batchpid: {message}")
+
+
+def test_picture(batchpid, tmp_path):
+    path = tmp_path / "run.svg"
+    assert batchpid("rollout", *SHORT, "--picture", path)[0] == 0
+    assert "panda_joint7" in path.read_text()

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+import batchpid as bp
+from sim import Robot
+from sim.cli.tune import Tune
+from sim.tuning.search import Weights
+
+pytest.importorskip("cmaes")
+
+SHORT = ("--generations", 1, "--population", 4, "--seconds", 0.1, "--workers", 0)
+
+
+def test_tune_writes_params_with_what_they_are_and_how_they_did(batchpid, tmp_path):
+    out = tmp_path / "panda.yaml"
+    status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
+    assert status == 0
+    assert "designed" in said
+    assert "tuned" in said
+    params, names = bp.load_params(out)
+    assert tuple(names) == Robot.load("panda").joint_names
+    assert type(params.gain_units).__name__ == "PerMassMatrix"
+    about = bp.load_about(out)
+    assert about["seed"] == 0
+    assert about["judged"]["settling_time"] > 0
+    assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    assert not out.with_suffix(".search.json").exists()
+
+
+def test_tune_resumes_what_was_cut_short(batchpid, tmp_path, monkeypatch):
+    out = tmp_path / "a.yaml"
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            "sim.tuning.evaluation.evaluate_gains", interrupt
+        )  # after the search, before the judging
+        status, _, complaint = batchpid("tune", "panda", *SHORT, "--out", out)
+    assert status == 130
+    assert "interrupted" in complaint
+    history = out.with_suffix(".search.json")
+    costs = json.loads(history.read_text())["costs"]
+    status, _, complaint = batchpid("tune", "panda", *SHORT, "--seed", 1, "--resume", "--out", out)
+    assert status == 2
+    assert "another search" in complaint
+    status, said, _ = batchpid("tune", "panda", *SHORT, "--resume", "--out", out)
+    assert status == 0
+    assert f"{costs[0][0]:.4f} as designed" in said
+
+
+def test_compare_tells_the_sets_apart(batchpid, tmp_path):
+    robot = Robot.load("panda")
+    bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)
+    picture = tmp_path / "two.png"
+    flags = ("--moves", 1, "--seconds", 1.2, "--workers", 0, "--picture", picture)
+    status, said, _ = batchpid("compare", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags)
+    assert status == 0
+    rows = {line.split("  ")[0]: line for line in said.splitlines() if " of 2" in line}
+    assert rows.keys() == {"tuned", "mine.yaml", "drive (30, 6)"}
+    assert "2 / 2 of 2" in rows["tuned"]
+    assert "never" in rows["mine.yaml"]
+    assert picture.stat().st_size > 10_000
+
+
+def test_the_flags_weigh_as_the_search_does_by_itself():
+    flags, weights = Tune(), Weights()
+    assert {field.name: getattr(flags, field.name) for field in dataclasses.fields(weights)} == (
+        dataclasses.asdict(weights)
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("compare", "nothing.yaml"), "neither a name nor a file"),
+        (("compare", "drive:a,b"), "DAMPING"),
+        (("compare", "tuned", "--picture", "x.png"), "name two"),
+        (("tune", "nobody"), "no robot 'nobody'"),
+        (("tune", "panda", "--population", "1"), "population"),
+        (("tune", "panda", "--out", "gains.txt"), "gains.txt"),
+    ],
+)
+def test_bad_input_is_told_with_status_2(batchpid, tmp_path, monkeypatch, arguments, complaint):
+    monkeypatch.chdir(tmp_path)
+    status, _, said = batchpid(*arguments)
+    assert status == 2
+    assert complaint in said

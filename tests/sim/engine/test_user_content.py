@@ -1,0 +1,124 @@
+"""The user's own content of a scene: built anywhere, separate from env to env, and put back at a reset."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner
+from sim.engine.user_content import sapien
+
+ROBOT = Robot.load("panda")
+DROP = 0.5 * 9.81 * 0.2**2
+
+
+def box_beside_the_robot(scene, env):
+    """As in SAPIEN's tutorial, visual and lights included; each env's box falls from higher."""
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.5, 0.5, 0.5])
+    builder.add_box_visual(half_size=[0.5, 0.5, 0.5], material=[1.0, 0.0, 0.0])
+    box = builder.build(name="box")
+    box.set_pose(sapien.Pose(p=[2, 0, 1.0 + 0.1 * env]))
+    scene.set_ambient_light([0.5, 0.5, 0.5])
+    scene.add_directional_light([0, 1, -1], [0.5, 0.5, 0.5])
+    return box
+
+
+def balls_on_the_arm(scene, env):
+    """Content that robots and each other touch: balls of another size in each env, on the arm and in a heap."""
+    balls = []
+    for k in range(3):
+        builder = scene.create_actor_builder()
+        builder.add_sphere_collision(radius=0.05 + 0.01 * (env % 3))
+        builder.set_initial_pose(
+            sapien.Pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k])
+        )
+        balls.append(builder.build())
+    return balls
+
+
+def run(build, num_envs=4, ticks=30, **options):
+    with Runner(ROBOT, num_envs, build=build, **options) as runner:
+        rollout = runner.rollout(np.broadcast_to(ROBOT.start, (ticks, ROBOT.dof)))
+        return rollout, runner.poses()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_box_falls_and_a_reset_puts_it_back(workers):
+    with Runner(ROBOT, 2, workers=workers, build=box_beside_the_robot) as runner:
+        before = runner.poses()
+        np.testing.assert_allclose(
+            before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6
+        )
+        for _ in range(20):
+            runner.step(ROBOT.start)
+        after = runner.poses()
+        np.testing.assert_allclose((before - after)[:, 0, 2], DROP, rtol=1e-2)
+        for _ in range(80):
+            runner.step(ROBOT.start)
+        np.testing.assert_allclose(runner.poses()[:, 0, 2], 0.5, atol=2e-3)
+        runner.reset(mask=np.array([False, True]))
+        poses = runner.poses()
+        np.testing.assert_allclose(poses[0, 0, 2], 0.5, atol=2e-3)
+        np.testing.assert_array_equal(poses[1], before[1])
+        runner.step(ROBOT.start)
+        assert runner.poses()[1, 0, 2] > 1.09  # it starts at rest
+
+
+def test_content_meets_the_robot_and_no_other_env():
+    lonely, _ = run(box_beside_the_robot, num_envs=1, workers=0)
+    touched, balls = run(balls_on_the_arm, num_envs=4, workers=0)
+    assert np.abs(touched.qpos[:, 0] - lonely.qpos[:, 0]).max() > 1e-6
+    assert balls.shape == (4, 3, 7)
+    again, _ = run(balls_on_the_arm, num_envs=1, workers=0)
+    np.testing.assert_array_equal(again.qpos[:, 0], touched.qpos[:, 0])
+
+
+@pytest.mark.parametrize(
+    "options", [{"pack_size": 1}, {"pack_size": 3}, {"workers": 2}, {"workers": 2, "pack_size": 4}]
+)
+def test_the_same_bits_for_any_packing_and_any_workers(options):
+    expected, poses = run(balls_on_the_arm, num_envs=5, ticks=40, workers=0)
+    found, others = run(balls_on_the_arm, num_envs=5, ticks=40, **({"workers": 0} | options))
+    np.testing.assert_array_equal(found.qpos, expected.qpos)
+    np.testing.assert_array_equal(others, poses)
+    assert np.ptp(poses[:, :, 2], axis=0).max() > 1e-3  # the envs differ
+
+
+def test_a_function_from_anywhere_travels():
+    scope = {"sapien": sapien}
+    exec(  # as in a script's __main__ or a notebook: no worker can import it
+        "def build(scene, env):\n"
+        "    builder = scene.create_actor_builder()\n"
+        "    builder.add_sphere_collision(radius=size)\n"
+        "    builder.set_initial_pose(sapien.Pose([1, env, 2]))\n"
+        "    return [builder.build()]\n"
+        "size = 0.1\n",
+        scope,
+    )
+    _, poses = run(scope["build"], num_envs=3, ticks=1, workers=2)
+    np.testing.assert_array_equal(poses[:, 0, 1], [0, 1, 2])
+
+
+def test_errors_name_build_and_the_env():
+    def wrong(scene, env):
+        if env == 2:
+            raise KeyError("no such thing")
+
+    for workers in (0, 2):
+        with pytest.raises(
+            InvalidArgumentError, match=r"build, env 2: raised KeyError: 'no such thing'.*test_user_content"
+        ):
+            run(wrong, workers=workers)
+    with pytest.raises(InvalidArgumentError, match="no entity"):
+        run(lambda scene, env: [3], workers=0)
+    with pytest.raises(InvalidArgumentError, match="must be a function"):
+        run("build", workers=0)
+    lock = threading.Lock()
+    with pytest.raises(InvalidArgumentError, match="cannot be sent to a worker"):
+        run(lambda scene, env: lock, workers=1)
+    with pytest.raises(InvalidArgumentError, match="was not given"):
+        run(None, workers=0)
+    with pytest.raises(InvalidArgumentError, match=r"\[0, 1\] entities"):
+        run(lambda scene, env: box_beside_the_robot(scene, env) if env else None, workers=0)

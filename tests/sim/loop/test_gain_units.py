@@ -1,0 +1,108 @@
+"""Gains per unit of inertia on real robots: alike on every joint, the same bytes for any number of workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.metrics import step_metrics
+from sim import Robot, Runner
+from sim.tuning.search import start_gains
+
+OMEGA = 9.0
+
+
+def acceleration_params(robot, units, **options):
+    return robot.params(
+        kp=3 * OMEGA**2,
+        ki=OMEGA**3,
+        kd=3 * OMEGA,
+        setpoint_weight=0.1,
+        weight_origin="start",
+        derivative_filter_time=1e-3,
+        gain_units=units,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_one_set_of_gains_settles_every_arm_joint_of_every_robot_on_its_tutorials_move(name):
+    robot = Robot.load(name)
+    with Runner(robot, 1, params=acceleration_params(robot, "mass_matrix"), workers=0, substeps=10) as runner:
+        runner.reset(robot.settings.start)
+        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (400, robot.dof)))
+    m = step_metrics(rollout.time, robot.settings.target, rollout.qpos, start=robot.settings.start)
+    arm = slice(0, 7)
+    assert (m.settling_time[0, arm] < 1.0).all()
+    assert (np.nan_to_num(m.overshoot[0, arm]) < 0.01).all()
+    assert (m.steady_state_error[0, arm] < 1e-3).all()
+
+
+@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
+def test_same_bytes_for_any_number_of_workers_and_any_packing(units):
+    robot = Robot.load("panda")
+    rng = np.random.default_rng(0)
+    start = robot.start + rng.uniform(-0.2, 0.0, (5, robot.dof)) * [1, 1, 1, 1, 1, 0, 1, 0, 0]
+    goal = np.clip(start + rng.uniform(-0.5, 0.5, start.shape), robot.lower, robot.upper)
+    outcome = []
+    for workers, pack_size in ((0, 8), (0, 2), (2, 3)):
+        params = acceleration_params(robot, units)
+        with Runner(robot, 5, params=params, workers=workers, pack_size=pack_size) as runner:
+            runner.reset(start)
+            outcome.append(runner.rollout(np.broadcast_to(goal, (10, 5, robot.dof))))
+    assert np.abs(outcome[0].qpos[-1] - start).max() > 0.05
+    for other in outcome[1:]:
+        for field in ("qpos", "qvel", "effort", "saturated"):
+            assert getattr(other, field).tobytes() == getattr(outcome[0], field).tobytes(), field
+
+
+def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix():
+    """For one substep, the effort is that of plain gains multiplied by hand."""
+    robot = Robot.load("jaco2")
+    diagonal = robot.mass_matrix(robot.start)[0].diagonal()
+    efforts = []
+    for units, inertia in (("inertia", 1.0), ("effort", diagonal)):
+        params = bp.make_params(robot.dof, 80.0 * inertia, 10.0 * inertia, 18.0 * inertia, gain_units=units)
+        with Runner(robot, 1, params=params, workers=0, substeps=1) as runner:
+            efforts.append(runner.step(robot.settings.target).effort)
+    np.testing.assert_allclose(*efforts, rtol=1e-6)
+
+
+def test_gain_units_are_for_pid_control_only():
+    robot = Robot.load("panda")
+    with pytest.raises(InvalidArgumentError, match="gain_units"):
+        Runner(robot, 1, params=acceleration_params(robot, "inertia"), control="drive", workers=0)
+
+
+def test_mass_matrix_is_what_the_engine_accelerates():
+    """One free step under a small effort: M times the acceleration is the effort."""
+    robot = Robot.load("jaco2")
+    rng = np.random.default_rng(1)
+    start = robot.start + 0.1 + 0.2 * rng.random(robot.dof)
+    matrix = robot.mass_matrix(start)[0]
+    effort = matrix @ rng.uniform(-1, 1, robot.dof)
+    with Runner(robot, 1, control="effort", workers=0, substeps=1, ground=False) as runner:
+        runner.reset(start)
+        acceleration = runner.step(effort).qvel[0] * 2000
+    np.testing.assert_allclose(matrix @ acceleration, effort, rtol=2e-3, atol=2e-3 * np.abs(effort).max())
+
+
+@pytest.mark.parametrize("substeps", [5, 20])
+def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps):
+    """Down from upright, jaco2's mass matrix changes fast: matrices that are ahead on average put it 18 mrad off."""
+    robot = Robot.load("jaco2")
+    start = robot.settings.start + np.array(
+        [0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25]
+    )
+    move = robot.settings.target - start
+    with Runner(
+        robot, 1, params=start_gains(robot), workers=0, measurement_rate=True, substeps=substeps
+    ) as runner:
+        runner.reset(start)
+        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (1200 // substeps, robot.dof)))
+    gone = rollout.qpos[:, 0] - start
+    along = gone @ move / (move @ move)
+    assert along[-1] > 0.8
+    assert np.abs(gone - along[:, None] * move)[:, :7].max() < 2e-3

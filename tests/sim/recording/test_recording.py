@@ -1,0 +1,388 @@
+"""Recordings hold every tick, whatever ends the program, and destroy nothing that was there."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+h5py = pytest.importorskip("h5py")
+
+from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError  # noqa: E402
+from sim import FaultWarning, Recorder, Robot, Runner, read_recording  # noqa: E402
+from sim.cli import main  # noqa: E402
+from sim.recording.recorder import RecordingError  # noqa: E402
+
+ROBOT = Robot.load("panda")
+N = 3
+FIELDS = ("time", "setpoint", "qpos", "qvel", "effort", "saturated", "ok")
+
+
+def make(**options):
+    return Runner(ROBOT, N, **({"workers": 0, "substeps": 2} | options))
+
+
+def table(ticks):
+    noise = np.random.default_rng(ticks).uniform(-0.3, 0.3, (ticks, N, ROBOT.dof))
+    return np.clip(ROBOT.settings.target + noise, ROBOT.lower, ROBOT.upper)
+
+
+def same(recording, rollout):
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(recording, name), getattr(rollout, name), name)
+
+
+def test_every_tick_is_there_with_what_it_belongs_to(tmp_path):
+    path = tmp_path / "deep" / "run.h5"
+    with make() as runner:
+        runner.step(ROBOT.start)
+        with Recorder(path, runner, seed=7) as recorder:
+            assert recorder.partial.exists()
+            assert not path.exists()
+            rollout = runner.rollout(table(40))
+        runner.step(ROBOT.start)
+        params = runner.params
+    recording = read_recording(path)
+    same(recording, rollout)
+    assert recording.complete
+    assert recording.joint_names == ROBOT.joint_names
+    for ours, theirs in zip(recording.params, params, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    about = recording.attributes
+    assert (about["seed"], about["timestep"], about["num_envs"], about["control"]) == (7, 1 / 2000, N, "pid")
+    assert {"python", "numpy", "h5py", "sapien"} <= set(json.loads(about["versions"]))
+    assert [path.name] == os.listdir(path.parent)
+    with h5py.File(path) as file:  # by anyone's reader
+        assert file["qpos"].attrs["unit"].tolist() == ["rad"] * 7 + ["m"] * 2
+        assert file["qvel"].attrs["unit"][0] == "rad/s"
+        assert file["effort"].attrs["unit"].tolist() == ["N m"] * 7 + ["N"] * 2
+        assert file["time"].attrs["unit"].tolist() == ["s"]
+    every = read_recording(path, every=7)
+    np.testing.assert_array_equal(every.qpos, recording.qpos[::7])
+
+
+def test_control_by_effort_has_setpoints_in_newton_metres(tmp_path):
+    with make(control="effort") as runner, Recorder(tmp_path / "run.h5", runner):
+        runner.step(np.zeros(9))
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["setpoint"].attrs["unit"][0] == "N m"
+
+
+def test_it_can_be_read_while_it_grows(tmp_path):
+    with make() as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
+        rollout = runner.rollout(table(5))
+        deadline = time.monotonic() + 10
+        while len(read_recording(recorder.partial).time) < 5:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        same(read_recording(recorder.partial), rollout)
+        assert not read_recording(recorder.partial).complete
+
+
+def test_whoever_watches_it_grow_does_not_keep_it_from_its_end(tmp_path):
+    watch = (
+        "import h5py, sys; file = h5py.File(sys.argv[1], 'r', swmr=True, libver='latest'); "
+        "print('open', flush=True); sys.stdin.read()"
+    )
+    with make() as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
+        runner.rollout(table(5))
+        command = [sys.executable, "-c", watch, recorder.partial]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout.readline() == b"open\n"
+            recorder.close()
+            process.stdin.close()
+    assert len(read_recording(tmp_path / "run.h5").time) == 5
+
+
+def test_no_earlier_file_is_destroyed(tmp_path):
+    path = tmp_path / "run.h5"
+    path.write_text("precious")
+    left = tmp_path / "run.h5.partial"
+    left.write_text("precious too")
+    with make() as runner:
+        with pytest.raises(InvalidArgumentError, match=r"exists already.*run\.h5.*overwrite=True"):
+            Recorder(path, runner)
+        recorder = Recorder(path, runner, overwrite=True)
+        runner.step(ROBOT.start)
+        assert path.read_text() == "precious"
+        recorder.close()
+        recorder.close()
+    assert read_recording(path).complete
+    assert left.read_text() == "precious too"
+
+
+def test_an_exception_leaves_what_was_recorded(tmp_path):
+    path = tmp_path / "run.h5"
+    with make() as runner, pytest.raises(ZeroDivisionError), Recorder(path, runner):  # noqa: PT012
+        rollout = runner.rollout(table(4))
+        raise ZeroDivisionError
+    recording = read_recording(path)
+    same(recording, rollout)
+    assert not recording.complete
+    kept = path.read_bytes()
+    with make() as runner, pytest.raises(ZeroDivisionError), Recorder(path, runner, overwrite=True):  # noqa: PT012
+        runner.rollout(table(2))
+        raise ZeroDivisionError
+    assert path.read_bytes() == kept
+    assert len(read_recording(tmp_path / "run.h5.partial").time) == 2
+
+
+def test_one_recorder_at_a_time_and_none_of_a_closed_runner(tmp_path):
+    with make() as runner:
+        with Recorder(tmp_path / "a.h5", runner):
+            runner.step(ROBOT.start)
+            with pytest.raises(
+                InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"
+            ):
+                Recorder(tmp_path / "b.h5", runner)
+            runner.step(ROBOT.start)
+        with Recorder(tmp_path / "b.h5", runner):
+            runner.step(ROBOT.start)
+    with pytest.raises(ClosedError):
+        Recorder(tmp_path / "c.h5", runner)
+    assert sorted(os.listdir(tmp_path)) == ["a.h5", "b.h5"]
+    assert [len(read_recording(tmp_path / name).time) for name in ("a.h5", "b.h5")] == [2, 1]
+
+
+def test_a_file_made_meanwhile_is_kept(tmp_path):
+    path = tmp_path / "run.h5"
+    with make() as runner:
+        recorder = Recorder(path, runner)
+        runner.step(ROBOT.start)
+        path.write_text("someone else's")
+        with pytest.raises(RecordingError, match=r"made by someone else.*run\.h5\.partial"):
+            recorder.close()
+    assert path.read_text() == "someone else's"
+    assert len(read_recording(tmp_path / "run.h5.partial").time) == 1
+
+
+def test_faults_are_told(tmp_path):
+    with make(non_finite="contain") as runner, Recorder(tmp_path / "run.h5", runner):
+        setpoints = table(4)
+        setpoints[2, 1, 3] = np.nan
+        with pytest.warns(FaultWarning):
+            runner.rollout(setpoints)
+    recording = read_recording(tmp_path / "run.h5")
+    (fault,) = json.loads(recording.attributes["faults"])
+    assert (fault["env"], fault["joint"], fault["cause"]) == (1, "panda_joint4", "setpoint")
+    assert recording.ok.tolist() == [[True] * 3] * 2 + [[True, False, True]] * 2
+
+
+FULL = """
+import os, sys, time, warnings
+warnings.simplefilter("ignore")
+from sim import Robot, Runner, Recorder, read_recording
+robot = Robot.load("panda")
+with Runner(robot, 3, workers=0, substeps=2) as runner:
+    recorder = Recorder(sys.argv[1], runner)
+    for _ in range(50):
+        runner.step(robot.start)
+    while len(read_recording(recorder.partial).time) < 50:
+        time.sleep(0.02)
+    os.dup2(os.open("/dev/full", os.O_RDWR), recorder._file.id.get_vfd_handle())  # from here on there is no space
+    try:
+        while True:
+            runner.step(robot.start)
+    except OSError as error:
+        print(error)
+    try:
+        recorder.close()
+    except OSError as error:
+        print(error)
+    print(runner.step(robot.start).ok.all())
+"""
+
+
+def test_a_disk_that_fills_up_crashes_nothing_and_what_was_recorded_can_be_read(tmp_path):
+    path = tmp_path / "run.h5"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, path],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    told = f"{path}.partial: cannot be written: No space left on device; what was recorded before can be read"
+    assert done.stdout.splitlines() == [told, told, "True"]
+    assert len(read_recording(tmp_path / "run.h5.partial").time) == 50
+
+
+def test_no_space_from_the_start(tmp_path, monkeypatch):
+    with make() as runner:
+
+        def full(self, *arguments, **options):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(h5py.Group, "create_dataset", full)
+        with pytest.raises(RecordingError, match=r"partial: cannot be made: .*No space"):
+            Recorder(tmp_path / "run.h5", runner)
+        assert not os.listdir(tmp_path)
+        assert runner.recorder is None
+
+
+@pytest.mark.parametrize("path", ["run.csv", "run", 3, None])
+def test_bad_names(path):
+    with make() as runner, pytest.raises(InvalidArgumentError, match="path"):
+        Recorder(path, runner)
+
+
+def test_bad_files(tmp_path):
+    (tmp_path / "text.h5").write_text("hello")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    for name in ("text.h5", "other.h5", "missing.h5", "."):
+        with pytest.raises(BatchPIDError):
+            read_recording(tmp_path / name)
+
+
+DAMAGE = {
+    "no names": (lambda file: file.attrs.pop("joint_names"), "does not say its joint_names"),
+    "a group": (lambda file: (file.pop("qpos"), file.create_group("qpos")), "slice"),
+    "other joints": (
+        lambda file: file.attrs.create("joint_names", ["a", "b"]),
+        r"setpoint is float64 \(2, 3, 9\)",
+    ),
+    "other limits": (lambda file: file.attrs.create("upper", 3.0), r"upper are \(\), not one for each of 9"),
+    "text": (lambda file: (file.pop("ok"), file.create_dataset("ok", data=["a", "b"])), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_file_is_told_of(case, tmp_path):
+    damage, message = DAMAGE[case]
+    with make() as runner, Recorder(tmp_path / "run.h5", runner):
+        runner.rollout(table(2))
+    with h5py.File(tmp_path / "run.h5", "r+") as file:
+        damage(file)
+    with pytest.raises(RecordingError, match=rf"cannot be read as a recording: .*{message}|{message}"):
+        read_recording(tmp_path / "run.h5")
+
+
+PROGRAM = """
+import sys, time, numpy as np, warnings
+warnings.simplefilter("ignore")
+from sim import Robot, Runner, Recorder
+robot = Robot.load("panda")
+with Runner(robot, 3, workers=0, substeps=2) as runner, Recorder(sys.argv[1], runner) as recorder:
+    for tick in range(10**9):
+        begun = time.monotonic()
+        runner.step(np.clip(robot.settings.target * np.sin(tick / 50), robot.lower, robot.upper))
+        print(begun, time.monotonic(), flush=True)
+        if tick == int(sys.argv[2]):
+            print("pause", flush=True)
+            time.sleep(100)
+"""
+
+
+def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
+    """Beginning and end, on the clock, of every tick of a recorded program that got the signal then or in its pause."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, path, str(pause)], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    lines = [process.stdout.readline()]
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and lines[-1] != "pause\n":
+        lines.append(process.stdout.readline())
+    while (
+        lines[-1] == "pause\n" and time.monotonic() < end and read_count(path + ".partial") < len(lines) - 1
+    ):
+        time.sleep(0.1)
+    process.send_signal(number)
+    lines += process.stdout.read().splitlines()
+    process.stdout.close()
+    process.wait(timeout=30)
+    return np.array([line.split() for line in lines if len(line.split()) == 2], float)
+
+
+def read_count(path):
+    try:
+        return len(read_recording(path).time)
+    except RecordingError:  # not begun
+        return 0
+
+
+def assert_lacks_at_most_a_second(recording, ticks):
+    kept = len(recording.time)
+    assert kept <= len(ticks) + 1
+    if kept < len(ticks):
+        assert ticks[-1, 0] - ticks[kept, 1] < 1
+    assert np.isfinite(recording.qpos).all()
+    np.testing.assert_allclose(recording.time, (1 + np.arange(kept)) * 2 / 2000)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_killed_at_any_time_it_lacks_at_most_a_second(number, tmp_path):
+    ticks = kill_after(1.7, str(tmp_path / "run.h5"), number)
+    recording = read_recording(tmp_path / ("run.h5" if number == signal.SIGINT else "run.h5.partial"))
+    assert_lacks_at_most_a_second(recording, ticks)
+    assert len(ticks) > 10
+    assert not recording.complete
+
+
+def test_killed_in_a_pause_it_lacks_nothing(tmp_path):
+    assert len(kill_after(60, str(tmp_path / "run.h5"), pause=20)) == 21
+    assert len(read_recording(tmp_path / "run.h5.partial").time) == 21
+
+
+@pytest.mark.slow
+def test_killed_at_many_moments(tmp_path):
+    chance = np.random.default_rng(0)
+    for case in range(40):
+        ticks = kill_after(chance.uniform(0.0, 1.5), str(tmp_path / f"run{case}.h5"))
+        assert_lacks_at_most_a_second(read_recording(tmp_path / f"run{case}.h5.partial"), ticks)
+
+
+def test_a_slow_disk_slows_the_run_instead_of_losing_more(tmp_path, monkeypatch):
+    monkeypatch.setattr("sim.recording.recorder._EVERY", 0.1)
+    monkeypatch.setattr("sim.recording.recorder._LAG", 0.2)
+    with make() as runner:
+        recorder = Recorder(tmp_path / "run.h5", runner)
+        write, times = recorder._write, [time.monotonic()]
+
+        def slow(rows):
+            time.sleep(0.6)
+            write(rows)
+
+        recorder._write = slow
+        while times[-1] < times[0] + 1.2:
+            runner.step(ROBOT.start)
+            times.append(time.monotonic())
+        recorder.close()
+    assert max(np.diff(times)) > 0.2  # it waited for the disk
+    assert len(read_recording(tmp_path / "run.h5").time) == len(times) - 1
+
+
+def test_plot_draws_whole_and_cut_recordings(tmp_path, capsys):
+    for name in ("a.h5", "b.h5"):
+        with make() as runner, Recorder(tmp_path / name, runner):
+            runner.rollout(table(20))
+    with make() as runner, Recorder(tmp_path / "killed.h5", runner) as recorder:
+        runner.rollout(table(20))
+        while read_count(recorder.partial) < 20:
+            time.sleep(0.02)
+        shutil.copy(recorder.partial, tmp_path / "c.h5.partial")  # as a kill would leave it
+    assert main(["plot", str(tmp_path / "a.h5")]) == 0
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    picture = tmp_path / "both.svg"
+    arguments = ["--versus", str(tmp_path / "b.h5"), "--joints", "panda_joint1", "--out", str(picture)]
+    assert main(["plot", str(tmp_path / "a.h5"), *arguments]) == 0
+    assert "<svg" in picture.read_text()
+    assert main(["plot", str(tmp_path / "c.h5.partial"), "--kind", "efforts", "--every", "3"]) == 0
+    assert (tmp_path / "c.png").exists()
+    assert "cut short" in capsys.readouterr().out
+    with make() as runner, Recorder(tmp_path / "empty.h5", runner):
+        pass
+    assert main(["plot", str(tmp_path / "empty.h5")]) == 2
+    assert "holds no tick" in capsys.readouterr().err
+    assert main(["plot", str(tmp_path / "none.h5")]) == 2
+    assert "no such file" in capsys.readouterr().err

@@ -1,0 +1,114 @@
+"""Forward kinematics against SAPIEN's link poses, and J^T F against the work that a force does."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot
+from sim.engine.building import SceneSpec, parse
+from sim.engine.pack import Pack
+from sim.engine.physics import PHYSICS
+from sim.robot.kinematics import Kinematics
+from sim.robot.rotations import about, from_rpy, multiply, rotate
+
+ODD = """<robot name="odd">
+  <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>
+  <joint name="last" type="prismatic"><parent link="bracket"/><child link="tip"/>
+    <origin xyz="0 0.1 0.2" rpy="0.3 -0.2 0.1"/><axis xyz="0 3 4"/>
+    <limit lower="-1" upper="1" effort="9" velocity="9"/></joint>
+  <joint name="first" type="continuous"><parent link="base"/><child link="mid"/><origin rpy="1 2 3"/></joint>
+  <joint name="weld" type="fixed"><parent link="mid"/><child link="bracket"/>
+    <origin xyz="0.5 0 0" rpy="0 0.7 0"/></joint>
+  <joint name="aside" type="revolute"><parent link="mid"/><child link="side"/><origin xyz="0 0 -0.4"/>
+    <axis xyz="-1 1 0.5"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
+</robot>"""
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def odd_robot(folder):
+    path = folder / "odd.urdf"
+    text = ODD
+    for link in ("tip", "base", "mid", "side", "bracket"):
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{INERTIAL}</link>')
+    path.write_text(text)
+    return Robot.load(path)
+
+
+@pytest.fixture(scope="module", params=["panda", "jaco2", "odd"])
+def robot(request, tmp_path_factory):
+    return odd_robot(tmp_path_factory.mktemp("odd")) if request.param == "odd" else Robot.load(request.param)
+
+
+def random_qpos(robot, count):
+    low, high = np.maximum(robot.lower, -6), np.minimum(robot.upper, 6)
+    return np.random.default_rng(0).uniform(low, high, (count, robot.dof))
+
+
+def test_link_poses_are_sapiens(robot):
+    count = 40
+    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
+    pack = Pack(parse(spec), spec, 1)
+    kinematics = Kinematics(robot)
+    qpos = random_qpos(robot, count)
+    ours = kinematics.poses(qpos)
+    assert ours.position.shape == (count, len(kinematics.links), 3)
+    for k, row in enumerate(qpos):
+        pack.write_state([0], row[None], np.zeros((1, robot.dof)))
+        for link in pack._robots[0].links:
+            pose, index = link.entity_pose, kinematics.index(link.name)
+            np.testing.assert_allclose(ours.position[k, index], pose.p, atol=2e-6)
+            same = np.abs(ours.wxyz[k, index] @ pose.q)
+            assert same == pytest.approx(1, abs=2e-6)
+    pack.close()
+
+
+def test_any_batch_shape(robot):
+    kinematics = Kinematics(robot)
+    qpos = random_qpos(robot, 6)
+    flat = kinematics.poses(qpos)
+    for part, whole in zip(kinematics.poses(qpos.reshape(2, 3, -1)), flat, strict=True):
+        np.testing.assert_array_equal(part.reshape(whole.shape), whole)
+    np.testing.assert_array_equal(kinematics.poses(qpos[0]).position, flat.position[0])
+
+
+def test_efforts_of_a_force_are_the_gradient_of_its_work(robot):
+    kinematics = Kinematics(robot)
+    qpos = random_qpos(robot, 5)
+    poses = kinematics.poses(qpos)
+    force, step = np.array([3.0, -2.0, 5.0]), 1e-6
+    for link in range(len(kinematics.links)):
+        efforts = kinematics.efforts_of_force(poses, link, force)
+        for joint in range(robot.dof):
+            nudge = step * np.eye(robot.dof)[joint]
+            ahead, behind = (kinematics.poses(qpos + sign * nudge).position[:, link] for sign in (1, -1))
+            np.testing.assert_allclose(efforts[:, joint], (ahead - behind) @ force / (2 * step), atol=1e-7)
+
+
+def test_the_tool_is_the_hand_or_the_end_of_the_chain(tmp_path):
+    for robot, tool in (
+        (Robot.load("panda"), "panda_hand"),
+        (Robot.load("jaco2"), "j2s7s300_link_7"),
+        (odd_robot(tmp_path), "mid"),
+    ):
+        kinematics = Kinematics(robot)
+        assert kinematics.links[kinematics.tool] == tool
+    with pytest.raises(InvalidArgumentError, match="is unknown"):
+        kinematics.index("elbow")
+
+
+angles = st.floats(-7, 7)
+vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
+
+
+@settings(deadline=None)
+@given(roll=angles, pitch=angles, yaw=angles, v=vectors)
+def test_rotations_compose_keep_lengths_and_follow_the_urdf_order(roll, pitch, yaw, v):
+    x, y, z = (about(axis, angle) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True))
+    q = from_rpy([roll, pitch, yaw])
+    np.testing.assert_allclose(rotate(q, v), rotate(z, rotate(y, rotate(x, v))), atol=1e-12)
+    np.testing.assert_allclose(rotate(multiply(x, y), v), rotate(x, rotate(y, v)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(rotate(q, v)), np.linalg.norm(v), atol=1e-12)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    np.testing.assert_allclose(rotate(z, v)[:2], [[cos, -sin], [sin, cos]] @ v[:2], atol=1e-12)
