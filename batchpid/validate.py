@@ -1,14 +1,18 @@
-"""Checks of what callers pass to the runner; each names the argument, the joint or env, the value and the remedy."""
+"""Checks of arguments; each error names the argument, the joint or env, the value and the remedy."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError
+
+T = TypeVar("T")
 
 
 def integer(argument: str, value: Any, low: int, high: int) -> int:
@@ -50,6 +54,25 @@ def flag(argument: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise InvalidArgumentError(argument, "must be True or False", value=value, remedy="pass a bool")
     return bool(value)
+
+
+def instance(argument: str, value: Any, kind: type[T], remedy: str) -> T:
+    """Return ``value`` if it is a ``kind``."""
+    if not isinstance(value, kind):
+        raise InvalidArgumentError(argument, f"must be a {kind.__name__}", value=value, remedy=remedy)
+    return value
+
+
+def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path:
+    """Return ``value`` as a path that ends in one of ``suffixes``, if any are given."""
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+        raise InvalidArgumentError(argument, "must be a path", value=value, remedy="pass the file's name")
+    path = Path(value)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InvalidArgumentError(
+            argument, "unknown file format", value=str(path), remedy=f"end it in {' or '.join(suffixes)}"
+        )
+    return path
 
 
 def read_array(argument: str, value: ArrayLike, kinds: str = "iuf") -> NDArray[Any]:

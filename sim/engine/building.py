@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sapien import physx
+from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
 from sim.engine.contact_prediction import Link
@@ -17,13 +18,6 @@ from sim.engine.physics import Physics
 from sim.engine.user_content import Build, HeadlessScene
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.urdf import Joint
-
-with warnings.catch_warnings():
-    # Without a system Vulkan SAPIEN warns that it falls back to its own; nothing here renders.
-    warnings.filterwarnings("ignore", message=".*libvulkan.*")
-    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
-    from sapien import physx
-    from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 GRAVITY = (0.0, 0.0, -9.81)
 

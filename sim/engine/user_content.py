@@ -6,21 +6,16 @@ Beside ``sim/engine/pack.py`` this is the one module that touches SAPIEN, which 
 from __future__ import annotations
 
 import traceback
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import sapien
 from numpy.typing import NDArray
+from sapien.physx import PhysxArticulationLinkComponent, PhysxRigidDynamicComponent
+from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
-
-with warnings.catch_warnings():
-    warnings.filterwarnings("ignore", message=".*libvulkan.*")
-    warnings.filterwarnings("ignore", message=".*pkg_resources.*")
-    import sapien
-    from sapien.physx import PhysxArticulationLinkComponent, PhysxRigidDynamicComponent
-    from sapien.wrapper.actor_builder import ActorBuilder
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds to the scene of env ``env``; returns the entities whose poses are wanted, or None."""
