@@ -38,9 +38,7 @@ def track(
     if params.ki is None:
         raise no_integral()
     if params.integration is not None and dt is None:
-        raise InvalidArgumentError(
-            "dt", "is needed where the params integrate first", remedy="give dt in seconds"
-        )
+        raise InvalidArgumentError("dt", "is needed where the params integrate first", remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)

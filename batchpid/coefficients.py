@@ -87,9 +87,7 @@ def _spread(coefficients: Coefficients, shape: tuple[int, int]) -> Coefficients:
     xp, dtype = namespace(*coefficients), coefficients.kp.dtype
     return Coefficients(
         *(
-            leaf
-            if leaf is None or isinstance(leaf, tuple)
-            else xp.zeros(shape, dtype) + xp.asarray(leaf, dtype=dtype)
+            leaf if leaf is None or isinstance(leaf, tuple) else xp.zeros(shape, dtype) + xp.asarray(leaf, dtype=dtype)
             for leaf in coefficients
         )
     )

@@ -64,14 +64,8 @@ class BatchPID:
             raise InvalidArgumentError(
                 "num_envs", "is not a whole number >= 1", value=num_envs, remedy="give the number of envs"
             )
-        if (
-            isinstance(dt, bool)
-            or not isinstance(dt, int | float | np.floating)
-            or not 0 < dt <= sys.float_info.max
-        ):
-            raise InvalidArgumentError(
-                "dt", "is not positive and finite", value=dt, remedy="give seconds > 0"
-            )
+        if isinstance(dt, bool) or not isinstance(dt, int | float | np.floating) or not 0 < dt <= sys.float_info.max:
+            raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
         if not isinstance(params, PIDParams):
             raise _no_params(params)
         self._dt, self._backend, self._names = float(dt), backend, joint_names
@@ -174,9 +168,7 @@ class BatchPID:
         try:
             mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidArgumentError(
-                "mask", f"is no array: {error}", remedy="give one bool per env"
-            ) from None
+            raise InvalidArgumentError("mask", f"is no array: {error}", remedy="give one bool per env") from None
         if mask.dtype != bool or mask.shape != (self.num_envs,):
             raise InvalidArgumentError(
                 "mask",
@@ -235,9 +227,7 @@ class BatchPID:
         if array.shape == self._shape:
             return array
         envs, joints = self._shape
-        if array.ndim <= 2 and all(
-            n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
-        ):
+        if array.ndim <= 2 and all(n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)):
             return array.reshape((1,) * (2 - array.ndim) + array.shape)
         raise InvalidArgumentError(
             name,

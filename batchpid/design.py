@@ -142,9 +142,7 @@ def design_gains(
         ("integral_time", 1.0 if integral_time is None else min(integral_time, 1.0), math.inf),
     ):
         if not 0 < value < top:
-            raise InvalidArgumentError(
-                name, "is out of range", value=value, remedy=f"use 0 < {name} < {top:g}"
-            )
+            raise InvalidArgumentError(name, "is out of range", value=value, remedy=f"use 0 < {name} < {top:g}")
     if gain_units not in CHOICES["gain_units"]:
         raise InvalidArgumentError(
             "gain_units",
@@ -154,16 +152,12 @@ def design_gains(
         )
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     own = np.diagonal(mass, axis1=1, axis2=2)
-    inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[
-        gain_units
-    ]
+    inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
     # The loop that works with the whole mass matrix makes up for the joints' own damping.
     damping = {"effort": robot.damping, "inertia": robot.damping / own.max(0), "mass_matrix": 0.0}[gain_units]
     bandwidth = float(bandwidth_hz)
     while True:
-        gains = pid_from_inertia(
-            inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
-        )
+        gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
         filter_time = _filter_time(mass, gains, dt, robot.damping, gain_units, margin)
         if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
             break

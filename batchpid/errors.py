@@ -31,9 +31,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
     ) -> None:
         self.argument, self.problem, self.remedy = argument, problem, remedy
         self.joint, self.env, self.value = joint, env, value
-        where = "".join(
-            f", {kind} {place!r}" for kind, place in (("joint", joint), ("env", env)) if place is not None
-        )
+        where = "".join(f", {kind} {place!r}" for kind, place in (("joint", joint), ("env", env)) if place is not None)
         got = "" if value is None else f" (got {value!r})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 
@@ -55,9 +53,7 @@ class MissingDependencyError(BatchPIDError, ImportError):
 
     def __init__(self, package: str, purpose: str, extra: str) -> None:
         self.package, self.purpose, self.extra = package, purpose, extra
-        super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'"
-        )
+        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (self.package, self.purpose, self.extra))

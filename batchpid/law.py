@@ -126,9 +126,7 @@ def advance(
         finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
             finite = finite if optional is None else finite & xp.isfinite(optional)
-        r, y, r_rate, y_rate, ff = (
-            None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
-        )
+        r, y, r_rate, y_rate, ff = (None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff))
 
     error = wrapped_error(k, r, y, xp)
     origin = turned_origin(k, state, y, xp)
@@ -181,9 +179,7 @@ def advance(
         origin=origin,
     )
     if finite is not None:
-        new = PIDState(
-            *(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True))
-        )
+        new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
         effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
     if not aux:
         return new, effort
@@ -209,9 +205,7 @@ def advance(
     )
 
 
-def reset(
-    params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False
-) -> PIDState:
+def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
     """Start the envs of ``mask`` (envs,) bool anew from ``measurement`` (envs, joints); the others are untouched.
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load.
@@ -221,9 +215,7 @@ def reset(
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
     chosen = xp.asarray(mask)[:, None]
-    return PIDState(
-        *(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True))
-    )
+    return PIDState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))
 
 
 def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:

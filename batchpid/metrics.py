@@ -139,9 +139,7 @@ def step_metrics(
         first = _like("start", start, y.shape[1:])
         t, y, r = np.append(0.0, t), np.concatenate([first[None], y]), np.concatenate([r[:1], r])
         if t[1] <= 0:
-            raise InvalidArgumentError(
-                "time", "must be above 0 where start is given", value=t[1], remedy="drop row 0"
-            )
+            raise InvalidArgumentError("time", "must be above 0 where start is given", value=t[1], remedy="drop row 0")
     t = t - t[0]
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
     y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)

@@ -285,9 +285,7 @@ def make_params(
         integral_max=build.freeze(integral_highest),
         derivative_filter_time=build.option("derivative_filter_time", derivative_filter_time, neutral=0.0),
         setpoint_weight=build.option("setpoint_weight", setpoint_weight, neutral=1.0),
-        setpoint_weight_derivative=build.option(
-            "setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0
-        ),
+        setpoint_weight_derivative=build.option("setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0),
         deadband=build.option("deadband", deadband, neutral=0.0),
         tracking_time=build.freeze(tracking),
         conditional=conditional,

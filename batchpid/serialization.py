@@ -83,8 +83,7 @@ def save_params(
     document["dtype"] = str(options.pop("dtype"))
     document |= {name: options.pop(name) for name in CHOICES}
     document["joints"] = {
-        name: {key: _plain(column[:, joint]) for key, column in options.items()}
-        for joint, name in enumerate(names)
+        name: {key: _plain(column[:, joint]) for key, column in options.items()} for joint, name in enumerate(names)
     }
     if _is_yaml(path):
         text = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=10_000)
@@ -98,9 +97,7 @@ def save_params(
         beside.unlink(missing_ok=True)
 
 
-def load_params(
-    path: str | os.PathLike[str], joint_names: Sequence[str] | None = None
-) -> tuple[PIDParams, list[str]]:
+def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
     """Return the params in a file and their joints' names, in the order of ``joint_names`` where given.
 
     Nothing in the file is executed, and every value passes :func:`batchpid.make_params`: a file from a stranger is
@@ -208,25 +205,17 @@ def _checked(path: Path, document: Any) -> dict[str, dict[str, Any]]:
         raise InvalidArgumentError(str(path), "holds no params", remedy=f"it must say 'format: {FORMAT}'")
     for key in document:
         if key not in HEAD:
-            raise InvalidArgumentError(
-                f"{path}: {key}", "is no known key", remedy=f"choose from {', '.join(HEAD)}"
-            )
+            raise InvalidArgumentError(f"{path}: {key}", "is no known key", remedy=f"choose from {', '.join(HEAD)}")
     if not isinstance(document.get("about", {}), dict):
-        raise InvalidArgumentError(
-            f"{path}: about", "is no mapping", remedy="name what is told, or leave it out"
-        )
+        raise InvalidArgumentError(f"{path}: about", "is no mapping", remedy="name what is told, or leave it out")
     if document.get("dtype", "float64") not in ("float32", "float64"):
         raise InvalidArgumentError(f"{path}: dtype", "is unknown", remedy="choose from float32, float64")
     joints = document.get("joints")
     if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
-        raise InvalidArgumentError(
-            f"{path}: joints", "is no mapping from names to options", remedy="name the joints"
-        )
+        raise InvalidArgumentError(f"{path}: joints", "is no mapping from names to options", remedy="name the joints")
     for name, options in joints.items():
         if not isinstance(options, dict) or "kp" not in options:
-            raise InvalidArgumentError(
-                f"{path}: joints", "has no kp", joint=name, remedy="give 'kp: <number>'"
-            )
+            raise InvalidArgumentError(f"{path}: joints", "has no kp", joint=name, remedy="give 'kp: <number>'")
         for key, value in options.items():
             if key not in OFF:
                 raise InvalidArgumentError(
@@ -270,8 +259,7 @@ def _columns(path: Path, joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
                     remedy="give one per env",
                 )
         spread = [
-            value * (rows // len(value)) if isinstance(value, list) else [value] * rows
-            for value in values.values()
+            value * (rows // len(value)) if isinstance(value, list) else [value] * rows for value in values.values()
         ]
         dtype: Any = {float: float, bool: bool, str: object}[type(off)]
         columns[key] = np.array(spread, dtype=dtype).T

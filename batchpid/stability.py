@@ -93,9 +93,7 @@ def spectral_radius(
     The exact one-step matrix of the law, output first, and the plant, on the state (q, q - q', I, d). Arguments
     as :func:`stability_bound`, with ``ki`` [N m/(rad s) or N/(m s)] as kp. Where ki is 0 its pole at 1 is left out.
     """
-    m, p, i, c, tau, b = _columns(
-        mass_matrix, dt, kp=kp, ki=ki, kd=kd, filter_time=filter_time, damping=damping
-    )
+    m, p, i, c, tau, b = _columns(mass_matrix, dt, kp=kp, ki=ki, kd=kd, filter_time=filter_time, damping=damping)
     shape = m.shape[:-1]
     one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
 
@@ -131,11 +129,7 @@ def _numbers(name: str, value: ArrayLike) -> Any:
 
 
 def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Any, ...]:
-    if (
-        isinstance(dt, bool)
-        or not isinstance(dt, int | float | np.number)
-        or not 0 < dt <= np.finfo(float).max
-    ):
+    if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not 0 < dt <= np.finfo(float).max:
         raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
     m = _numbers("mass_matrix", mass_matrix)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:

@@ -119,9 +119,7 @@ def minimum_jerk(
     if duration is not None:
         total = np.broadcast_to(_positive("duration", duration, way.shape), way.shape)
     else:
-        v = _positive(
-            "max_velocity", np.inf if max_velocity is None else max_velocity, way.shape, finite=False
-        )
+        v = _positive("max_velocity", np.inf if max_velocity is None else max_velocity, way.shape, finite=False)
         a = _positive(
             "max_acceleration",
             np.inf if max_acceleration is None else max_acceleration,
@@ -185,17 +183,13 @@ def trapezoidal(
         vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), way.shape) for limit in (vs, as_))
         moves = np.broadcast_to(moves.any(-1, keepdims=True), way.shape)
     as_ = np.where(moves, as_, 1.0)
-    peak = np.minimum(
-        np.where(moves, vs, 1.0), np.sqrt(as_)
-    )  # a short move never reaches its cruising velocity
+    peak = np.minimum(np.where(moves, vs, 1.0), np.sqrt(as_))  # a short move never reaches its cruising velocity
     ramp = peak / as_
     total = np.where(moves, 1 / peak + ramp, 0.0)
     time = _ticks(dt, total)
     t = np.minimum(time[(...,) + (None,) * way.ndim], total)
     left = total - t
-    s = np.where(
-        t < ramp, as_ * t**2 / 2, np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2))
-    )
+    s = np.where(t < ramp, as_ * t**2 / 2, np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2)))
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
     return _trajectory(time, x0, way, s, rate, acceleration, done=left <= 0)
@@ -316,9 +310,7 @@ def _count(duration: float, dt: float) -> int:
     return max(1, math.ceil(duration / dt * (1 - 1e-12)))
 
 
-def _numbers(
-    name: str, value: ArrayLike, shape: tuple[int, ...] | None = None, finite: bool = True
-) -> Float64:
+def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None, finite: bool = True) -> Float64:
     """Return ``value`` as float64 that broadcasts to ``shape``, with no NaN, and no infinity where finite."""
     try:
         array = np.asarray(value, np.float64)

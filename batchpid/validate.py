@@ -125,9 +125,7 @@ def array(
     return result
 
 
-def within(
-    argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]
-) -> NDArray[np.float64]:
+def within(argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]) -> NDArray[np.float64]:
     """``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN counts as near."""
     beyond = np.abs(rows) > far
     if beyond.any():

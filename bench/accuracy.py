@@ -48,16 +48,12 @@ def main(options: Options) -> None:
                         "rms": error.rms,
                         "over_time": {
                             "seconds": THINNED * TIMESTEP,
-                            "max": [
-                                float(f"{value:.3g}") for value in error.over_time[THINNED - 1 :: THINNED]
-                            ],
+                            "max": [float(f"{value:.3g}") for value in error.over_time[THINNED - 1 :: THINNED]],
                         },
                     }
                 )
     labels = ("robot", "motion", "physics", "reference")
-    rows = [
-        [str(row[label]) for label in labels] + [f"{row['max']:.1e}", f"{row['rms']:.1e}"] for row in figures
-    ]
+    rows = [[str(row[label]) for label in labels] + [f"{row['max']:.1e}", f"{row['rms']:.1e}"] for row in figures]
     print(table(rows, [*labels, "max [rad]", "RMS [rad]"], "llllrr"))
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)

@@ -87,12 +87,8 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
             new["machine"] = measured["machine"]
             new["cases"][name] = {
                 "rates": {case: round(row["median"]) for case, row in measured["cases"].items()},
-                "ratios": {
-                    case: round(row["closed_loop_over_case"], 3) for case, row in measured["cases"].items()
-                },
-                "phases": {
-                    phase: round(us, 2) for phase, us in measured["microseconds_per_env_step"].items()
-                },
+                "ratios": {case: round(row["closed_loop_over_case"], 3) for case, row in measured["cases"].items()},
+                "phases": {phase: round(us, 2) for phase, us in measured["microseconds_per_env_step"].items()},
             }
     if (path := folder / "pytest.json").is_file():
         benchmarks = json.loads(path.read_text())["benchmarks"]
@@ -163,9 +159,7 @@ def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
         left = 0.0
         for phase, colour in PHASES.items():
             spent = cases[name]["phases"][phase]
-            axes.barh(
-                row, spent, left=left, height=0.6, color=colour, lw=0, label=phase if row == 0 else None
-            )
+            axes.barh(row, spent, left=left, height=0.6, color=colour, lw=0, label=phase if row == 0 else None)
             left += spent
         axes.text(0.3, row + 0.38, label, fontsize=7.5, va="center")
     axes.set_yticks([])
@@ -248,9 +242,7 @@ def machine(about: dict[str, Any]) -> str:
     packages = ", ".join(
         f"{name} {about[name]}" for name in ("sapien", "numpy", "mujoco", "gymnasium") if name in about
     )
-    return (
-        f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']}, {packages}."
-    )
+    return f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']}, {packages}."
 
 
 def cases_table(cases: dict[str, Any]) -> str:
@@ -270,10 +262,7 @@ def cases_table(cases: dict[str, Any]) -> str:
 
 def phases_table(cases: dict[str, Any]) -> str:
     """Microseconds per env step of each phase."""
-    rows = [
-        [label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)]
-        for name, label in SETUPS.items()
-    ]
+    rows = [[label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)] for name, label in SETUPS.items()]
     return markdown(["µs per env step in a worker", *PHASES], rows)
 
 
@@ -296,8 +285,7 @@ def presets_table(figures: dict[str, Any]) -> str:
 def resources_table(resources: dict[str, dict[str, float]]) -> str:
     """Memory, building, starting."""
     rows = [
-        [what, *(form.format(robot[name]) for robot in resources.values())]
-        for name, (what, form) in RESOURCES.items()
+        [what, *(form.format(robot[name]) for robot in resources.values())] for name, (what, form) in RESOURCES.items()
     ]
     return markdown(["", *resources], rows)
 

@@ -41,7 +41,5 @@ def run_scaling(benchmark, num_envs, workers, substeps, steps):
 
         obs = benchmark.pedantic(run, rounds=ROUNDS, warmup_rounds=1)
     assert obs.ok.all()
-    assert (np.abs(obs.qpos - setup.start)[:, setup.moving].max(axis=1) > 1e-4).all(), (
-        "the robots did not move"
-    )
+    assert (np.abs(obs.qpos - setup.start)[:, setup.moving].max(axis=1) > 1e-4).all(), "the robots did not move"
     record(benchmark, num_envs * ticks * substeps)

@@ -32,9 +32,7 @@ class TestThroughput:
     def test_by_hand(self, benchmark, setups, name, physics, case):
         setup = setups[name, physics]
         benchmark.group = f"{name}, {physics}"
-        processes = [
-            BaselineProcess(setup, index) for index in range(1 if case == "tutorial" else setup.workers)
-        ]
+        processes = [BaselineProcess(setup, index) for index in range(1 if case == "tutorial" else setup.workers)]
         try:
             _, steps, final = benchmark.pedantic(run_baseline, (case, processes, setup), rounds=ROUNDS)
         finally:

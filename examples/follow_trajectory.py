@@ -40,8 +40,7 @@ def main():
     moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)
     ticks = min(move.ticks for move in moves.values())
     position, rate = (
-        np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1)
-        for name in ("position", "velocity")
+        np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1) for name in ("position", "velocity")
     )
     params = robot.params(kp=KP, ki=0.0, kd=KD, derivative_filter_time=0.002)
     with Runner(robot, len(moves), params=params) as runner:

@@ -12,9 +12,7 @@ import tyro
 from sim import Robot, Runner
 
 
-def main(
-    robot: str = "panda", stiffness: Annotated[float, tyro.conf.arg(help="of the internal drive")] = 0.0
-) -> None:
+def main(robot: str = "panda", stiffness: Annotated[float, tyro.conf.arg(help="of the internal drive")] = 0.0) -> None:
     """Print what SAPIEN's tutorial prints of every joint."""
     loaded = Robot.load(robot)
     for joint in loaded.all_joints:

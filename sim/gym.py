@@ -137,11 +137,7 @@ class ReachVectorEnv(VectorEnv):
         An int ``seed`` gives env k the seed + k; a sequence has one for each env. What an env draws depends on its
         seed alone, not on its company.
         """
-        mask = (
-            np.ones(self.num_envs, bool)
-            if not options
-            else options.get("reset_mask", np.ones(self.num_envs, bool))
-        )
+        mask = np.ones(self.num_envs, bool) if not options else options.get("reset_mask", np.ones(self.num_envs, bool))
         if (
             not isinstance(mask, np.ndarray)
             or mask.dtype != np.bool_

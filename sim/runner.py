@@ -158,9 +158,7 @@ class Runner:
             physics = PHYSICS[choice("physics", physics, PHYSICS)]
         pack_size = packing(self.num_envs, integer("pack_size", pack_size, 1, 65535))
         if build is not None and not callable(build):
-            raise InvalidArgumentError(
-                "build", "must be a function", value=build, remedy="define build(scene, env)"
-            )
+            raise InvalidArgumentError("build", "must be a function", value=build, remedy="define build(scene, env)")
         self._on_fault = choice("on_fault", on_fault, ACTIONS)
         limit = None if speed_limit is None else joint_speeds("speed_limit", speed_limit, robot.joint_names)
         self._contains = choice("non_finite", non_finite, ("raise", "contain")) == "contain"

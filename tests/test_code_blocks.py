@@ -22,9 +22,7 @@ from sim.cli import COMMANDS, main, parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md")])
-BLOCK = re.compile(
-    r"(?:<!-- needs: (?P<needs>[\w, ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL
-)
+BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>[\w, ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
 SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
@@ -63,9 +61,7 @@ def test_links_lead_somewhere():
             if not re.match(r"\w+:", target[0]):
                 assert path.exists(), f"{page.name}: {target[0]}"
                 titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
-                assert not anchor or anchor in [
-                    re.sub(r"[^\w-]", "", t.lower().replace(" ", "-")) for t in titles
-                ]
+                assert not anchor or anchor in [re.sub(r"[^\w-]", "", t.lower().replace(" ", "-")) for t in titles]
 
 
 def test_every_page_is_in_the_index():
@@ -105,9 +101,7 @@ def run(words: list[str]) -> None:
         assert rest[0] == "install"
         extras = re.findall(r"\[(.*?)\]", rest[-1])
         project = (ROOT / "pyproject.toml").read_text()
-        assert all(
-            re.search(rf"^{name} = \[", project, re.MULTILINE) for part in extras for name in part.split(",")
-        )
+        assert all(re.search(rf"^{name} = \[", project, re.MULTILINE) for part in extras for name in part.split(","))
     elif program == "python":
         files = rest[2:] if rest[:2] == ["-m", "pytest"] else rest[:1]
         assert files, words

@@ -117,9 +117,7 @@ def phases(setup: Setup) -> dict[str, float]:
     percent. "waiting" is what a tick of :meth:`Runner.step` takes beyond the work of a worker, on average.
     """
     share = max(1, setup.num_envs // max(setup.workers, 1))
-    spec = LoopSpec(
-        setup.scene(gravity=True), share, Robot.load(setup.robot.path, dissipation="sapien").params()
-    )
+    spec = LoopSpec(setup.scene(gravity=True), share, Robot.load(setup.robot.path, dissipation="sapien").params())
     layout = Arrays.layout(1, share, setup.robot.dof).items()
     fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout}
     loop = Loop(spec, Arrays.of_ticks(fields, slice(0, share)))

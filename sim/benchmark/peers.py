@@ -53,9 +53,7 @@ class AsyncVector:
         # The processes are forks of one that has loaded all packages: else many would take a minute to start.
         multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
         with single_threaded():
-            self._envs = gymnasium.vector.AsyncVectorEnv(
-                [lambda: _tutorial_env(setup)] * count, context="forkserver"
-            )
+            self._envs = gymnasium.vector.AsyncVectorEnv([lambda: _tutorial_env(setup)] * count, context="forkserver")
         self._actions = np.tile(setup.target, (count, 1))
 
     def reset(self) -> None:
@@ -116,9 +114,7 @@ class MuJoCo:
         for body in spec.bodies:
             body.gravcomp = 1
         for joint, kp, kd in zip(robot.joints, settings.kp, settings.kd, strict=True):
-            actuator = spec.add_actuator(
-                name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
-            )
+            actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.set_to_position(kp=kp, kv=kd)
         self._setup, self._model = setup, spec.compile()
         self._columns = [self._model.joint(name).qposadr[0] for name in robot.joint_names]

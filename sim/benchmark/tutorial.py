@@ -69,9 +69,7 @@ class TutorialLoop:
         self.robot.set_qf(qf)
         self.scene.step()
 
-    def run(
-        self, steps: int, record: Callable[[NDArray[np.float32]], None] | None = None
-    ) -> NDArray[np.float32]:
+    def run(self, steps: int, record: Callable[[NDArray[np.float32]], None] | None = None) -> NDArray[np.float32]:
         """``steps`` sim steps; ``record`` is given qpos after each. Returns the last qpos (dof,)."""
         for _ in range(steps):
             self.step()

@@ -63,9 +63,7 @@ class Compare:
         moves = tutorial_move(robot) + random_moves(robot, self.moves, self.seed)
         drawn = None
         if self.variation:
-            drawn = draw_variation(
-                robot, len(moves.start), self.seed, payload=self.payload, friction=self.friction
-            )
+            drawn = draw_variation(robot, len(moves.start), self.seed, payload=self.payload, friction=self.friction)
         evaluations = [
             evaluate_gains(
                 robot,

@@ -43,9 +43,7 @@ def duration(seconds: float) -> float:
     return number("seconds", seconds, 1e-6, 1e6, "simulated time")
 
 
-def follow(
-    runner: Runner, setpoint: NDArray[Any], start: NDArray[np.float64], seconds: float, label: str
-) -> Followed:
+def follow(runner: Runner, setpoint: NDArray[Any], start: NDArray[np.float64], seconds: float, label: str) -> Followed:
     """Reset a fresh runner to ``start`` and hold ``setpoint`` (dof,) or (envs, dof) for ``seconds``, under a bar.
 
     Runs whole ticks, two at least.

@@ -37,9 +37,7 @@ class Plot:
         from sim import plots
 
         every = integer("every", self.every, 1, 10**9)
-        out = plots.check_path(
-            self.out or self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png")
-        )
+        out = plots.check_path(self.out or self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png"))
         traces = _read(self.recording, every)
         if self.versus is not None:
             figure = plots.comparison(traces, _read(self.versus, every), joints=self.joints or None)

@@ -21,8 +21,6 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     pace = 0.1 if sys.stderr.isatty() else 5.0
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
-        return tqdm(
-            items, desc=label, delay=DELAY, mininterval=pace, leave=False, dynamic_ncols=True, **options
-        )
+        return tqdm(items, desc=label, delay=DELAY, mininterval=pace, leave=False, dynamic_ncols=True, **options)
 
     return wrap

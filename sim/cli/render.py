@@ -49,7 +49,5 @@ class Render:
         def progress(rows: object) -> object:
             return tqdm(rows, desc="filming", unit="frame", leave=False)
 
-        path = film(
-            rollout, robot, self.out, fps=self.fps, width=self.width, height=self.height, progress=progress
-        )
+        path = film(rollout, robot, self.out, fps=self.fps, width=self.width, height=self.height, progress=progress)
         print(f"film: {path}")

@@ -72,10 +72,7 @@ def verdicts(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[s
     never = np.isinf(alive).sum(0) if len(alive) else np.zeros(robot.dof, int)
     unsettled = [f"{name} ({n})" for name, n in zip(robot.joint_names, never, strict=True) if n]
     if unsettled:
-        yield (
-            f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: "
-            f"{', '.join(unsettled)}."
-        )
+        yield (f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {', '.join(unsettled)}.")
     if not dead.size and not unsettled:
         yield f"Every joint of every env settled within {seconds:g} s to 2 % of its move."
     yield from limit_notes(robot, rollout.setpoint[-1])

@@ -112,9 +112,7 @@ class Rollout:
             print(f"written: {self.out}")
         if self.picture is not None:
             traces = plots.Traces.of(run.rollout, robot)
-            print(
-                f"picture: {plots.save(plots.step_responses(traces, mark=0, title=robot.name), self.picture)}"
-            )
+            print(f"picture: {plots.save(plots.step_responses(traces, mark=0, title=robot.name), self.picture)}")
 
 
 def _recording(path: Path | None, runner: Runner, seed: int) -> AbstractContextManager[Any]:

@@ -80,9 +80,7 @@ class Tune:
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = Path(f"out/{robot.path.stem}.tuned.yaml") if self.out is None else self.out
         if out.suffix not in (".yaml", ".yml", ".json"):
-            raise InvalidArgumentError(
-                "out", "unknown file format", value=str(out), remedy="end it in .yaml or .json"
-            )
+            raise InvalidArgumentError("out", "unknown file format", value=str(out), remedy="end it in .yaml or .json")
         picture = plots.check_path(out.with_suffix(".png") if self.picture is None else self.picture)
         out.parent.mkdir(parents=True, exist_ok=True)
         history = out.with_suffix(".search.json")
@@ -99,9 +97,7 @@ class Tune:
             seconds=self.seconds,
             gain_units=self.gain_units,
             per_joint=self.per_joint,
-            weights=Weights(
-                self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation
-            ),
+            weights=Weights(self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation),
             variation=varied,
             workers=self.workers,
             time_limit=self.time_limit,
@@ -123,9 +119,7 @@ class Tune:
                 physics=self.physics,
                 variation=drawn,
             )
-            for name, params in bar("judging", unit="set")(
-                [("designed", found.start_params), ("tuned", found.params)]
-            )
+            for name, params in bar("judging", unit="set")([("designed", found.start_params), ("tuned", found.params)])
         ]
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
@@ -145,9 +139,7 @@ class Tune:
         save_params(out, found.params, robot.joint_names, about)
         history.unlink(missing_ok=True)
         before, after = (plots.Traces.of(t.rollout.envs(slice(0, 1)), robot, t.name) for t in evaluations)
-        image = plots.save(
-            plots.comparison(before, after, title=f"{robot.name}, {moves.names[0]} move"), picture
-        )
+        image = plots.save(plots.comparison(before, after, title=f"{robot.name}, {moves.names[0]} move"), picture)
         print(f"\nwritten: {out}\npicture: {image}")
         for text in evaluations[1].shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {text}")

@@ -57,9 +57,7 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
         except Exception as error:
             raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
     if len(builders) != 1 or actors:
-        raise RobotError(
-            "the URDF does not describe one articulated robot; it needs at least one moving joint"
-        )
+        raise RobotError("the URDF does not describe one articulated robot; it needs at least one moving joint")
     _part(builders[0])
     return builders[0]
 

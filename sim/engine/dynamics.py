@@ -47,16 +47,12 @@ class Dynamics:
             matrix[...] = self._model.compute_generalized_mass_matrix(row)
         return matrices
 
-    def inverse_dynamics(
-        self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]
-    ) -> NDArray[np.float64]:
+    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> NDArray[np.float64]:
         """Efforts (n, dof) [N m or N] of a motion, gravity included, friction and damping left out."""
         rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, qacc)), strict=True)
         return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
 
-    def forward_dynamics(
-        self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]
-    ) -> NDArray[np.float64]:
+    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> NDArray[np.float64]:
         """Accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included, damping left out."""
         rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, effort)), strict=True)
         return np.array([self._model.compute_forward_dynamics(*row) for row in rows])
@@ -100,6 +96,4 @@ def scene_dynamics(spec: SceneSpec) -> Dynamics:
 
 def robot_dynamics(robot: RobotDescription, ground: bool = True) -> Dynamics:
     """Return the dynamics of ``robot`` on a fixed base, with or without a ground at height 0."""
-    return scene_dynamics(
-        SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["fast"], ground=ground)
-    )
+    return scene_dynamics(SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["fast"], ground=ground))

@@ -215,9 +215,7 @@ class Pack:
     def read_root(self) -> Float32:
         """Each robot's root link (M, 13): position, quaternion w, x, y, z, linear and angular velocity."""
         rows = [
-            np.concatenate(
-                [pose.p, pose.q, robot.get_root_linear_velocity(), robot.get_root_angular_velocity()]
-            )
+            np.concatenate([pose.p, pose.q, robot.get_root_linear_velocity(), robot.get_root_angular_velocity()])
             for robot, pose in ((robot, robot.get_root_pose()) for robot in self._robots)
         ]
         return np.array(rows, np.float32)

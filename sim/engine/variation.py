@@ -72,11 +72,7 @@ class VariedPack(Pack):
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Joint positions as the sensors give them."""
         qpos = super().read_qpos(dtype)
-        return (
-            qpos
-            if self._resolution == 0
-            else (np.rint(qpos / self._resolution) * self._resolution).astype(dtype)
-        )
+        return qpos if self._resolution == 0 else (np.rint(qpos / self._resolution) * self._resolution).astype(dtype)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """What the model of the unloaded robot says at the measured positions."""

@@ -51,15 +51,11 @@ class Control:
         else:
             self.state = bp.reset(self.params, self.state, qpos, mask)
 
-    def begin(
-        self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None
-    ) -> None:
+    def begin(self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None) -> None:
         """Take the commands of a tick of so many sim steps."""
         self._substeps, self._setpoint, self._setpoint_rate = substeps, setpoint, setpoint_rate
 
-    def effort(
-        self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
-    ) -> Float64 | None:
+    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Joint efforts of sim step ``step`` of the tick, ``feedforward`` included; None to leave qf alone.
 
         At the ``last`` one ``saturated`` is brought up to date.
@@ -75,9 +71,7 @@ class PIDControl(Control):
         self.params = params
         self._coefficients = bp.discretise(params, self.dt, self.size)
 
-    def effort(
-        self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
-    ) -> Float64 | None:
+    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Advance the law by one sim step."""
         qvel = pack.read_qvel() if self._measurement_rate else None
         inputs = (self._setpoint, qpos, qvel, self._setpoint_rate, feedforward)
@@ -104,9 +98,7 @@ class InertiaPIDControl(PIDControl):
         damping = np.array([joint.damping for joint in self._scene.joints])
         self._damping = damping if self._whole and damping.any() else None
 
-    def effort(
-        self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
-    ) -> Float64 | None:
+    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Advance the law by one sim step."""
         if step % INERTIA_EVERY == 0:
             # Where the robot will be half-way through these steps, so that the error is zero on average: near upright,
@@ -160,16 +152,12 @@ class DriveControl(Control):
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
         pack.write_drive(np.asarray(params.kp), np.asarray(damping), np.asarray(limit))
 
-    def begin(
-        self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None
-    ) -> None:
+    def begin(self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None) -> None:
         """Take a tick's commands, and give them to the drives."""
         super().begin(pack, substeps, setpoint, setpoint_rate)
         pack.write_drive_target(setpoint, np.zeros_like(setpoint) if setpoint_rate is None else setpoint_rate)
 
-    def effort(
-        self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
-    ) -> Float64 | None:
+    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Leave the effort to the drive; its target moves where there is an integral."""
         if self._integrates:
             self.state, target = bp.drive_target(
@@ -190,9 +178,7 @@ class EffortControl(Control):
 
     reads_qpos_each_step = False
 
-    def effort(
-        self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool
-    ) -> Float64 | None:
+    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Add and saturate."""
         low, high = self.params.effort_min, self.params.effort_max
         total = self._setpoint if feedforward is None else self._setpoint + feedforward
@@ -206,9 +192,7 @@ class EffortControl(Control):
 CONTROLS = ("pid", "drive", "effort")
 
 
-def make_control(
-    name: str, scene: SceneSpec, params: bp.PIDParams, size: int, measurement_rate: bool
-) -> Control:
+def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, size: int, measurement_rate: bool) -> Control:
     """Build the control of that name for ``size`` envs, with ``params`` of one row or ``size``."""
     inertia = params.gain_units is not None
     kinds = {

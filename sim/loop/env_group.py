@@ -57,13 +57,9 @@ class EnvGroup:
         if self._control.state is not None:
             # The new params may need more of a state than the old ones, or less.
             both = zip(bp.init(params, self._qpos), self._control.state, strict=True)
-            self._control.state = bp.PIDState(
-                *(new if new is None or old is None else old for new, old in both)
-            )
+            self._control.state = bp.PIDState(*(new if new is None or old is None else old for new, old in both))
 
-    def reset(
-        self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], steps: int
-    ) -> None:
+    def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state; ``steps`` sim steps have been made."""
         watch = self._watch
         bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
@@ -114,9 +110,7 @@ class EnvGroup:
             content=pack.read_content(),
             isolated=pack.isolated.copy(),
             saturated=self._control.saturated,
-            controller={
-                name: leaf for name, leaf in self._control.state._asdict().items() if leaf is not None
-            },
+            controller={name: leaf for name, leaf in self._control.state._asdict().items() if leaf is not None},
             containment=self._watch.read(),
         )
 
@@ -150,15 +144,11 @@ class EnvGroup:
         source = ~np.isfinite(self.pack.qf) & bad.any(1, keepdims=True)
         watch.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
         if watch.speed_limit is not None:
-            watch.fail(
-                (np.abs(qvel) > watch.speed_limit) & ~bad.any(1, keepdims=True), "speed", step, self._qpos
-            )
+            watch.fail((np.abs(qvel) > watch.speed_limit) & ~bad.any(1, keepdims=True), "speed", step, self._qpos)
         self._qpos = np.where(bad, self._qpos, qpos)
         self._put_back()
 
-    def _admit(
-        self, command: tuple[NDArray[np.float64] | None, ...]
-    ) -> tuple[NDArray[np.float64] | None, ...]:
+    def _admit(self, command: tuple[NDArray[np.float64] | None, ...]) -> tuple[NDArray[np.float64] | None, ...]:
         """Stop the envs whose commands are not finite; the commands, harmless for all that are stopped."""
         watch = self._watch
         for cause, rows in zip(("setpoint", "setpoint_rate", "feedforward"), command, strict=True):

@@ -82,9 +82,7 @@ class EnvStates:
             raise InvalidArgumentError("snapshot", f"has {problem}", remedy="take a new one")
         for name, count in (("joint", dof), ("cause", len(CAUSES))):
             if not ((self.containment[name] >= 0) & (self.containment[name] < count)).all():
-                raise InvalidArgumentError(
-                    "snapshot", f"names a {name} beyond {count}", remedy="take a new one"
-                )
+                raise InvalidArgumentError("snapshot", f"names a {name} beyond {count}", remedy="take a new one")
         for env, size in enumerate(sizes):
             if size > self.content.shape[1] or not np.isnan(self.content[env, size:]).all():
                 raise InvalidArgumentError(
@@ -144,9 +142,7 @@ class Snapshot:
         beside = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             with beside.open("xb") as file:
-                tables: dict[str, Any] = (
-                    {"head": np.array(json.dumps(head))} | arrays | dict(_flatten(self.states))
-                )
+                tables: dict[str, Any] = {"head": np.array(json.dumps(head))} | arrays | dict(_flatten(self.states))
                 np.savez(file, **tables)
                 file.flush()
                 os.fsync(file.fileno())
@@ -175,9 +171,7 @@ class Snapshot:
             if not isinstance(about, dict) or not isinstance(steps, int) or not 0 <= steps < 2**62:
                 raise ValueError("it does not say what it is of")
             params = {
-                name.removeprefix("params."): tables.pop(name)
-                for name in list(tables)
-                if name.startswith("params.")
+                name.removeprefix("params."): tables.pop(name) for name in list(tables) if name.startswith("params.")
             }
             params |= {name: _marker(kind) for name, kind in head["markers"].items()}
             return cls(about, steps, bp.PIDParams(**params), _build(tables))

@@ -72,9 +72,7 @@ def draw_efforts(axes: Axes, traces: Traces, joint: int, mark: int | None) -> No
     share = traces.saturated[..., joint].mean(1)
     if share.any():
         strip = axes.inset_axes((0, 0.97, 1, 0.06))
-        strip.imshow(
-            share[None], aspect="auto", cmap=_saturation_colours(), vmin=0, vmax=1, interpolation="nearest"
-        )
+        strip.imshow(share[None], aspect="auto", cmap=_saturation_colours(), vmin=0, vmax=1, interpolation="nearest")
         strip.set_axis_off()
     peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
     if math.isfinite(limit):

@@ -91,9 +91,7 @@ def efforts(
     return figure
 
 
-def comparison(
-    first: Traces, second: Traces, *, joints: Sequence[int | str] | None = None, title: str = ""
-) -> Figure:
+def comparison(first: Traces, second: Traces, *, joints: Sequence[int | str] | None = None, title: str = "") -> Figure:
     """Two runs of the same joints: median and 10 to 90 % of the envs, positions above efforts.
 
     Raises
@@ -127,10 +125,7 @@ def comparison(
     _legend(
         figure,
         [
-            *(
-                Line2D([], [], color=colour, lw=1.6, label=f"{label}: median, 10 to 90 %")
-                for _, colour, label in runs
-            ),
+            *(Line2D([], [], color=colour, lw=1.6, label=f"{label}: median, 10 to 90 %") for _, colour, label in runs),
             Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint"),
             Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits"),
         ],
@@ -156,9 +151,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     # A palette of 256 colours cannot be told from the original, and takes a third of the bytes.
-    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        path, optimize=True, dpi=(dpi, dpi)
-    )
+    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True, dpi=(dpi, dpi))
     return path
 
 
@@ -218,9 +211,7 @@ def _name(axes: Axes, traces: Traces, joint: int) -> None:
 def _legend(figure: Figure, handles: list[Any]) -> None:
     # As many side by side as the figure is wide enough for: an entry of n letters takes about n + 8 of them.
     letters = figure.get_figwidth() * 17
-    columns = max(
-        1, min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles))))
-    )
+    columns = max(1, min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles)))))
     if sum(len(handle.get_label()) + 8 for handle in handles) < letters:
         columns = len(handles)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False)

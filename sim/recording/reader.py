@@ -77,9 +77,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording
         try:
             file = h5py.File(path, "r")
         except OSError:
-            file = h5py.File(
-                path, "r", swmr=True, libver="latest"
-            )  # someone writes it, or was killed while doing so
+            file = h5py.File(path, "r", swmr=True, libver="latest")  # someone writes it, or was killed while doing so
         with file:
             attributes = dict(file.attrs)
             if attributes.get("format") != FORMAT:

@@ -177,9 +177,7 @@ class Recorder:
             for name, value in _attributes(runner, seed).items():
                 file.attrs[name] = value
             datasets = {
-                "time": file.create_dataset(
-                    "time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan
-                )
+                "time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan)
             }
             for name, dtype in FIELDS.items():
                 table = shape[:1] if name == "ok" else shape
@@ -280,14 +278,10 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path
         It is the name of a file, or ends otherwise than in .h5 or .hdf5.
     """
     if not isinstance(path, str | os.PathLike):
-        raise InvalidArgumentError(
-            "path", "must be a path", value=path, remedy="pass a file name ending in .h5"
-        )
+        raise InvalidArgumentError("path", "must be a path", value=path, remedy="pass a file name ending in .h5")
     path = Path(path)
     if path.suffix not in (".h5", ".hdf5"):
-        raise InvalidArgumentError(
-            "path", "unknown file format", value=str(path), remedy="end it in .h5 or .hdf5"
-        )
+        raise InvalidArgumentError("path", "unknown file format", value=str(path), remedy="end it in .h5 or .hdf5")
     if path.exists() and not overwrite:
         raise InvalidArgumentError(
             "path", "exists already", value=str(path), remedy="choose another name, or pass overwrite=True"

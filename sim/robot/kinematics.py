@@ -65,9 +65,7 @@ class Kinematics:
     def index(self, link: str) -> int:
         """Return the place of a link in every pose."""
         if link not in self.links:
-            raise InvalidArgumentError(
-                "link", "is unknown", value=link, remedy=f"use one of {', '.join(self.links)}"
-            )
+            raise InvalidArgumentError("link", "is unknown", value=link, remedy=f"use one of {', '.join(self.links)}")
         return self.links.index(link)
 
     @property
@@ -137,6 +135,4 @@ def _frame(element: etree._Element) -> tuple[Float64, Float64, Float64]:
 
 def numbers(element: etree._Element | None, key: str, default: str) -> Float64:
     """Return an attribute's numbers, separated by spaces."""
-    return np.array(
-        [float(word) for word in (default if element is None else element.get(key, default)).split()]
-    )
+    return np.array([float(word) for word in (default if element is None else element.get(key, default)).split()])

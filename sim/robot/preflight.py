@@ -67,11 +67,7 @@ def check(
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names
-    start = (
-        robot.start
-        if qpos is None
-        else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
-    )
+    start = robot.start if qpos is None else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
     findings = [*_links(robot), *_joints(robot), *_base(robot), *_poses(robot, "start pose", start)]
     if setpoint is not None:
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
@@ -102,9 +98,7 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
         elif rigid:
             effect = "SAPIEN makes it a link of 1e-6 kg, which costs time in every step"
         else:
-            effect = (
-                "SAPIEN makes it a link of 1e-6 kg: the joint that moves it is all but impossible to control"
-            )
+            effect = "SAPIEN makes it a link of 1e-6 kg: the joint that moves it is all but impossible to control"
         yield Finding(
             "note" if rigid else "warning",
             "no-inertia",

@@ -82,9 +82,7 @@ class Robot(RobotDescription):
         urdf = read_urdf(path, package_dirs=tuple(map(Path, package_dirs)), missing_meshes=missing_meshes)
         joints = tuple(joint for joint in urdf.joints if joint.moves)
         if not joints:
-            raise RobotError(
-                f"{path}: a robot without moving joints has nothing to control; check the joint types"
-            )
+            raise RobotError(f"{path}: a robot without moving joints has nothing to control; check the joint types")
         srdf = path.with_suffix(".srdf")
         bundled = path.parent == _ASSETS
         return cls(

@@ -38,7 +38,5 @@ def about(axis: NDArray[Any], angle: NDArray[Any]) -> NDArray[Any]:
 
 def from_rpy(rpy: ArrayLike) -> NDArray[np.float64]:
     """Return the rotation of a URDF's ``rpy`` [rad]: about the fixed x, then y, then z."""
-    roll, pitch, yaw = (
-        about(axis, angle) for axis, angle in zip(np.eye(3), np.asarray(rpy, float), strict=True)
-    )
+    roll, pitch, yaw = (about(axis, angle) for axis, angle in zip(np.eye(3), np.asarray(rpy, float), strict=True))
     return multiply(yaw, multiply(pitch, roll))

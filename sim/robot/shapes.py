@@ -204,7 +204,5 @@ def sphere(radius: float, deviation: float = DEVIATION) -> tuple[Vertices, Faces
     a, b = ring * segments + column, ring * segments + following
     c, d = a + segments, b + segments
     # At a pole one of the two triangles of a quad has no area.
-    faces = np.concatenate(
-        [np.stack([a, c, d], -1)[:-1].reshape(-1, 3), np.stack([a, d, b], -1)[1:].reshape(-1, 3)]
-    )
+    faces = np.concatenate([np.stack([a, c, d], -1)[:-1].reshape(-1, 3), np.stack([a, d, b], -1)[1:].reshape(-1, 3)])
     return vertices, faces

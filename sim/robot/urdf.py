@@ -127,9 +127,7 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     """
     root = parse_xml(path)
     if root.tag != "robot":
-        raise RobotError(
-            f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?"
-        )
+        raise RobotError(f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?")
     for element in list(root.iter("visual")):
         element.getparent().remove(element)
     missing = _resolve_meshes(root, path, package_dirs)
@@ -221,9 +219,7 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     if dynamics is not None:
         passive = {key: number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
         if any(not 0 <= value < math.inf for value in passive.values()):
-            raise RobotError(
-                f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF"
-            )
+            raise RobotError(f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF")
     return Joint(
         name=name,
         type=kind,
@@ -306,9 +302,7 @@ def _read_link(element: etree._Element, path: Path) -> Link:
     for shape in element.iterfind("collision/geometry/*"):
         for key, count in _SIZES.get(shape.tag, {}).items():
             if min(numbers(shape, key, count, where)) <= 0:
-                raise RobotError(
-                    f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF"
-                )
+                raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF")
     return Link(name, value, len(element.findall("collision")), inertial)
 
 
@@ -325,24 +319,18 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterat
     for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
-            raise RobotError(
-                f"{path}: {kind} name used twice: {', '.join(sorted(twice))}; names must be unique"
-            )
+            raise RobotError(f"{path}: {kind} name used twice: {', '.join(sorted(twice))}; names must be unique")
     known = {link.name for link in links}
     for joint in joints:
         for link in (joint.parent_link, joint.child_link):
             if link not in known:
-                raise RobotError(
-                    f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link"
-                )
+                raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
     children = [joint.child_link for joint in joints]
     if twice := {name for name in children if children.count(name) > 1}:
         raise RobotError(f"{path}: link with two parents: {', '.join(sorted(twice))}; a robot must be a tree")
     roots = [link.name for link in links if link.name not in set(children)]
     if len(roots) != 1:
-        raise RobotError(
-            f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree"
-        )
+        raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
     seen = 0
     level = [roots[0]]
     while level:
@@ -351,6 +339,4 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterat
         yield from found
         level = [joint.child_link for joint in found]
     if seen != len(joints):
-        raise RobotError(
-            f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree"
-        )
+        raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")

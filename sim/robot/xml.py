@@ -26,15 +26,11 @@ def parse_xml(path: Path) -> etree._Element:
     try:
         tree = etree.parse(str(path), parser)
     except etree.XMLSyntaxError as error:
-        raise RobotError(
-            f"{path}: not well-formed XML: {error.msg}; correct the file at that line"
-        ) from error
+        raise RobotError(f"{path}: not well-formed XML: {error.msg}; correct the file at that line") from error
     except OSError as error:
         raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
     if tree.docinfo.internalDTD is not None:
-        raise RobotError(
-            f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines"
-        )
+        raise RobotError(f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines")
     return tree.getroot()
 
 
@@ -46,9 +42,7 @@ def number(element: etree._Element, key: str, default: float, where: str) -> flo
     try:
         return float(text)
     except ValueError:
-        raise RobotError(
-            f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF"
-        ) from None
+        raise RobotError(f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF") from None
 
 
 def numbers(element: etree._Element, key: str, count: int, where: str) -> list[float]:

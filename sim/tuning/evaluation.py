@@ -136,9 +136,7 @@ def evaluate_gains(
         moves=moves,
         rollout=rollout,
         metrics=metrics,
-        chatter=_chatter(robot, moves, metrics, shortest)
-        if judge_chatter
-        else np.full(moves.start.shape, np.nan),
+        chatter=_chatter(robot, moves, metrics, shortest) if judge_chatter else np.full(moves.start.shape, np.nan),
         allowed=np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest),
     )
 
@@ -148,9 +146,7 @@ def _chatter(robot: Robot, moves: Moves, metrics: StepMetrics, shortest: Float64
 
     A smooth effort of less than a thousandth of the joint's limit counts as that.
     """
-    settled = np.where(
-        np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0
-    ).max(1)
+    settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
     floor = 1e-3 * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 1.0)
     result = np.empty_like(moves.start)
     for row, (start, target) in enumerate(zip(moves.start, moves.target, strict=True)):

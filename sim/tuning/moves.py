@@ -129,9 +129,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
             f"{robot.name!r} touches itself or the ground on nearly every move: {len(starts)} of {count} were free",
             remedy="give the moves yourself, or correct the collision shapes (batchpid inspect shows them)",
         )
-    return Moves(
-        np.array(starts).reshape(-1, robot.dof), np.array(targets).reshape(-1, robot.dof), tuple(names)
-    )
+    return Moves(np.array(starts).reshape(-1, robot.dof), np.array(targets).reshape(-1, robot.dof), tuple(names))
 
 
 def fastest(robot: Robot, moves: Moves) -> Float64:
@@ -141,16 +139,11 @@ def fastest(robot: Robot, moves: Moves) -> Float64:
     z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
     rate, acceleration = np.where(early, 4 * t, 4 * (1 - t)), np.where(early, 4.0, -4.0)
     return np.array(
-        [
-            _duration(robot, *move, z, rate, acceleration)
-            for move in zip(moves.start, moves.target, strict=True)
-        ]
+        [_duration(robot, *move, z, rate, acceleration) for move in zip(moves.start, moves.target, strict=True)]
     )
 
 
-def smooth_effort(
-    robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200
-) -> Float64:
+def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200) -> Float64:
     """Efforts (samples, dof) of the minimum-jerk motion from ``start`` to ``target`` (dof,) in ``duration`` [s].
 
     T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
@@ -173,9 +166,7 @@ def _with_mimics(robot: Robot, qpos: Float64) -> Float64:
     return coupled
 
 
-def _duration(
-    robot: Robot, start: Float64, target: Float64, z: Float64, rate: Float64, acceleration: Float64
-) -> float:
+def _duration(robot: Robot, start: Float64, target: Float64, z: Float64, rate: Float64, acceleration: Float64) -> float:
     probe, step = robot.dynamics(), target - start
     qpos = start + z[:, None] * step
     still = np.zeros_like(qpos)

@@ -374,9 +374,7 @@ def _read_history(path: Path | str | None, settings: dict[str, Any]) -> Sequence
     return told
 
 
-def _write_history(
-    path: Path | str | None, settings: dict[str, Any], costs: Sequence[Sequence[float]]
-) -> None:
+def _write_history(path: Path | str | None, settings: dict[str, Any], costs: Sequence[Sequence[float]]) -> None:
     if path is None:
         return
     target = Path(path)

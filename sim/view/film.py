@@ -103,9 +103,7 @@ def film(
     """
     path = Path(out)
     if path.suffix not in FORMATS:
-        raise InvalidArgumentError(
-            "out", "unknown format", value=str(path), remedy=f"end it in {' or '.join(FORMATS)}"
-        )
+        raise InvalidArgumentError("out", "unknown format", value=str(path), remedy=f"end it in {' or '.join(FORMATS)}")
     rate = number("fps", fps, 1.0, 120.0, "frames a second")
     size = tuple(integer(name, value, 16, 8192) for name, value in (("width", width), ("height", height)))
     integer("num_envs", rollout.qpos.shape[1], 1, MOST)
@@ -145,9 +143,7 @@ def window(rollout: Rollout, robot: Robot, *, seconds: float | None = None) -> N
     try:
         viewer = Viewer()
     except RuntimeError as error:
-        raise RenderError(
-            f"SAPIEN cannot open a window ({error}); set DISPLAY, or use batchpid view"
-        ) from error
+        raise RenderError(f"SAPIEN cannot open a window ({error}); set DISPLAY, or use batchpid view") from error
     viewer.set_scene(show.scene)
     viewer.set_camera_pose(_looking(show.stage))
     viewer.window.set_camera_parameters(near=0.05, far=100.0, fovy=FIELD_OF_VIEW)

@@ -38,13 +38,9 @@ class Panel:
             self._place = gui.add_slider("Time [s]", 0.0, source.duration, source.period, 0.0)
             self._on(self._place, source.seek)
         with gui.add_folder("Watch"):
-            self._robot = gui.add_slider(
-                "Robot", min=0, max=max(1, source.per_group - 1), step=1, initial_value=0
-            )
+            self._robot = gui.add_slider("Robot", min=0, max=max(1, source.per_group - 1), step=1, initial_value=0)
             self._robot.disabled = source.per_group == 1
-            self._joint = gui.add_dropdown(
-                "Joint", self._names, initial_value=self._names[_first_moving(source.robot)]
-            )
+            self._joint = gui.add_dropdown("Joint", self._names, initial_value=self._names[_first_moving(source.robot)])
             self._ghost = gui.add_checkbox("Show its setpoint", True)
         if isinstance(source, Live):
             self._live(source)
@@ -212,9 +208,7 @@ class Panel:
         weight = gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0)
         force = gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0)
         push = gui.add_button_group("Push along", ("+x", "-x", "+y", "-y", "up", "down"))
-        directions = dict(
-            zip(("+x", "-x", "+y", "-y", "up", "down"), np.repeat(np.eye(3), 2, axis=0), strict=True)
-        )
+        directions = dict(zip(("+x", "-x", "+y", "-y", "up", "down"), np.repeat(np.eye(3), 2, axis=0), strict=True))
         for name in ("-x", "-y", "down"):
             directions[name] = -directions[name]
 

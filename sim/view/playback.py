@@ -13,9 +13,7 @@ from sim.view.data import Frame, Traces
 class Playback:
     """``rollout`` of ``robot``, from its first row to its last and then again."""
 
-    def __init__(
-        self, robot: Robot, rollout: Rollout, label: str = "recorded", period: float = 1 / 30
-    ) -> None:
+    def __init__(self, robot: Robot, rollout: Rollout, label: str = "recorded", period: float = 1 / 30) -> None:
         if rollout.qpos.shape[2] != robot.dof:
             raise InvalidArgumentError(
                 "rollout",

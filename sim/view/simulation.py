@@ -238,20 +238,15 @@ class Live:
         if not force.any():
             return np.zeros(self._frame.qpos.shape)
         poses = self.kinematics.poses(self._frame.qpos)
-        return np.where(
-            self._frame.ok[:, None], self.kinematics.efforts_of_force(poses, self.load_link, force), 0.0
-        )
+        return np.where(self._frame.ok[:, None], self.kinematics.efforts_of_force(poses, self.load_link, force), 0.0)
 
     def _observe(self, disturbance: Float64) -> Frame:
         seen = [runner.observe() for runner in self._runners]
         qpos, effort, saturated, ok = (
-            np.concatenate([getattr(obs, name) for obs in seen])
-            for name in ("qpos", "effort", "saturated", "ok")
+            np.concatenate([getattr(obs, name) for obs in seen]) for name in ("qpos", "effort", "saturated", "ok")
         )
         if not ok.all():  # one that diverged stays where it was last seen
-            before = (
-                self._frame.qpos if hasattr(self, "_frame") else np.tile(self.start, (len(self.groups), 1))
-            )
+            before = self._frame.qpos if hasattr(self, "_frame") else np.tile(self.start, (len(self.groups), 1))
             qpos = np.where(ok[:, None], qpos, before).astype(np.float32)
         return Frame(
             time=self.time,
@@ -274,9 +269,7 @@ class Live:
             unset = {"setpoint_weight": 1.0}
             return {
                 "given": {
-                    gain: np.broadcast_to(rows.get(gain, unset.get(gain, 0.0)), (1, robot.dof))[0].astype(
-                        float
-                    )
+                    gain: np.broadcast_to(rows.get(gain, unset.get(gain, 0.0)), (1, robot.dof))[0].astype(float)
                     for gain in GAINS
                 }
             }

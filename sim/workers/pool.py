@@ -252,9 +252,7 @@ class WorkerPool:
         if not slot.queue and slot.losses:
             self.recoveries += 1
             if slot.cause:
-                self._warning = (
-                    f"{slot.cause}; brought back in {time.monotonic() - slot.lost:.1f} s by replay"
-                )
+                self._warning = f"{slot.cause}; brought back in {time.monotonic() - slot.lost:.1f} s by replay"
             slot.losses = 0
 
     def _look(self, slot: _Slot) -> None:
@@ -309,9 +307,7 @@ class WorkerPool:
 
     def _dismiss(self, slot: _Slot, patience: float) -> None:
         if isinstance(slot.worker, ProcessWorker):
-            with contextlib.suppress(
-                KeyError, ValueError
-            ):  # closed already, when there could be no other after it
+            with contextlib.suppress(KeyError, ValueError):  # closed already, when there could be no other after it
                 self._poller.unregister(slot.worker.fileno())
         slot.worker.close(patience)
 

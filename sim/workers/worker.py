@@ -166,9 +166,7 @@ class ProcessWorker:
             state = "stopped" if pulse.stopped else "asleep"
             raise self._lost(f"is stuck: {state} for {pulse.idle:.1f} s amid a request")
         if pulse.spent > limit:
-            raise self._lost(
-                f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short"
-            )
+            raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 
     def close(self, patience: float = 5.0) -> None:
         """End the process: ask, and kill it after ``patience`` seconds."""

@@ -35,9 +35,7 @@ LOWER = {
 }
 UPPER = {
     "panda": [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973, 0.04, 0.04],
-    "jaco2": [2 * PI, PI * 313 / 180, 2 * PI, PI * 330 / 180, 2 * PI, PI * 295 / 180, 2 * PI]
-    + [1.41] * 3
-    + [2] * 3,
+    "jaco2": [2 * PI, PI * 313 / 180, 2 * PI, PI * 330 / 180, 2 * PI, PI * 295 / 180, 2 * PI] + [1.41] * 3 + [2] * 3,
 }
 DAMPING = {"panda": [0.003] * 7 + [0.3] * 2, "jaco2": [0] * 13}
 MASS = {"panda": 17.451901, "jaco2": 5.55724}
@@ -154,9 +152,7 @@ def test_sapien_sees_every_joint_in_file_order(name: str, world: World) -> None:
 
 def test_sapien_orders_joints_breadth_first(tmp_path: Path) -> None:
     # The rule that assets/README.md states, on an uneven tree with a fixed joint, listed out of order.
-    inertial = (
-        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    )
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     links = "".join(f'<link name="{link}">{inertial}</link>' for link in "gfedcba")
     kinds = {
         "ef": "prismatic",

@@ -25,8 +25,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "filter": GAINS | {"derivative_filter_time": [0.0, 0.02, 0.005]},
     "setpoint weight": GAINS | {"setpoint_weight": [0.0, 0.7, 1.0]},
     "weight from start": GAINS | {"setpoint_weight": 0.4, "weight_origin": "start"},
-    "derivative weight": GAINS
-    | {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "derivative_filter_time": 0.02},
+    "derivative weight": GAINS | {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "derivative_filter_time": 0.02},
     "kick": GAINS | {"setpoint_weight_derivative": 1.0, "first_derivative": "kick"},
     "deadband": GAINS | {"deadband": [0.0, 0.3, 1.0]},
     "clamp": LIMITED | {"anti_windup": "clamp"},

@@ -63,9 +63,7 @@ def test_blocks_have_the_law_s_gradients(inputs):
 
 def test_a_large_batch_goes_in_blocks(monkeypatch, inputs):
     """Through reset, track and a change of params, where the state that is written over must not be in use."""
-    params = bp.make_params(
-        JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32
-    )
+    params = bp.make_params(JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32)
     pids = []
     for large in (10**9, ENVS):
         monkeypatch.setattr(backends, "LARGE", large)

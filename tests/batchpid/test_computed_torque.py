@@ -20,9 +20,7 @@ def mass(rng, envs, joints):
 
 
 def params(joints, **options):
-    return bp.make_params(
-        joints, 100.0, 50.0, 20.0, anti_windup="conditional", gain_units="mass_matrix", **options
-    )
+    return bp.make_params(joints, 100.0, 50.0, 20.0, anti_windup="conditional", gain_units="mass_matrix", **options)
 
 
 @settings(deadline=None, max_examples=60)

@@ -25,9 +25,7 @@ def test_calls_are_the_law(kind, options, inputs):
     pid = bp.BatchPID(params, ENVS, DT, kind, terms=True)
     state = bp.init(params, inputs.measurement[0])
     for t in range(10):
-        r, y, v, ff = (
-            x[t] for x in (inputs.setpoint, inputs.measurement, inputs.measurement_rate, inputs.feedforward)
-        )
+        r, y, v, ff = (x[t] for x in (inputs.setpoint, inputs.measurement, inputs.measurement_rate, inputs.feedforward))
         state, expected = bp.step(params, state, r, y, DT, measurement_rate=v, feedforward=ff)
         effort = pid(r, y, v, feedforward=ff)
         np.testing.assert_allclose(effort, expected, rtol=1e-9, atol=1e-9)
@@ -152,7 +150,4 @@ def test_jax_is_named_where_it_is_missing(monkeypatch):
 
 def test_import_is_light():
     code = "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} & set(sys.modules)))"
-    assert (
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-        == "[]\n"
-    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

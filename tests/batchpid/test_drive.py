@@ -14,9 +14,7 @@ def test_the_drive_gives_the_law_s_effort(inputs):
         r, y, v = inputs.setpoint[t], inputs.measurement[t], inputs.measurement_rate[t]
         state, target = bp.drive_target(params, state, r, y, DT, measurement_rate=v)
         other, effort = bp.step(params, other, r, y, DT, measurement_rate=v)
-        np.testing.assert_allclose(
-            np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12
-        )
+        np.testing.assert_allclose(np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12)
 
 
 def test_no_stiffness_moves_no_target():

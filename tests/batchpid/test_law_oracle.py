@@ -83,9 +83,7 @@ def test_terms_add_up(options, inputs):
             aux=True,
         )
         assert np.array_equal(terms.feedforward, inputs.feedforward[t])
-        np.testing.assert_allclose(
-            terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12
-        )
+        np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)
         assert np.array_equal(terms.saturated, effort != terms.unsaturated)
         assert terms.finite.all()
 

@@ -21,9 +21,7 @@ def roll(params, r, y, ff=None, state=None):
     """Return the states and the terms of a run."""
     state, states, terms = bp.init(params, y[0]) if state is None else state, [], []
     for t in range(len(r)):
-        state, _, shown = bp.step(
-            params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], aux=True
-        )
+        state, _, shown = bp.step(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], aux=True)
         states.append(state)
         terms.append(shown)
     return states, terms
@@ -31,8 +29,7 @@ def roll(params, r, y, ff=None, state=None):
 
 def equal_bits(a, b):
     return all(
-        (x is None) == (y is None) and (x is None or x.tobytes() == y.tobytes())
-        for x, y in zip(a, b, strict=True)
+        (x is None) == (y is None) and (x is None or x.tobytes() == y.tobytes()) for x, y in zip(a, b, strict=True)
     )
 
 
@@ -90,9 +87,7 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
     shards = (slice(cut), slice(cut, None))
     parts = [bp.init(params.for_envs(rows), run[1][0][rows]) for rows in shards]
     for t in range(len(run[0])):
-        whole, effort = bp.advance(
-            bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t]
-        )
+        whole, effort = bp.advance(bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t])
         for n, rows in enumerate(shards):
             k = bp.discretise(params.for_envs(rows), DT, len(effort[rows]) if spread else None)
             inputs = [x[t][rows] for x in run]
@@ -180,9 +175,7 @@ def test_a_change_of_ki_is_bumpless(run, ki):
 
 
 @pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
-@pytest.mark.parametrize(
-    "weights", [{}, {"setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}], ids=str
-)
+@pytest.mark.parametrize("weights", [{}, {"setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}], ids=str)
 def test_a_turn_more_or_less_is_no_event(turns, weights):
     """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or D."""
     params = bp.make_params(1, 3.0, 2.0, 0.5, continuous=True, **weights)
@@ -268,9 +261,7 @@ def test_nothing_given_is_written_to_or_kept(case, run):
         for leaf in state:
             if leaf is not None:
                 leaf.setflags(write=False)
-        state, effort, terms = bp.step(
-            params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], aux=True
-        )
+        state, effort, terms = bp.step(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], aux=True)
         kept = effort.copy()
         effort += 1e6  # the caller's own, from here on
     assert np.array_equal(kept, expected.effort)

@@ -60,14 +60,10 @@ def test_every_transform(options, inputs, dtype):
         efforts.append(effort)
     assert len(traces) == 1
     assert jax.tree.structure(state) == structure
-    assert all(
-        leaf.shape == (ENVS, JOINTS) and leaf.dtype == dtype for leaf in (*jax.tree.leaves(state), effort)
-    )
+    assert all(leaf.shape == (ENVS, JOINTS) and leaf.dtype == dtype for leaf in (*jax.tree.leaves(state), effort))
 
     # scan, vmap over the gains, and grad with respect to every leaf; that of the gains is compared below
-    @functools.partial(
-        jax.jit, compiler_options={"xla_backend_optimization_level": 0}
-    )  # compiles in 2/3 of the time
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in 2/3 of the time
     def run(candidates):
         def total(candidates):
             efforts = jax.vmap(rollout, (0, None, None))(candidates, r, y)
@@ -105,10 +101,7 @@ def test_gradients_equal_finite_differences(options, inputs, x64):
         return jnp.sum(weights * rollout(params._replace(**gains), r, y))
 
     gradient, h = jax.jit(jax.grad(loss))(gains), 1e-4
-    shifts = {
-        name: jax.random.normal(jax.random.key(n), value.shape)
-        for n, (name, value) in enumerate(gains.items())
-    }
+    shifts = {name: jax.random.normal(jax.random.key(n), value.shape) for n, (name, value) in enumerate(gains.items())}
     loss = jax.jit(loss)
     for name, value in gains.items():
         up, down = (loss(gains | {name: value + s * h * shifts[name]}) for s in (1, -1))
@@ -121,9 +114,7 @@ def test_gradients_equal_finite_differences(options, inputs, x64):
 def test_gradients_survive_times_of_zero(zero, inputs, x64):
     times = {"derivative_filter_time": [0.0, 0.0, 0.1], "tracking_time": [0.0, 0.0, 0.1]}
     strategy = {"anti_windup": "back_calculation"} if zero == "tracking_time" else {}
-    params = on_jax(
-        bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy), np.float64
-    )
+    params = on_jax(bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy), np.float64)
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
     gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))

@@ -84,9 +84,7 @@ def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, di
             peer.reset()
             state = bp.reset(params, state, np.full((1, 1), y), np.array([True]))
         expected = peer(y, dt=steps[t])
-        state, effort, terms = bp.step(
-            params, state, np.full((1, 1), r), np.full((1, 1), y), steps[t], aux=True
-        )
+        state, effort, terms = bp.step(params, state, np.full((1, 1), r), np.full((1, 1), y), steps[t], aux=True)
         close(effort.item(), expected)
         close([terms.p.item(), terms.i.item(), terms.d.item()], peer.components)
 
@@ -105,9 +103,7 @@ def test_simple_pid_maps_the_errors_of_angles_as_ours_wraps_them(path, kp, ki):
 
 def test_simple_pid_goes_from_manual_to_automatic_as_ours():
     """Its way, an integral of the last output, is a state of ours; track is the bumpless one."""
-    peer = simple_pid.PID(
-        2.0, 1.0, 0.0, setpoint=1.0, sample_time=None, output_limits=(-3, 3), auto_mode=False
-    )
+    peer = simple_pid.PID(2.0, 1.0, 0.0, setpoint=1.0, sample_time=None, output_limits=(-3, 3), auto_mode=False)
     peer.set_auto_mode(True, last_output=2.5)
     params = presets.simple_pid(1, 2.0, 1.0, 0.0, output_limits=(-3, 3))
     y = np.full((1, 1), 0.2)
@@ -146,11 +142,7 @@ class ControlToolbox:
         command = min(max(unsaturated, self.u_min), self.u_max)
         if self.antiwindup == "back_calculation":
             self.integral += dt * (self.i * error + (command - unsaturated) / self.tracking_time)
-        elif not (
-            self.antiwindup == "conditional_integration"
-            and command != unsaturated
-            and error * unsaturated > 0
-        ):
+        elif not (self.antiwindup == "conditional_integration" and command != unsaturated and error * unsaturated > 0):
             self.integral += dt * self.i * error
         self.integral = min(max(self.integral, self.i_min), self.i_max)
         self.last_error = error
@@ -203,9 +195,7 @@ def test_the_integral_does_not_wind_up_behind_its_clamp():
 
 def test_the_tracking_time_is_what_was_given_and_its_default_the_rule():
     """(control_toolbox #511)"""
-    given = bp.make_params(
-        1, 4.0, 1.0, 9.0, effort_limit=1, anti_windup="back_calculation", tracking_time=0.7
-    )
+    given = bp.make_params(1, 4.0, 1.0, 9.0, effort_limit=1, anti_windup="back_calculation", tracking_time=0.7)
     ruled = given.replace(anti_windup="back_calculation")
     without_d = bp.make_params(1, 4.0, 2.0, effort_limit=1, anti_windup="back_calculation")
     assert [p.tracking_time.item() for p in (given, ruled, without_d)] == pytest.approx([0.7, 3.0, 2.0])

@@ -17,10 +17,7 @@ NAMES = ["shoulder", "elbow", "no"]  # "no" is a bool to careless YAML
 def same(a, b):
     return all(
         (x is y is None)
-        or (
-            type(x) is type(y)
-            and (not isinstance(x, np.ndarray) or (x.dtype == y.dtype and np.array_equal(x, y)))
-        )
+        or (type(x) is type(y) and (not isinstance(x, np.ndarray) or (x.dtype == y.dtype and np.array_equal(x, y))))
         for x, y in zip(a, b, strict=True)
     )
 

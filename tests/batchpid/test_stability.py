@@ -49,9 +49,7 @@ def test_ratio_is_where_the_exact_loop_turns_unstable(seed, joints, filter_time,
 
 
 @settings(deadline=None, max_examples=20)
-@given(
-    seed=st.integers(0, 2**31), factor=st.sampled_from([0.8, 1.5]), filter_time=st.sampled_from([0.0, 2e-3])
-)
+@given(seed=st.integers(0, 2**31), factor=st.sampled_from([0.8, 1.5]), filter_time=st.sampled_from([0.0, 2e-3]))
 def test_the_law_itself_holds_and_diverges_where_the_bound_says(seed, factor, filter_time):
     rng = np.random.default_rng(seed)
     joints = 4

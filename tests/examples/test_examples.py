@@ -77,11 +77,7 @@ def test_a_profile_is_easier_to_follow_than_a_step(run):
 def test_the_integral_removes_what_an_uncompensated_drive_keeps(run, tmp_path):
     out = tmp_path / "errors.png"
     text = run("steady_state.py", "--seconds", "3", "--out", str(out))
-    errors = {
-        row[:32].strip(): [float(e) for e in row[32:].split()]
-        for row in text.splitlines()
-        if "compensat" in row
-    }
+    errors = {row[:32].strip(): [float(e) for e in row[32:].split()] for row in text.splitlines() if "compensat" in row}
     assert max(errors["drive (20, 5), no compensation"]) > 0.3
     assert max(errors["PID, no compensation"]) < 2e-3
     assert max(errors["PID, compensated"]) < 1e-3

@@ -275,9 +275,7 @@ METHODS = {
 
 def attempt(data: Any, call: Callable[..., Any], good: dict[str, Any]) -> tuple[Any, dict[str, Any], bool]:
     """Call with some arguments replaced by something nasty: the result, what was replaced, and whether it worked."""
-    names = data.draw(
-        st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=2, unique=True), label="replaced"
-    )
+    names = data.draw(st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=2, unique=True), label="replaced")
     bad = {}
     for name in names:
         value = data.draw(nasty, label=name)

@@ -30,9 +30,7 @@ def test_the_vector_env_is_gymnasiums_own_vector_of_single_envs(mode, actions):
     """Same observations, rewards, flags and infos, through time limits, success and resets, to the last bit."""
     options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6}
     ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=7, **options)
-    theirs = SyncVectorEnv(
-        [lambda: gymnasium.make(ID, max_episode_steps=7, **options)] * 3, autoreset_mode=mode
-    )
+    theirs = SyncVectorEnv([lambda: gymnasium.make(ID, max_episode_steps=7, **options)] * 3, autoreset_mode=mode)
     assert ours.unwrapped.spec.id == "batchpid/Reach-v0"
     assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
     assert ours.observation_space == theirs.observation_space
@@ -69,9 +67,7 @@ def same(ours, theirs):
         )
 
     assert set(ours[-1]) == set(theirs[-1])
-    return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(
-        plain(theirs[-1])
-    )
+    return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(plain(theirs[-1]))
 
 
 def test_workers_change_nothing_and_seeds_everything():
@@ -93,9 +89,7 @@ def test_workers_change_nothing_and_seeds_everything():
 def test_a_setpoint_at_the_goal_earns_more_and_reaches_it():
     gains = {"kp": 600.0, "kd": 50.0, "ki": 0.0, "derivative_filter_time": 2e-3}
     probe = ReachVectorEnv(1, workers=0)
-    env = ReachVectorEnv(
-        4, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None
-    )
+    env = ReachVectorEnv(4, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None)
     obs, _ = env.reset(seed=0)
     goal = obs[:, 18:]
     action = 2 * (goal - env.low) / (env.high - env.low) - 1
@@ -160,9 +154,7 @@ def test_bad_input_is_named():
 def test_gymnasiums_vector_wrappers_go_on_top():
     from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-    env = RecordEpisodeStatistics(
-        NormalizeObservation(gymnasium.make_vec(ID, num_envs=2, max_episode_steps=3))
-    )
+    env = RecordEpisodeStatistics(NormalizeObservation(gymnasium.make_vec(ID, num_envs=2, max_episode_steps=3)))
     env.reset(seed=0)
     for _ in range(3):
         *_, info = env.step(env.action_space.sample())

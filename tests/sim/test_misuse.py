@@ -144,9 +144,7 @@ def test_in_a_forked_child(runner):
 
 def test_a_stopped_worker_does_not_hang_whoever_has_much_to_send():
     with Runner(ROBOT, 64, workers=1) as runner:
-        runner._workers[0]._channel._socket.setsockopt(
-            socket.SOL_SOCKET, socket.SO_SNDBUF, 1
-        )  # as much as nothing
+        runner._workers[0]._channel._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # as much as nothing
         os.kill(runner.pids[0], signal.SIGSTOP)
         with pytest.warns(UserWarning, match="stuck: stopped"):
             obs = runner.reset(qpos=np.tile(NEAR, (64, 1)))

@@ -25,9 +25,7 @@ def falling(robot, qpos, timestep, seconds):
 def test_equation_of_motion_converges_with_the_fourth_order(panda):
     qpos = panda.sample(2, seed=3)
     fine = falling(panda, qpos, 1 / 16000, 0.05).read_qpos()
-    coarse, finer = (
-        np.abs(falling(panda, qpos, h, 0.05).read_qpos() - fine).max() for h in (1 / 200, 1 / 400)
-    )
+    coarse, finer = (np.abs(falling(panda, qpos, h, 0.05).read_qpos() - fine).max() for h in (1 / 200, 1 / 400))
     assert 1e-12 < finer < coarse / 10  # 16 in the limit
 
 

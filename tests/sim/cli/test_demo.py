@@ -43,9 +43,7 @@ def test_demo_tells_where_it_leaves_the_tutorial(batchpid, tmp_path):
 
 
 def test_demo_is_the_same_for_a_seed(batchpid, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "sim.plots.figures.save", lambda _, path: path
-    )  # drawing takes longer than the robots
+    monkeypatch.setattr("sim.plots.figures.save", lambda _, path: path)  # drawing takes longer than the robots
 
     def table(*flags):
         args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--out", tmp_path / "x.png")

@@ -39,9 +39,7 @@ def test_tune_resumes_what_was_cut_short(batchpid, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(
-            "sim.tuning.evaluation.evaluate_gains", interrupt
-        )  # after the search, before the judging
+        patched.setattr("sim.tuning.evaluation.evaluate_gains", interrupt)  # after the search, before the judging
         status, _, complaint = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 130
     assert "interrupted" in complaint

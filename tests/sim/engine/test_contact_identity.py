@@ -176,9 +176,7 @@ def test_a_drive_goes_on_where_it_was():
 def test_payload_and_friction_stay():
     model = robot("jaco2")
     variation = draw_variation(model, N, seed=2)
-    runs = [
-        thrash(variation=variation, recover=False, pack_size=size, checkpoint_steps=None) for size in (1, 8)
-    ]
+    runs = [thrash(variation=variation, recover=False, pack_size=size, checkpoint_steps=None) for size in (1, 8)]
     assert runs[0][1] == runs[1][1] > 0
     same(runs[1][0], runs[0][0])
 

@@ -105,9 +105,7 @@ def test_no_link_outruns_its_reach(name):
 def test_a_system_of_its_own_is_like_the_shared_one(physics):
     """Solver, gravity and time step; and what is set on the robot: friction, damping, drive, qf, weightlessness."""
     robot = Robot.load("jaco2")
-    spec = SceneSpec(
-        robot.urdf, robot.srdf, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0)
-    )
+    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0))
     pack = Pack(parse(spec), spec, 4, system_size=4)
     pack.write_state(range(4), np.tile(robot.start, (4, 1)), np.full((4, robot.dof), 0.1))
     pack.write_drive(np.array(30.0), np.array(2.0), np.array(9.0))

@@ -31,9 +31,7 @@ def balls_on_the_arm(scene, env):
     for k in range(3):
         builder = scene.create_actor_builder()
         builder.add_sphere_collision(radius=0.05 + 0.01 * (env % 3))
-        builder.set_initial_pose(
-            sapien.Pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k])
-        )
+        builder.set_initial_pose(sapien.Pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k]))
         balls.append(builder.build())
     return balls
 
@@ -48,9 +46,7 @@ def run(build, num_envs=4, ticks=30, **options):
 def test_a_box_falls_and_a_reset_puts_it_back(workers):
     with Runner(ROBOT, 2, workers=workers, build=box_beside_the_robot) as runner:
         before = runner.poses()
-        np.testing.assert_allclose(
-            before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6
-        )
+        np.testing.assert_allclose(before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6)
         for _ in range(20):
             runner.step(ROBOT.start)
         after = runner.poses()

@@ -90,9 +90,7 @@ def test_setpoint_rate_damps_the_velocity_error(panda):
 def test_gains_change_in_flight_without_a_bump(panda):
     """With an integral that carries the load, a change of ki leaves the effort as it is."""
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
-    with Runner(
-        panda, 1, workers=1, compensate="none", substeps=20, params=panda.params(ki=800.0, **gains)
-    ) as runner:
+    with Runner(panda, 1, workers=1, compensate="none", substeps=20, params=panda.params(ki=800.0, **gains)) as runner:
         runner.reset(POSE)
         for _ in range(400):
             before = runner.step(POSE)

@@ -32,9 +32,7 @@ def put(runner, env, qpos=None, qvel=None):
         if group.envs.start <= env < group.envs.stop:
             row = env - group.envs.start
             state = group.pack.read_qpos(), group.pack.read_qvel()
-            changed = [
-                table[row] if new is None else new for table, new in zip(state, (qpos, qvel), strict=True)
-            ]
+            changed = [table[row] if new is None else new for table, new in zip(state, (qpos, qvel), strict=True)]
             group.pack.write_state([row], *(np.array([table], np.float32) for table in changed))
             group._qpos = group.pack.read_qpos()
 
@@ -52,9 +50,7 @@ BAD = [(what, bad, 0) for what in WHAT for bad in (np.nan, -np.inf)] + [("setpoi
 @pytest.fixture(scope="module")
 def undisturbed():
     with make() as runner:
-        return runner.rollout(
-            setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9))
-        )
+        return runner.rollout(setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9)))
 
 
 @pytest.mark.parametrize(("what", "bad", "workers"), BAD)
@@ -189,9 +185,7 @@ def test_by_default_it_raises_and_changes_nothing(what):
         runner.step(table[0])
         other.step(table[0])
         bad = {"setpoint": table[1], what: np.full((N, 9), np.nan)}
-        with pytest.raises(
-            InvalidArgumentError, match=rf"{what}, joint 'panda_joint1', env 0: is not finite"
-        ):
+        with pytest.raises(InvalidArgumentError, match=rf"{what}, joint 'panda_joint1', env 0: is not finite"):
             runner.step(**bad)
         for first, second in zip(runner.step(table[1]), other.step(table[1]), strict=True):
             np.testing.assert_array_equal(first, second)

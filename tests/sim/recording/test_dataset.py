@@ -35,9 +35,7 @@ def test_dimensions_units_and_names(panda):
 
 def test_a_file_opens_as_it_was_written(tmp_path):
     path = tmp_path / "run.npz"
-    assert (
-        main(["rollout", "--num-envs", "2", "--workers", "0", "--seconds", "0.05", "--out", str(path)]) == 0
-    )
+    assert main(["rollout", "--num-envs", "2", "--workers", "0", "--seconds", "0.05", "--out", str(path)]) == 0
     recorded = read_rollout(path)
     assert recorded.robot == "panda"
     assert recorded.rollout.qpos.shape[1:] == (2, 9)

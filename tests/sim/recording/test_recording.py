@@ -139,9 +139,7 @@ def test_one_recorder_at_a_time_and_none_of_a_closed_runner(tmp_path):
     with make() as runner:
         with Recorder(tmp_path / "a.h5", runner):
             runner.step(ROBOT.start)
-            with pytest.raises(
-                InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"
-            ):
+            with pytest.raises(InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"):
                 Recorder(tmp_path / "b.h5", runner)
             runner.step(ROBOT.start)
         with Recorder(tmp_path / "b.h5", runner):
@@ -293,9 +291,7 @@ def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
     end = time.monotonic() + seconds
     while time.monotonic() < end and lines[-1] != "pause\n":
         lines.append(process.stdout.readline())
-    while (
-        lines[-1] == "pause\n" and time.monotonic() < end and read_count(path + ".partial") < len(lines) - 1
-    ):
+    while lines[-1] == "pause\n" and time.monotonic() < end and read_count(path + ".partial") < len(lines) - 1:
         time.sleep(0.1)
     process.send_signal(number)
     lines += process.stdout.read().splitlines()

@@ -36,9 +36,7 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
             "'arm'",
         ),
         (
-            robot(
-                link("b"), link("a"), link("tip", ""), joint("h", "b", "a"), joint("f", "a", "tip", "fixed")
-            ),
+            robot(link("b"), link("a"), link("tip", ""), joint("h", "b", "a"), joint("f", "a", "tip", "fixed")),
             "no-inertia",
             "note",
             "link 'tip'.*costs time",
@@ -84,9 +82,7 @@ def test_a_sound_robot_has_none(tmp_path):
 def test_poses_beyond_limits():
     panda = Robot.load("panda")
     findings = panda.check(qpos=np.zeros(9), setpoint=np.ones(9))
-    assert [(f.code, f.joint) for f in findings if "start pose" in f.text] == [
-        ("out-of-limits", "panda_joint4")
-    ]
+    assert [(f.code, f.joint) for f in findings if "start pose" in f.text] == [("out-of-limits", "panda_joint4")]
     assert {f.joint for f in findings if "setpoint" in f.text} == {
         "panda_joint4",
         "panda_finger_joint1",
@@ -96,10 +92,7 @@ def test_poses_beyond_limits():
 
 def test_how_it_is_loaded(tmp_path):
     path = write(tmp_path, one_joint(LIMIT + '<dynamics friction="0.2"/>'))
-    assert (
-        "replaced by SAPIEN's default 0.05"
-        in codes(Robot.load(path, dissipation="sapien").check())["friction"].text
-    )
+    assert "replaced by SAPIEN's default 0.05" in codes(Robot.load(path, dissipation="sapien").check())["friction"].text
     assert "floating-base" in codes(Robot.load(path, fixed_base=False).check())
 
 

@@ -34,8 +34,6 @@ def test_bound_is_where_the_engine_turns_unstable(name, filter_time):
             runner.reset(poses)
             goal = poses + 1e-4 * rng.normal(size=poses.shape)
             rollout = runner.rollout(np.broadcast_to(goal, (600, *goal.shape)))
-        fastest[factor] = np.nanmax(
-            np.abs(np.where(rollout.ok[..., None], rollout.qvel, np.inf)), axis=(0, 2)
-        )
+        fastest[factor] = np.nanmax(np.abs(np.where(rollout.ok[..., None], rollout.qvel, np.inf)), axis=(0, 2))
     assert (fastest[0.8] < BLOWN / 5).all()
     assert (fastest[1.5] > BLOWN).all()

@@ -183,9 +183,7 @@ def test_a_mimic_is_kept_only_where_sapien_gets_it_right(multiplier, offset, wor
         )
     )
     assert ("<mimic" in hand.urdf) == works
-    assert {finding.code: finding.severity for finding in hand.check()}["mimic"] == (
-        "note" if works else "warning"
-    )
+    assert {finding.code: finding.severity for finding in hand.check()}["mimic"] == ("note" if works else "warning")
     with Runner(hand, 1, workers=0, params=hand.params(kp=20.0, kd=3.0), ground=False) as runner:
         for _ in range(100):
             qpos = runner.step([0.5, 0.0]).qpos[0]

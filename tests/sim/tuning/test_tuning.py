@@ -155,9 +155,7 @@ def test_a_payload_that_the_model_does_not_know_pulls_the_hand_down_and_the_inte
     hold = Moves(pose[None], pose[None], ("hold",))
     loaded = Variation(np.array([2.0]), np.zeros(1), "panda_hand")
     gains = bp.design_gains(panda, gain_units="mass_matrix")
-    evaluation = evaluate_gains(
-        panda, gains, hold, seconds=3.0, variation=loaded, workers=0, measurement_rate=True
-    )
+    evaluation = evaluate_gains(panda, gains, hold, seconds=3.0, variation=loaded, workers=0, measurement_rate=True)
     assert evaluation.metrics.peak_deviation[0, 1] > 3e-3
     assert evaluation.metrics.steady_state_error[0, :7].max() < 1e-3
 
@@ -167,9 +165,7 @@ def test_late_efforts_and_coarse_sensors(panda):
     hold = Moves(pose, pose + 0.01 * np.array([[1, 1, 1, -1, 1, 1, 1, 0, 0]]), ("small",))
     coarse = Variation(np.zeros(1), np.zeros(1), "panda_hand", resolution=1e-3, late=True)
     gains = bp.design_gains(panda, gain_units="mass_matrix")
-    evaluation = evaluate_gains(
-        panda, gains, hold, seconds=0.2, variation=coarse, workers=0, measurement_rate=True
-    )
+    evaluation = evaluate_gains(panda, gains, hold, seconds=0.2, variation=coarse, workers=0, measurement_rate=True)
     steps = evaluation.rollout.qpos / 1e-3
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-2)
 
@@ -177,8 +173,7 @@ def test_late_efforts_and_coarse_sensors(panda):
 def test_tuning_with_variation_is_another_search(panda):
     moves = random_moves(panda, 1, 0)
     plain, varied = (
-        tune(panda, moves=moves, variation=v, workers=0, **SMALL)
-        for v in (None, {"payload": 1.0, "friction": 0.01})
+        tune(panda, moves=moves, variation=v, workers=0, **SMALL) for v in (None, {"payload": 1.0, "friction": 0.01})
     )
     assert plain.history != varied.history
     assert varied.settings["variation"] == {"payload": 1.0, "friction": 0.01}
@@ -186,6 +181,4 @@ def test_tuning_with_variation_is_another_search(panda):
 
 def test_variation_must_fit_the_envs(panda):
     with pytest.raises(InvalidArgumentError, match="variation"):
-        evaluate_gains(
-            panda, panda.params(), random_moves(panda, 2), variation=draw_variation(panda, 3), workers=0
-        )
+        evaluate_gains(panda, panda.params(), random_moves(panda, 2), variation=draw_variation(panda, 3), workers=0)

@@ -27,9 +27,7 @@ class Fake:
             self.now += every
             self.cpu += every * share
             ticks = round(self.cpu * os.sysconf("SC_CLK_TCK"))
-            self._stat.write_text(
-                f"7 (a ) b) {state} 1 1 1 0 -1 0 0 0 0 0 {ticks // 2} {ticks - ticks // 2} 0 0"
-            )
+            self._stat.write_text(f"7 (a ) b) {state} 1 1 1 0 -1 0 0 0 0 0 {ticks // 2} {ticks - ticks // 2} 0 0")
             self.pulse.look(self.now)
 
 

@@ -153,9 +153,7 @@ def test_too_slow_for_the_timeout():
 def test_as_many_workers_as_cores_keep_to_one_each():
     cores = os.sched_getaffinity(0)
     with Runner(ROBOT, 8 * len(cores) + 8, workers=len(cores), recover=True) as runner:
-        assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {
-            frozenset([core]) for core in cores
-        }
+        assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {frozenset([core]) for core in cores}
         os.kill(runner.pids[0], signal.SIGKILL)
         with pytest.warns(RecoveryWarning):
             runner.step(ROBOT.start)
