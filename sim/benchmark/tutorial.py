@@ -1,7 +1,7 @@
 """SAPIEN's tutorial "Drive Robot with PID Controller", as it is written there: the oracle and the baseline.
 
-One robot in one scene, one Python object per joint, one call after another. Only what needs a display is left out. It
-speaks to SAPIEN directly, because that is what it is here to show; nothing of the product uses it.
+One robot in one scene, one Python object per joint, one call after another. Only what needs a display is left out. The
+objects are SAPIEN's own, with its default settings; the Runner uses none of this.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import sapien
 from numpy.typing import NDArray
 
 from batchpid.reference import SimplePID
+from sim.engine.building import bare_scene
 from sim.robot.robot import Robot
 
 
@@ -37,7 +37,7 @@ class TutorialLoop:
         settings = robot.settings
         if settings is None:
             raise ValueError("the tutorial's loop needs a bundled robot, which carries the tutorial's gains")
-        self.scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+        self.scene = bare_scene()
         self.scene.set_timestep(1 / settings.rate_hz)
         self.scene.add_ground(0, render=False)
         loader = self.scene.create_urdf_loader()
@@ -46,7 +46,6 @@ class TutorialLoop:
             path = Path(folder) / "robot.urdf"
             path.write_text(robot.urdf)
             self.robot: Any = loader.load(str(path))
-        self.robot.set_root_pose(sapien.Pose([0, 0, 0], [1, 0, 0, 0]))
         self._gains = list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
         self.target = target
         self.reset(settings.start if start is None else start)

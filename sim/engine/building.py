@@ -49,7 +49,7 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     RobotError
         SAPIEN's loader refuses the description, or numbers its joints in another order than ours.
     """
-    loader = bare_scene(physx.PhysxCpuSystem()).create_urdf_loader()
+    loader = bare_scene().create_urdf_loader()
     loader.fix_root_link = spec.fixed_base
     with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
         try:
@@ -98,10 +98,10 @@ def _in_memory(text: str | None) -> Iterator[str]:
         yield f"/proc/self/fd/{file.fileno()}"
 
 
-def bare_scene(system: Any) -> Any:
-    """Return a new scene of ``system`` that needs no render device."""
+def bare_scene(system: Any = None) -> Any:
+    """Return a new scene that needs no render device, of ``system`` or of a PhysX system under the present settings."""
     # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
-    return HeadlessScene([system])
+    return HeadlessScene([physx.PhysxCpuSystem() if system is None else system])
 
 
 @contextmanager
