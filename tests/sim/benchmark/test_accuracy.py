@@ -9,11 +9,6 @@ from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves,
 from sim.engine.physics import PHYSICS
 
 
-@pytest.fixture(scope="module")
-def panda():
-    return Robot.load("panda")
-
-
 def falling(robot, qpos, timestep, seconds):
     """The robot without effort, after ``seconds``."""
     plant = EquationOfMotion(robot.dynamics(), np.zeros(robot.dof), qpos, timestep)

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Robot, Runner
+from sim import Runner
 from sim.cli.follow import start_poses
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return Robot.load("panda")
 
 
 def saved(batchpid, path, *flags):
@@ -24,18 +19,18 @@ def saved(batchpid, path, *flags):
         return dict(file)
 
 
-def test_file_holds_the_runner_s_rollout(batchpid, tmp_path, robot):
+def test_file_holds_the_runner_s_rollout(batchpid, tmp_path, panda):
     file = saved(batchpid, tmp_path / "new" / "run.npz", "--workers", 2, "--seed", 7, "--substeps", 10)
-    start = start_poses(robot, 3, 0.3, 7)
-    with Runner(robot, 3, workers=0, substeps=10) as runner:
+    start = start_poses(panda, 3, 0.3, 7)
+    with Runner(panda, 3, workers=0, substeps=10) as runner:
         runner.reset(qpos=start)
-        expected = runner.rollout(np.broadcast_to(robot.settings.target, (10, robot.dof)))
+        expected = runner.rollout(np.broadcast_to(panda.settings.target, (10, panda.dof)))
     for name, value in expected._asdict().items():
         np.testing.assert_array_equal(file[name], value)
     np.testing.assert_array_equal(file["start"], start)
-    assert tuple(file["joint_names"]) == robot.joint_names
-    assert list(file["units"]) == [joint.unit for joint in robot.joints]
-    np.testing.assert_array_equal(file["effort_limit"], robot.effort_limit)
+    assert tuple(file["joint_names"]) == panda.joint_names
+    assert list(file["units"]) == [joint.unit for joint in panda.joints]
+    np.testing.assert_array_equal(file["effort_limit"], panda.effort_limit)
 
 
 @pytest.mark.parametrize(
@@ -57,22 +52,22 @@ def test_every_flag_changes_the_motion(flags, batchpid, tmp_path):
     assert np.abs(file["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
 
 
-def test_params_from_a_file(batchpid, tmp_path, robot):
-    params = robot.params(kp=7.0, ki=0.0, kd=1.0)
-    bp.save_params(tmp_path / "gains.yaml", params, robot.joint_names)
+def test_params_from_a_file(batchpid, tmp_path, panda):
+    params = panda.params(kp=7.0, ki=0.0, kd=1.0)
+    bp.save_params(tmp_path / "gains.yaml", params, panda.joint_names)
     file = saved(batchpid, tmp_path / "run.npz", "--params", tmp_path / "gains.yaml", "--spread", 0)
-    with Runner(robot, 3, workers=0, params=params) as runner:
-        expected = runner.rollout(np.broadcast_to(robot.settings.target, (5, robot.dof)))
+    with Runner(panda, 3, workers=0, params=params) as runner:
+        expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
 
 
-def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, robot):
+def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     """By name or from the file that tune wrote: with the units and the measured rate that the file tells of."""
-    path = robot.path.with_name("panda.tuned.yaml")
+    path = panda.path.with_name("panda.tuned.yaml")
     by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--params", each) for each in ("tuned", path))
-    with Runner(robot, 3, workers=0, **robot.tuned()) as runner:
-        runner.reset(start_poses(robot, 3, 0.3, 0))
-        expected = runner.rollout(np.broadcast_to(robot.settings.target, (5, robot.dof)))
+    with Runner(panda, 3, workers=0, **panda.tuned()) as runner:
+        runner.reset(start_poses(panda, 3, 0.3, 0))
+        expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(by_name["qpos"], expected.qpos)
     np.testing.assert_array_equal(by_file["qpos"], expected.qpos)
 
@@ -82,14 +77,14 @@ def test_gains_that_ring_are_told_of(batchpid):
     assert "--params tuned" not in batchpid("rollout", *SHORT, "--params", "tuned")[1]
 
 
-def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, robot):
+def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, panda):
     path = tmp_path / "arm.urdf"
-    path.write_text(robot.path.read_text())
+    path.write_text(panda.path.read_text())
     assert batchpid("rollout", *SHORT, "--robot", path)[0] == 0  # with gains designed from its inertia
-    bp.save_params(tmp_path / "gains.json", robot.params(), robot.joint_names)
+    bp.save_params(tmp_path / "gains.json", panda.params(), panda.joint_names)
     file = saved(batchpid, tmp_path / "run.npz", "--robot", path, "--params", tmp_path / "gains.json")
     # Without settings of its own it holds its start pose: zero, moved inside the limits.
-    np.testing.assert_allclose(file["setpoint"][0, 0], np.clip(np.zeros(9), robot.lower, robot.upper))
+    np.testing.assert_allclose(file["setpoint"][0, 0], np.clip(np.zeros(9), panda.lower, panda.upper))
 
 
 def test_a_setpoint_out_of_limits_is_reported_once(batchpid):

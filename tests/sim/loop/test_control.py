@@ -1,17 +1,11 @@
 """The three kinds of control, and what changes in flight."""
 
 import numpy as np
-import pytest
 
-from sim import Robot, Runner
+from sim import Runner
 
 POSE = np.array([0.3, 0.4, -0.2, -1.8, 0.5, 1.9, 0.7, 0.02, 0.02])
 ARM = slice(0, 7)
-
-
-@pytest.fixture(scope="module")
-def panda():
-    return Robot.load("panda")
 
 
 def left_after(runner, seconds):

@@ -1,16 +1,10 @@
 """With friction and link damping as the URDF says, efforts alone must hold a robot where it is."""
 
 import numpy as np
-import pytest
 
-from sim import Robot, Runner
+from sim import Runner
 
 POSE = np.array([0.3, 0.4, -0.2, -1.8, 0.5, 1.9, 0.7, 0.02, 0.02])
-
-
-@pytest.fixture(scope="module")
-def panda():
-    return Robot.load("panda")
 
 
 def drift(runner, seconds=10.0):

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner, Snapshot
@@ -32,11 +33,6 @@ def params(robot, **options):
     return robot.params(**options)
 
 
-def same(first, second):
-    for name, ours, theirs in zip(first._fields, first, second, strict=True):
-        np.testing.assert_array_equal(ours, theirs, name)
-
-
 KINDS = [(name, control, 0) for name in ROBOTS for control in ("pid", "drive", "effort")]
 
 
@@ -50,13 +46,13 @@ def test_restored_in_place_and_in_another_runner(name, control, workers, tmp_pat
         snapshot = runner.snapshot()
         went_on = runner.rollout(table[20:])
         runner.restore(snapshot)
-        same(went_on, runner.rollout(table[20:]))
+        assert_identical(went_on, runner.rollout(table[20:]))
     snapshot.save(tmp_path / "at20.npz")
     for carried in (Snapshot.load(tmp_path / "at20.npz"), pickle.loads(pickle.dumps(snapshot))):
         with Runner(robot, N, workers=0, control=control, params=chosen) as other:
             other.rollout(table[:3])
             other.restore(carried)
-            same(went_on, other.rollout(table[20:]))
+            assert_identical(went_on, other.rollout(table[20:]))
             assert other.time == pytest.approx(went_on.time[-1])
 
 
@@ -98,8 +94,8 @@ def test_checkpoints_are_the_same_for_any_number_of_workers():
     for workers in (0, 1, 2):
         with Runner(robot, N, workers=workers, checkpoint_steps=100) as runner:
             results.append(runner.rollout(table))
-    same(results[0], results[1])
-    same(results[0], results[2])
+    assert_identical(results[0], results[1])
+    assert_identical(results[0], results[2])
 
 
 def test_it_holds_faults_params_and_content():
@@ -129,7 +125,7 @@ def test_it_holds_faults_params_and_content():
         np.testing.assert_array_equal(other.poses(), poses)
         np.testing.assert_array_equal(other.params.kp, 30.0)
         assert not other.faults
-        same(went_on, other.rollout(table[15:]))
+        assert_identical(went_on, other.rollout(table[15:]))
         np.testing.assert_array_equal(other.poses(), end)
 
 
@@ -153,7 +149,7 @@ def test_a_snapshot_of_another_kind_of_runner_is_refused(options, message):
         before = other.observe()
         with pytest.raises(InvalidArgumentError, match=message):
             other.restore(snapshot)
-        same(before, other.observe())
+        assert_identical(before, other.observe())
         with pytest.raises(InvalidArgumentError, match="snapshot: is none"):
             other.restore(before)
 
@@ -174,7 +170,7 @@ def test_a_snapshot_with_other_content_is_refused(kept):
         snapshot, before = first.snapshot(), second.observe()
         with pytest.raises(InvalidArgumentError, match=r"snapshot, env 0: holds other content.*same build="):
             second.restore(snapshot)
-        same(before, second.observe())
+        assert_identical(before, second.observe())
 
 
 BROKEN = {
@@ -210,7 +206,7 @@ def test_a_damaged_snapshot_is_refused_before_anything_changes(case, tmp_path):
         before = runner.step(ROBOTS["panda"].settings.target)
         with pytest.raises(InvalidArgumentError, match=message):
             runner.restore(Snapshot.load(tmp_path / "bad.npz"))
-        same(before, runner.observe())
+        assert_identical(before, runner.observe())
         assert runner.step(ROBOTS["panda"].settings.target).ok.all()
 
 

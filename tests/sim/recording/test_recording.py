@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from identical import assert_identical
 
 h5py = pytest.importorskip("h5py")
 
@@ -35,11 +36,6 @@ def table(ticks):
     return np.clip(ROBOT.settings.target + noise, ROBOT.lower, ROBOT.upper)
 
 
-def same(recording, rollout):
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(recording, name), getattr(rollout, name), name)
-
-
 def test_every_tick_is_there_with_what_it_belongs_to(tmp_path):
     path = tmp_path / "deep" / "run.h5"
     with make() as runner:
@@ -51,7 +47,7 @@ def test_every_tick_is_there_with_what_it_belongs_to(tmp_path):
         runner.step(ROBOT.start)
         params = runner.params
     recording = read_recording(path)
-    same(recording, rollout)
+    assert_identical(recording, rollout)
     assert recording.complete
     assert recording.joint_names == ROBOT.joint_names
     for ours, theirs in zip(recording.params, params, strict=True):
@@ -83,7 +79,7 @@ def test_it_can_be_read_while_it_grows(tmp_path):
         while len(read_recording(recorder.partial).time) < 5:
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        same(read_recording(recorder.partial), rollout)
+        assert_identical(read_recording(recorder.partial), rollout)
         assert not read_recording(recorder.partial).complete
 
 
@@ -125,7 +121,7 @@ def test_an_exception_leaves_what_was_recorded(tmp_path):
         rollout = runner.rollout(table(4))
         raise ZeroDivisionError
     recording = read_recording(path)
-    same(recording, rollout)
+    assert_identical(recording, rollout)
     assert not recording.complete
     kept = path.read_bytes()
     with make() as runner, pytest.raises(ZeroDivisionError), Recorder(path, runner, overwrite=True):  # noqa: PT012

@@ -18,11 +18,6 @@ from sim.tuning.search import tune
 pytest.importorskip("cmaes")
 
 
-@pytest.fixture(scope="module")
-def panda():
-    return Robot.load("panda")
-
-
 def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
     moves, again, other = random_moves(panda, 8, 3), random_moves(panda, 8, 3), random_moves(panda, 8, 4)
     np.testing.assert_array_equal(moves.start, again.start)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from identical import assert_identical
 
 from batchpid.errors import ClosedError, WorkerError
 from sim import RecoveryWarning, Robot, Runner
@@ -40,11 +41,6 @@ def make(**options):
 def undisturbed():
     with make(workers=0) as runner:
         return runner.rollout(table())
-
-
-def same(first, second):
-    for name, ours, theirs in zip(first._fields, first, second, strict=True):
-        np.testing.assert_array_equal(ours, theirs, name)
 
 
 def at_tick(tick, act):
@@ -90,7 +86,7 @@ def test_a_lost_worker_is_brought_back_to_the_same_bytes(number, undisturbed):
         assert runner.pids[0] == before[0]
         assert runner.pids[1] != before[1]
         assert not psutil.pid_exists(before[1])
-    same(undisturbed, rollout)
+    assert_identical(undisturbed, rollout)
 
 
 def test_killed_amid_a_long_tick_and_noticed_at_once():
@@ -177,7 +173,7 @@ def test_killed_between_ticks_at_start_and_while_it_catches_up(undisturbed):
         with pytest.warns(RecoveryWarning):
             rollout = runner.rollout(table())
         first.join()
-    same(undisturbed, rollout)
+    assert_identical(undisturbed, rollout)
 
 
 def test_everything_is_replayed(undisturbed):
@@ -202,7 +198,7 @@ def test_everything_is_replayed(undisturbed):
         expected = program(runner, lambda: None)
     with make() as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
-        same(expected, program(runner, lambda: send(runner.pids[1], signal.SIGKILL)))
+        assert_identical(expected, program(runner, lambda: send(runner.pids[1], signal.SIGKILL)))
         assert runner.recoveries == 4
 
 
@@ -245,7 +241,7 @@ def test_killed_amid_whatever_it_does(tmp_path):
     with Runner(ROBOT, 2, workers=1, build=build) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
         armed.touch()
-        same(expected, program(runner))
+        assert_identical(expected, program(runner))
     assert sorted(os.listdir(tmp_path)) == sorted([*methods, "armed"])
 
 
@@ -314,7 +310,7 @@ def test_an_interrupted_tick_is_finished_before_anything_else(workers):
             results.append((runner.observe(), runner.rollout(table(5)), runner.time))
     for first, second in zip(*results, strict=True):
         if hasattr(first, "_fields"):
-            same(first, second)
+            assert_identical(first, second)
         else:
             assert first == second
 
@@ -457,7 +453,7 @@ def test_kills_at_random_moments_of_many_rollouts(undisturbed):
                 assert time.monotonic() - began < 60
             recovered += runner.recoveries
             pids += runner.pids
-        same(undisturbed, rollout)
+        assert_identical(undisturbed, rollout)
         assert gone(pids)
         if round_ == 4:
             gc.collect()

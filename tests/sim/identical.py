@@ -1,0 +1,24 @@
+"""Bit-identity of results."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+
+def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()) -> None:
+    """Raise AssertionError unless the fields of ``second`` are bit-identical in ``first``.
+
+    Both are observations, rollouts or recordings. ``envs`` selects the envs to compare, ``skip`` names fields that may
+    differ.
+    """
+    rows = (*[slice(None)] * (second.ok.ndim - 1), envs)
+    for name in set(second._fields) - set(skip):
+        ours, theirs = getattr(first, name), getattr(second, name)
+        if name != "time":
+            ours, theirs = ours[rows], theirs[rows]
+        np.testing.assert_array_equal(ours, theirs, name)
+        assert ours.dtype == theirs.dtype, name
+        assert ours.tobytes() == theirs.tobytes(), f"{name} differs in NaNs or in the sign of zeros"
