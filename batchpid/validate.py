@@ -1,8 +1,14 @@
-"""Checks of arguments; each error names the argument, the joint or env, the value and the remedy."""
+"""Checks of arguments; each error names the argument, the joint or env, the value and the remedy.
+
+Every function takes the argument's name and its value, returns the value in its canonical form, and raises
+:class:`batchpid.InvalidArgumentError` where it is not what is asked for.
+"""
 
 from __future__ import annotations
 
+import math
 import os
+import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +22,7 @@ T = TypeVar("T")
 
 
 def integer(argument: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int within [low, high]."""
+    """Return ``value`` as an int within [low, high]."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InvalidArgumentError(argument, "must be a whole number", value=value, remedy="pass an int")
     if not low <= value <= high:
@@ -27,21 +33,26 @@ def integer(argument: str, value: Any, low: int, high: int) -> int:
 
 
 def number(argument: str, value: Any, low: float, high: float, unit: str) -> float:
-    """``value`` as a finite float within [low, high]."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
-        raise InvalidArgumentError(argument, "must be a number", value=value, remedy=f"pass a float ({unit})")
-    if not low <= value <= high:  # NaN is in no range
+    """Return ``value`` as a finite float within [low, high]; an infinite bound is none."""
+    value = _scalar(argument, value, unit)
+    if not low <= value <= high or math.isinf(value):  # NaN is in no range
+        ends = f"from {low:g} to {high:g}" if math.isfinite(high) else f">= {low:g}"
+        raise InvalidArgumentError(argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})")
+    return value
+
+
+def positive(argument: str, value: Any, unit: str) -> float:
+    """Return ``value`` as a finite float above 0."""
+    value = _scalar(argument, value, unit)
+    if not 0 < value < math.inf:
         raise InvalidArgumentError(
-            argument,
-            "out of range",
-            value=value,
-            remedy=f"use a number from {low:g} to {high:g} ({unit})",
+            argument, "must be positive and finite", value=value, remedy=f"use a number > 0 ({unit})"
         )
-    return float(value)
+    return value
 
 
 def choice(argument: str, value: Any, known: Collection[str]) -> str:
-    """``value`` if it is one of ``known``."""
+    """Return ``value`` if it is one of ``known``."""
     if not isinstance(value, str) or value not in known:
         raise InvalidArgumentError(
             argument, "unknown option", value=value, remedy=f"use one of {', '.join(map(repr, known))}"
@@ -50,7 +61,7 @@ def choice(argument: str, value: Any, known: Collection[str]) -> str:
 
 
 def flag(argument: str, value: Any) -> bool:
-    """``value`` as a bool."""
+    """Return ``value`` as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise InvalidArgumentError(argument, "must be True or False", value=value, remedy="pass a bool")
     return bool(value)
@@ -61,6 +72,20 @@ def instance(argument: str, value: Any, kind: type[T], remedy: str) -> T:
     if not isinstance(value, kind):
         raise InvalidArgumentError(argument, f"must be a {kind.__name__}", value=value, remedy=remedy)
     return value
+
+
+def names(argument: str, value: Any, count: int | None = None) -> list[str]:
+    """Return ``value`` as a list of different names, ``count`` of them if given."""
+    sequence = isinstance(value, Sequence) and not isinstance(value, str)
+    if not sequence or not all(isinstance(name, str) for name in value):
+        raise InvalidArgumentError(argument, "must be a list of names", value=value, remedy="pass a list of strings")
+    if count is not None and len(value) != count:
+        raise InvalidArgumentError(
+            argument, f"has {len(value)} names, needs {count}", value=value, remedy="name every joint once"
+        )
+    if len(set(value)) != len(value):
+        raise InvalidArgumentError(argument, "repeats a name", value=value, remedy="name every joint once")
+    return list(value)
 
 
 def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path:
@@ -75,8 +100,14 @@ def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path
     return path
 
 
+def is_traced(value: Any) -> bool:
+    """Return whether ``value`` is an array inside jax.jit, jax.grad or jax.vmap, whose entries cannot be checked."""
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(value, jax.core.Tracer)
+
+
 def read_array(argument: str, value: ArrayLike, kinds: str = "iuf") -> NDArray[Any]:
-    """``value`` as an array of a dtype whose kind is one of ``kinds``, of any shape."""
+    """Return ``value`` as an array, of any shape, of a dtype whose kind is one of ``kinds``."""
     try:
         result = np.asarray(value)
         if result.dtype.kind not in kinds:
@@ -89,6 +120,19 @@ def read_array(argument: str, value: ArrayLike, kinds: str = "iuf") -> NDArray[A
     return result
 
 
+def broadcast(argument: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return ``value`` as float64, broadcast to ``shape``."""
+    result = read_array(argument, value).astype(np.float64, copy=False)
+    try:
+        return np.broadcast_to(result, shape)
+    except ValueError:
+        raise InvalidArgumentError(
+            argument,
+            f"has shape {result.shape}, which does not broadcast to {shape}",
+            remedy="give one value, one per joint, or one per env and joint",
+        ) from None
+
+
 def array(
     argument: str,
     value: ArrayLike,
@@ -97,7 +141,7 @@ def array(
     *,
     finite: bool = True,
 ) -> NDArray[np.float64]:
-    """``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
+    """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
     A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
     """
@@ -112,52 +156,54 @@ def array(
             f"has shape {result.shape}, needs {shape} or ({shape[-1]},)",
             remedy=f"the last axis counts the joints {', '.join(joint_names)}",
         ) from None
-    if finite and not np.isfinite(result).all():
-        *_, env, joint = (int(index) for index in np.argwhere(~np.isfinite(result))[0])
-        raise InvalidArgumentError(
-            argument,
-            "is not finite",
-            joint=joint_names[joint],
-            env=env,
-            value=float(result[~np.isfinite(result)][0]),
-            remedy="pass finite numbers",
-        )
+    if finite:
+        entries(argument, result, np.isfinite(result), "is not finite", joint_names, remedy="pass finite numbers")
     return result
 
 
+def entries(
+    argument: str,
+    values: NDArray[Any],
+    good: Any,
+    problem: str,
+    joint_names: Sequence[str] | None = None,
+    *,
+    remedy: str = "correct that entry",
+) -> None:
+    """Raise for the first entry of ``values`` (..., envs, joints), or (joints,), that is not ``good``.
+
+    The error names the joint, and the env where there are several; an entry of a scalar has neither.
+    """
+    if np.all(good):
+        return
+    index = tuple(int(n) for n in np.argwhere(~np.asarray(good))[0])
+    joint, value = index[-1] if index else None, values[index]
+    raise InvalidArgumentError(
+        argument,
+        problem,
+        joint=joint if joint is None or joint_names is None else joint_names[joint],
+        env=index[-2] if len(index) > 1 and values.shape[-2] > 1 else None,
+        value=value.item() if isinstance(value, np.generic) else value,
+        remedy=remedy,
+    )
+
+
 def within(argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]) -> NDArray[np.float64]:
-    """``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN counts as near."""
-    beyond = np.abs(rows) > far
-    if beyond.any():
-        *_, env, joint = (int(index) for index in np.argwhere(beyond)[0])
-        raise InvalidArgumentError(
-            argument,
-            f"is beyond +-{far:g}",
-            joint=joint_names[joint],
-            env=env,
-            value=float(rows[beyond][0]),
-            remedy="give what a robot can have",
-        )
+    """Return ``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN passes."""
+    near = ~(np.abs(rows) > far)
+    entries(argument, rows, near, f"is beyond +-{far:g}", joint_names, remedy="give what a robot can have")
     return rows
 
 
 def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) -> NDArray[np.float64]:
-    """``value`` as one positive number per joint (dof,)."""
+    """Return ``value`` as one positive number per joint (dof,)."""
     speeds = array(argument, value, (1, len(joint_names)), joint_names)[0]
-    if (speeds <= 0).any():
-        index = int(np.argmax(speeds <= 0))
-        raise InvalidArgumentError(
-            argument,
-            "must be > 0",
-            joint=joint_names[index],
-            value=float(speeds[index]),
-            remedy="leave it out for none",
-        )
+    entries(argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none")
     return speeds
 
 
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:
-    """``value`` as bools, one for each env (envs,)."""
+    """Return ``value`` as one bool per env (envs,)."""
     mask = read_array(argument, value, "b")
     if mask.shape != (num_envs,):
         raise InvalidArgumentError(
@@ -166,3 +212,12 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
             remedy="use e.g. mask = ~obs.ok",
         )
     return mask
+
+
+def _scalar(argument: str, value: Any, unit: str) -> float:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+        raise InvalidArgumentError(argument, "must be a number", value=value, remedy=f"pass a float ({unit})")
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf

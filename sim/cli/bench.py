@@ -124,10 +124,11 @@ def _as_json(setup: Setup, results: dict[str, Result], spent: dict[str, float]) 
 
 def machine() -> dict[str, Any]:
     """Hardware and versions that a figure depends on."""
-    import importlib.metadata
     import os
     import platform
     from contextlib import suppress
+
+    from batchpid.versions import package_versions
 
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
@@ -135,15 +136,9 @@ def machine() -> dict[str, Any]:
             if line.startswith("model name"):
                 processor = line.partition(":")[2].strip()
                 break
-    packages = ("batchpid", "sapien", "numpy", "jax", "mujoco", "gymnasium")
-    versions = {}
-    for package in packages:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
     return {
         "processor": processor,
         "cores": len(os.sched_getaffinity(0)),
         "system": platform.platform(),
-        "python": platform.python_version(),
-        **versions,
+        **package_versions(),
     }

@@ -13,7 +13,6 @@ import os
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.choices import MARKERS
 from batchpid.errors import InvalidArgumentError
+from batchpid.files import write_atomically
 from sim.loop.faults import CAUSES, Containment
 
 _FORMAT = 2
@@ -134,21 +134,12 @@ class Snapshot:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to an .npz file, beside it first, so that an older file stays whole until this one is."""
-        target = Path(path)
         leaves = {name: leaf for name, leaf in self.params._asdict().items() if leaf is not None}
         arrays = {f"params.{name}": leaf for name, leaf in leaves.items() if not isinstance(leaf, tuple)}
         markers = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
         head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": markers}
-        beside = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            with beside.open("xb") as file:
-                tables: dict[str, Any] = {"head": np.array(json.dumps(head))} | arrays | dict(_flatten(self.states))
-                np.savez(file, **tables)
-                file.flush()
-                os.fsync(file.fileno())
-            beside.replace(target)
-        finally:
-            beside.unlink(missing_ok=True)
+        tables: dict[str, Any] = {"head": np.array(json.dumps(head))} | arrays | dict(_flatten(self.states))
+        write_atomically(path, lambda file: np.savez(file, **tables))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Snapshot:

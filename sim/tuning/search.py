@@ -21,7 +21,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +33,10 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.files import write_atomically
 from batchpid.stability import stability_bound
 from batchpid.validate import integer, number
+from batchpid.versions import package_versions
 from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
@@ -196,7 +197,7 @@ def tune(
         "variation": None if variation is None else dict(variation),
         "measurement_rate": measurement_rate,
         **{name: str(value) for name, value in runner_options.items()},
-        "versions": _versions(),
+        "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
     cma = CMA(mean=np.zeros(search.dimension), sigma=SPREAD, seed=seed, population_size=population)
     known = _read_history(history, settings)
@@ -336,18 +337,6 @@ def _with_headroom(params: bp.PIDParams) -> bp.PIDParams:
     )
 
 
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {}
-    for package in ("batchpid", "sapien", "numpy", "cmaes"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
-
-
 def _read_history(path: Path | str | None, settings: dict[str, Any]) -> Sequence[Sequence[float]]:
     if path is None or not Path(path).exists():
         return []
@@ -375,9 +364,5 @@ def _read_history(path: Path | str | None, settings: dict[str, Any]) -> Sequence
 
 
 def _write_history(path: Path | str | None, settings: dict[str, Any], costs: Sequence[Sequence[float]]) -> None:
-    if path is None:
-        return
-    target = Path(path)
-    draft = target.with_name(target.name + ".part")
-    draft.write_text(json.dumps({"settings": settings, "costs": [list(row) for row in costs]}))
-    os.replace(draft, target)
+    if path is not None:
+        write_atomically(path, json.dumps({"settings": settings, "costs": [list(row) for row in costs]}))
