@@ -1,20 +1,33 @@
-"""The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control."""
+"""The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control.
 
-from sim.engine.dynamics import robot_dynamics
-from sim.engine.physics import Physics
+Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:`Robot.dynamics` does.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+for _name in ("batchpid", "assets"):
+    _origin = getattr(importlib.util.find_spec(_name), "origin", None)
+    if _origin and Path(_origin) != Path(__file__).parents[1] / _name / "__init__.py":
+        raise ImportError(f"{_origin} hides the package {_name!r} that sim needs; rename it or run in another folder")
+
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout
 from sim.recording.reader import Recording, read_recording
 from sim.recording.recorder import Recorder
-from sim.robot.description import register_dynamics
+from sim.robot.description import Dynamics, RobotDescription, register_dynamics
 from sim.robot.limits import SetpointWarning
 from sim.robot.preflight import Finding
 from sim.robot.robot import Robot
-from sim.runner import Runner
-from sim.workers.pool import RecoveryWarning
 
-register_dynamics(robot_dynamics)
+if TYPE_CHECKING:
+    from sim.engine.physics import Physics
+    from sim.runner import Runner
+    from sim.workers.pool import RecoveryWarning
 
 __all__ = [
     "Fault",
@@ -32,3 +45,20 @@ __all__ = [
     "Snapshot",
     "read_recording",
 ]
+
+_LOADS_SAPIEN = {"Physics": "sim.engine.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LOADS_SAPIEN:
+        raise AttributeError(f"module 'sim' has no attribute {name!r}")
+    return getattr(importlib.import_module(_LOADS_SAPIEN[name]), name)
+
+
+def _dynamics(robot: RobotDescription, ground: bool = True) -> Dynamics:
+    from sim.engine.dynamics import robot_dynamics
+
+    return robot_dynamics(robot, ground)
+
+
+register_dynamics(_dynamics)

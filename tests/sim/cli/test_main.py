@@ -118,7 +118,7 @@ def test_warnings_are_one_line(batchpid, probe, monkeypatch):
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from sim.cli import main; main(['--help']); "
-        "heavy = {'jax', 'sapien', 'matplotlib', 'h5py', 'sim', 'tyro'} & set(sys.modules); assert not heavy, heavy"
+        "heavy = {'jax', 'sapien', 'matplotlib', 'h5py'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
@@ -132,6 +132,24 @@ def test_help_of_a_command_does_not_load_the_simulator(name):
         "heavy = {'jax', 'sapien', 'matplotlib', 'h5py'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize("name", ["sim", "assets"])
+def test_a_file_of_the_user_that_hides_a_package_is_named_and_not_run(name, tmp_path):
+    hiding = tmp_path / f"{name}.py"
+    hiding.write_text("print('the user's own program')")
+    ran = subprocess.run([sys.executable, "-m", "batchpid", "--help"], cwd=tmp_path, capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr.startswith(f"batchpid: {hiding} hides the package {name!r}")
+    assert ran.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["batchpid", "assets"])
+def test_importing_sim_names_a_file_that_hides_a_package_it_needs(name, tmp_path):
+    hiding = tmp_path / f"{name}.py"
+    hiding.touch()
+    ran = subprocess.run([sys.executable, "-c", "import sim"], cwd=tmp_path, capture_output=True, text=True)
+    assert ran.stderr.splitlines()[-1].startswith(f"ImportError: {hiding} hides the package {name!r}")
 
 
 def test_reader_may_leave_early():
