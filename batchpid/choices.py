@@ -33,6 +33,10 @@ class HoldEffort(NamedTuple):
     """Marker: a joint with a non-finite input gets its last effort again."""
 
 
+class MeasuredRate(NamedTuple):
+    """Marker: the derivative takes the measured velocity, not the difference quotient of positions."""
+
+
 class PerInertia(NamedTuple):
     """Marker: the gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
 
@@ -48,6 +52,7 @@ MARKERS = (
     WeightFromStart,
     ZeroEffort,
     HoldEffort,
+    MeasuredRate,
     PerInertia,
     PerMassMatrix,
 )
@@ -56,6 +61,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
     "weight_origin": {"zero": None, "start": WeightFromStart()},
     "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
+    "measurement_rate": {"difference": None, "measured": MeasuredRate()},
     "gain_units": {"effort": None, "inertia": PerInertia(), "mass_matrix": PerMassMatrix()},
 }
 """Options chosen by name, and the marker that each name puts into the params (the first is the default)."""

@@ -64,6 +64,8 @@ class PIDParams(NamedTuple):
     """WeightFromStart(); off: setpoint weighting takes positions as they are."""
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: what is not finite propagates."""
+    measurement_rate: Any = None
+    """MeasuredRate(), for who runs the law on a robot: give it the measured rate; off: differences of measurements."""
     gain_units: Any = None
     """PerInertia() or PerMassMatrix(), for who runs the law on a robot; off: the gains give efforts."""
 
@@ -173,6 +175,7 @@ def make_params(
     first_derivative: str = "zero",
     weight_origin: str = "zero",
     non_finite: str = "propagate",
+    measurement_rate: str = "difference",
     gain_units: str = "effort",
     joint_names: Sequence[str] | None = None,
     dtype: Any = np.float64,
@@ -219,6 +222,9 @@ def make_params(
     non_finite
         What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or keep the state and
         command "zero" effort, or "hold" the last effort.
+    measurement_rate
+        Rate of the measurement that the derivative uses: "difference" of successive measurements, or "measured": the
+        velocity that :class:`sim.Runner` reads from the simulator. A law that is given none differences.
     gain_units
         "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
         which :class:`sim.Runner` turns into an effort at the robot's pose (see :mod:`batchpid.computed_torque`).
@@ -269,6 +275,7 @@ def make_params(
             ("first_derivative", first_derivative),
             ("weight_origin", weight_origin),
             ("non_finite", non_finite),
+            ("measurement_rate", measurement_rate),
             ("gain_units", gain_units),
         )
     }

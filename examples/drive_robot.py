@@ -49,11 +49,11 @@ def main(options: Options) -> None:
     robot = Robot.load(options.robot)
     target = robot.settings.target
     command = target if driven else np.zeros(robot.dof)  # under "effort" it is the joint effort itself
-    gains = robot.tuned() if control == "pid" and options.gains == "tuned" else {}
+    gains = robot.tuned() if control == "pid" and options.gains == "tuned" else None
     start = robot.start + np.random.default_rng(0).uniform(-0.1, 0.1, (options.num_envs, robot.dof))
     start = np.clip(start, robot.lower, robot.upper)
 
-    with Runner(robot, options.num_envs, control=control, compensate=compensate, **gains) as runner:
+    with Runner(robot, options.num_envs, control=control, compensate=compensate, params=gains) as runner:
         runner.reset(start)
         ticks = round(options.seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(command, (ticks, robot.dof)))

@@ -26,8 +26,8 @@ FLOOR = 1e-6  # [rad]: below it the last bits of float32 positions speak
 
 def final_errors(robot: Robot, control: str, compensate: str, seconds: float) -> np.ndarray:
     """Return |setpoint - qpos| of every joint (dof,) after ``seconds`` at the tutorial's target."""
-    gains = robot.tuned() if control == "pid" else {}
-    with Runner(robot, 1, control=control, compensate=compensate, workers=0, **gains) as runner:
+    gains = robot.tuned() if control == "pid" else None
+    with Runner(robot, 1, control=control, compensate=compensate, workers=0, params=gains) as runner:
         ticks = round(seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (ticks, robot.dof)))
     return np.abs(rollout.qpos[-1, 0] - robot.settings.target)

@@ -1,45 +1,108 @@
-"""What a runner tells of its envs: after a tick, and over a rollout."""
+"""Observations and rollouts. What is observed of an env is defined here, once: a new quantity is one line."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 
+class Quantity(NamedTuple):
+    """Observed quantity: its dtype, meaning, unit ("rad|m" is the joint's own), and whether there is one per joint."""
+
+    dtype: Any
+    meaning: str
+    unit: str = "1"
+    per_joint: bool = True
+
+
 class Observation(NamedTuple):
-    """State of every env after a tick. (envs, dof) in the robot's joint order, ``ok`` (envs,).
+    """State of every env after a tick, (envs, dof) in the robot's joint order; ``ok`` is (envs,).
 
-    ``qpos`` [rad or m], ``qvel`` [rad/s or m/s]; ``effort`` [N m or N] and ``saturated`` as applied in the last
-    substep (under control "drive" the effort is the qf beside the drive, which PhysX keeps to itself).
-    ``ok`` is False for an env that failed in this tick, or is held since it did: see :attr:`Runner.faults`.
+    ``effort`` and ``saturated`` are those of the last sim step; under control "drive" the effort is qf alone, since
+    PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is suspended
+    since an earlier one: see :attr:`sim.Runner.faults`.
     """
 
-    qpos: Float32
-    qvel: Float32
-    effort: Float32
-    saturated: Bool
-    ok: Bool
+    qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
+    qvel: Annotated[Float32, Quantity(np.float32, "joint velocity", "rad/s|m/s")]
+    effort: Annotated[Float32, Quantity(np.float32, "applied joint effort", "N m|N")]
+    saturated: Annotated[Bool, Quantity(np.bool_, "effort at its limit")]
+    ok: Annotated[Bool, Quantity(np.bool_, "state is finite", per_joint=False)]
+
+    def for_envs(self, envs: slice | Any) -> Observation:
+        """Return the observation of some envs (a slice or an index array)."""
+        return Observation._make(array[envs] for array in self)
+
+    def __repr__(self) -> str:
+        envs, dof = self.qpos.shape[-2:]
+        return f"Observation({envs} envs, {dof} joints, {_sound(self.ok)})"
 
 
-class Rollout(NamedTuple):
-    """Observations of a rollout, stacked: (ticks, envs, dof), ``ok`` (ticks, envs), ``time`` (ticks,) [s].
+OBSERVED: dict[str, Quantity] = {
+    name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()
+}
+"""Quantity of each field of :class:`Observation`."""
+RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | OBSERVED
+"""Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 
-    Row k is the state at the end of tick k, at ``time[k]``.
+
+def empty_observation(*shape: int) -> Observation:
+    """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
+    fields = OBSERVED.values()
+    return Observation(*(np.empty(shape if each.per_joint else shape[:-1], each.dtype) for each in fields))
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Record of a run. Row k is the state at the end of tick k, at ``time[k]``.
+
+    The fields of :class:`Observation` are attributes, with the ticks first: ``qpos`` (ticks, envs, dof), ..., ``ok``
+    (ticks, envs).
     """
 
-    time: NDArray[np.float64]
-    setpoint: NDArray[np.float64]
-    qpos: Float32
-    qvel: Float32
-    effort: Float32
-    saturated: Bool
-    ok: Bool
+    time: Float64
+    """End of each tick (ticks,) [s]."""
+    setpoint: Float64
+    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]."""
+    observation: Observation
+    """Observations, stacked."""
+    tick: float
+    """Time from one row to the next [s]."""
 
-    def envs(self, envs: slice | Any) -> Rollout:
-        """The rollout of some envs (a slice or an index array)."""
-        return Rollout._make([self.time, *(field[:, envs] for field in self[1:])])
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        if name not in OBSERVED:
+            raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, {', '.join(OBSERVED)}")
+        array: NDArray[Any] = getattr(self.observation, name)
+        return array
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs."""
+        return int(self.qpos.shape[1])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return time, setpoint and every observed quantity, by name."""
+        return {"time": self.time, "setpoint": self.setpoint, **self.observation._asdict()}
+
+    def for_envs(self, envs: slice | Sequence[int] | Any) -> Rollout:
+        """Return the rollout of some envs (a slice or an index array)."""
+        part = Observation._make(array[:, envs] for array in self.observation)
+        return Rollout(self.time, self.setpoint[:, envs], part, self.tick)
+
+    def __repr__(self) -> str:
+        ticks, envs, dof = self.qpos.shape
+        end = f"up to {self.time[-1]:g} s" if ticks else "empty"
+        return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_sound(self.ok)})"
+
+
+def _sound(ok: Bool) -> str:
+    failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum()) if ok.size else 0
+    return f"{failed} failed" if failed else "all ok"

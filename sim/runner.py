@@ -20,12 +20,12 @@ from batchpid.validate import array, choice, env_mask, flag, integer, joint_spee
 from sim.engine.building import SceneSpec
 from sim.engine.physics import PHYSICS, Physics
 from sim.engine.variation import Variation
-from sim.loop.arrays import Arrays
+from sim.loop.arrays import Arrays, Command
 from sim.loop.control import CONTROLS, check_params, default_params
 from sim.loop.faults import ACTIONS, Fault, FaultLog
 from sim.loop.loop import COMPENSATE, LoopSpec
 from sim.loop.snapshot import EnvStates, Snapshot
-from sim.observation import Observation, Rollout
+from sim.observation import Observation, Rollout, empty_observation
 from sim.robot.limits import LimitWatch
 from sim.robot.robot import Robot
 from sim.workers.pool import WorkerPool, packing
@@ -74,8 +74,6 @@ class Runner:
         Passive force added at every sim step: ``"gravity+coriolis"``, ``"gravity"`` or ``"none"``.
     physics
         ``"accurate"`` (SAPIEN's solver settings), ``"fast"``, or a :class:`sim.Physics`.
-    measurement_rate
-        Give the law qvel as the measurement's rate instead of letting it difference qpos.
     ground
         Whether every scene has a ground plane at height 0.
     build
@@ -126,7 +124,6 @@ class Runner:
         control: str = "pid",
         compensate: str = "gravity+coriolis",
         physics: str | Physics = "accurate",
-        measurement_rate: bool = False,
         ground: bool = True,
         build: Callable[[Any, int], Any] | None = None,
         pack_size: int = 4,
@@ -165,7 +162,6 @@ class Runner:
         self._checkpoint_steps = (
             None if checkpoint_steps is None else integer("checkpoint_steps", checkpoint_steps, 1, 10**9)
         )
-        measurement_rate = flag("measurement_rate", measurement_rate)
         recover = flag("recover", recover)
         timeout = number("timeout", timeout, 1e-3, 1e9, "seconds")
         self._params = check_params(
@@ -203,7 +199,6 @@ class Runner:
             "dissipation": robot.dissipation,
             "ground": scene.ground,
             "fixed_base": robot.fixed_base,
-            "measurement_rate": measurement_rate,
         }
 
         def spec(envs: slice) -> LoopSpec:
@@ -213,7 +208,6 @@ class Runner:
                 params=first_params.for_envs(envs),
                 control=self.control,
                 compensate=self.compensate,
-                measurement_rate=measurement_rate,
                 pack_size=pack_size,
                 first_env=envs.start,
                 on_fault=on_fault,
@@ -306,7 +300,7 @@ class Runner:
         extra = None if feedforward is None else self._rows("feedforward", feedforward)
         if self.control != "effort":
             self._limits.check("setpoint", target)
-        self._run(tuple(None if rows is None else rows[None] for rows in (target, rate, extra)), 1, count)
+        self._run(Command(target, rate, extra).map(lambda rows: rows[None]), 1, count)
         return self.observe()
 
     def rollout(
@@ -347,28 +341,22 @@ class Runner:
             return self._rows(name, rows[:, None] if rows.ndim == 2 else rows, shape)
 
         targets = over_time("setpoints", setpoints)
-        rates, extras = over_time("setpoint_rates", setpoint_rates), over_time("feedforwards", feedforwards)
+        command = Command(targets, over_time("setpoint_rates", setpoint_rates), over_time("feedforwards", feedforwards))
         assert targets is not None
         if self.control != "effort":
             self._limits.check("setpoint", targets)
-        result = Rollout(
-            time=(self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep,
-            setpoint=np.array(targets),
-            qpos=np.empty(shape, np.float32),
-            qvel=np.empty(shape, np.float32),
-            effort=np.empty(shape, np.float32),
-            saturated=np.empty(shape, np.bool_),
-            ok=np.empty(shape[:2], np.bool_),
-        )
+        seen = empty_observation(ticks, self.num_envs, self.robot.dof)
+        times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
+        result = Rollout(times, targets.copy(), seen, self.timestep * self.substeps)
         done = 0
         for tick in range(ticks) if progress is None else progress(range(ticks)):
             if tick == done:  # a tick for which no worker has been sent ahead
                 done = min(ticks, tick + self._room())
-                commands = (None if rows is None else rows[tick:done] for rows in (targets, rates, extras))
-                self._run(tuple(commands), done - tick, self.substeps)
+                sent = slice(tick, done)
+                self._run(command.map(lambda rows, sent=sent: rows[sent]), done - tick, self.substeps)
                 for row, arrays in zip(range(tick, done), pool.ticks, strict=False):
-                    for name in Observation._fields:
-                        getattr(result, name)[row] = getattr(arrays, name)
+                    for table, now in zip(seen, arrays.observation, strict=True):
+                        table[row] = now
         return result
 
     def observe(self) -> Observation:
@@ -486,21 +474,20 @@ class Runner:
 
     # -- inside --------------------------------------------------------------------------------------------------
 
-    def _run(self, commands: tuple[NDArray[np.float64] | None, ...], ticks: int, substeps: int) -> None:
-        """Run ticks under setpoints, their rates and feedforwards (ticks, envs, dof)."""
-        pool, setpoint = self._open(), commands[0]
-        assert setpoint is not None
+    def _run(self, command: Command, ticks: int, substeps: int) -> None:
+        """Run ticks under ``command`` (ticks, envs, dof)."""
+        pool = self._open()
         if self._checkpoint_steps is not None and self._since_checkpoint >= self._checkpoint_steps:
             self.snapshot()
         before, self._steps = self._steps, self._steps + ticks * substeps
         self._since_checkpoint += ticks * substeps
         self._last = ticks - 1
-        self.work_seconds = np.array(pool.run(Run(commands, ticks, substeps))) / ticks
+        self.work_seconds = np.array(pool.run(Run(command, ticks, substeps))) / ticks
         for done, arrays in enumerate(pool.ticks[:ticks], start=1):
             self._faults.note(arrays)
             if self.recorder is not None:
                 time = (before + done * substeps) * self.timestep
-                self.recorder.append(time, setpoint[done - 1], self._observe(arrays))
+                self.recorder.append(time, command.setpoint[done - 1], self._observe(arrays))
 
     def _room(self) -> int:
         """How many ticks the workers can be sent at once: no more than up to the next checkpoint."""
@@ -512,7 +499,7 @@ class Runner:
 
     @staticmethod
     def _observe(arrays: Arrays) -> Observation:
-        return Observation(*(getattr(arrays, name).copy() for name in Observation._fields))
+        return Observation._make(array.copy() for array in arrays.observation)
 
     def _refuse_variation(self) -> None:
         if self._varies:

@@ -156,9 +156,8 @@ def follow(robot: Robot, moves: Moves, steps: int, solver: Physics | None, finer
     """
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
     size, plant = len(moves.start), _plant(robot, moves, solver, TIMESTEP / finer)
-    options = robot.tuned()
-    control = make_control("pid", spec, options["params"], size, options["measurement_rate"])
-    control.set_params(plant, options["params"])  # type: ignore[arg-type]
+    control = make_control("pid", spec, robot.tuned(), size)
+    control.set_params(plant, robot.tuned())  # type: ignore[arg-type]
     control.reset(plant.read_qpos(), np.ones(size, bool))
     control.begin(plant, steps, moves.target)  # type: ignore[arg-type]
     table = np.empty((steps, *moves.start.shape))

@@ -124,7 +124,7 @@ def phases(setup: Setup) -> dict[str, float]:
     clocks = [_Clock(group) for group in loop.groups]
     everyone, still = np.ones(share, bool), np.zeros((share, setup.robot.dof))
     loop.reset(everyone, np.tile(setup.start, (share, 1)), still)
-    loop.ticks[0].setpoint[...] = setup.target
+    loop.ticks[0].command.setpoint[...] = setup.target
     for clock in clocks:
         clock.seconds.clear()
     total = sum(loop.run(1, setup.substeps, False, False) for _ in range(setup.ticks))

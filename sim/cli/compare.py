@@ -81,7 +81,7 @@ class Compare:
         print(evaluation_table(robot, evaluations))
         if self.picture is not None:
             first, second = (
-                plots.Traces.of(evaluation.rollout.envs(slice(0, 1)), robot, evaluation.name)
+                plots.Traces.of(evaluation.rollout.for_envs(slice(0, 1)), robot, evaluation.name)
                 for evaluation in evaluations[:2]
             )
             title = f"{robot.name}, {moves.names[0]} move"

@@ -61,7 +61,7 @@ class Demo:
             )
         seconds = duration(self.seconds)
         start = start_poses(robot, self.num_envs, SPREAD, self.seed)
-        options = robot.tuned() if self.gains == "tuned" else {"params": robot.params()}
+        params = robot.tuned() if self.gains == "tuned" else robot.params()
         whose = "tuned gains" if self.gains == "tuned" else "the tutorial's gains"
         with Runner(
             robot,
@@ -69,7 +69,7 @@ class Demo:
             workers=self.workers,
             timestep=1 / settings.rate_hz,
             substeps=SUBSTEPS,
-            **options,
+            params=params,
         ) as runner:
             print(
                 f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
@@ -92,4 +92,4 @@ class Demo:
         )
         print(f"\npicture: {plots.save(figure, out)}")
         if self.viewer:
-            window(run.rollout.envs(slice(0, 16)), robot)
+            window(run.rollout.for_envs(slice(0, 16)), robot)

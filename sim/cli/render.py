@@ -44,7 +44,7 @@ class Render:
 
         recorded = read_rollout(self.run_file)
         robot = Robot.load(self.robot or recorded.robot)
-        rollout = recorded.rollout.envs(slice(0, integer("envs", self.envs, 1, 64)))
+        rollout = recorded.rollout.for_envs(slice(0, integer("envs", self.envs, 1, 64)))
 
         def progress(rows: object) -> object:
             return tqdm(rows, desc="filming", unit="frame", leave=False)

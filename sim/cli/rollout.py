@@ -138,9 +138,11 @@ def _write(path: Path, robot: Robot, run: Followed) -> None:
     import numpy as np
 
     path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = run.rollout.arrays()
     np.savez_compressed(
         path,
-        **run.rollout._asdict(),
+        **arrays,
+        tick=run.rollout.tick,
         start=run.start,
         robot=np.array(robot.name),
         joint_names=np.array(robot.joint_names),

@@ -115,7 +115,6 @@ class Tune:
                 moves,
                 name=name,
                 workers=self.workers,
-                measurement_rate=True,
                 physics=self.physics,
                 variation=drawn,
             )
@@ -138,7 +137,7 @@ class Tune:
         }
         save_params(out, found.params, robot.joint_names, about)
         history.unlink(missing_ok=True)
-        before, after = (plots.Traces.of(t.rollout.envs(slice(0, 1)), robot, t.name) for t in evaluations)
+        before, after = (plots.Traces.of(t.rollout.for_envs(slice(0, 1)), robot, t.name) for t in evaluations)
         image = plots.save(plots.comparison(before, after, title=f"{robot.name}, {moves.names[0]} move"), picture)
         print(f"\nwritten: {out}\npicture: {image}")
         for text in evaluations[1].shortfalls(arm)[:5]:

@@ -122,4 +122,4 @@ def _recorded(path: Path, name: str | None, period: float) -> Playback:
     count = recorded.rollout.qpos.shape[1]
     if count > MOST:
         print(f"showing the first {MOST} of {count} envs")
-    return Playback(robot, recorded.rollout.envs(slice(0, MOST)), period=period)
+    return Playback(robot, recorded.rollout.for_envs(slice(0, MOST)), period=period)

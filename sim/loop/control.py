@@ -30,12 +30,12 @@ class Control:
 
     reads_qpos_each_step = True
 
-    def __init__(self, scene: SceneSpec, params: bp.PIDParams, size: int, measurement_rate: bool) -> None:
+    def __init__(self, scene: SceneSpec, params: bp.PIDParams, size: int) -> None:
         self.size, self.dt = size, scene.timestep
         self.saturated: NDArray[np.bool_] = np.zeros((size, len(scene.joints)), bool)
         self.state: Any = None
         self.params = params
-        self._scene, self._measurement_rate = scene, measurement_rate
+        self._scene = scene
         self._setpoint: Float64 = np.zeros((size, len(scene.joints)))
         self._setpoint_rate: Float64 | None = None
 
@@ -73,7 +73,7 @@ class PIDControl(Control):
 
     def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
         """Advance the law by one sim step."""
-        qvel = pack.read_qvel() if self._measurement_rate else None
+        qvel = pack.read_qvel() if self.params.measurement_rate is not None else None
         inputs = (self._setpoint, qpos, qvel, self._setpoint_rate, feedforward)
         if not last:
             self.state, effort = bp.advance(self._coefficients, self.state, *inputs)
@@ -107,11 +107,11 @@ class InertiaPIDControl(PIDControl):
             self._matrix = self._mass_matrix(qpos + 0.5 * (kept - 1) * self.dt * pack.read_qvel())
             if self._damping is not None:
                 self._matrix += self.dt * np.diag(self._damping)
-        qvel = pack.read_qvel() if self._measurement_rate or self._damping is not None else None
+        qvel = pack.read_qvel() if self.params.measurement_rate is not None or self._damping is not None else None
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel
             feedforward = viscous if feedforward is None else feedforward + viscous
-        rates = (qvel if self._measurement_rate else None, self._setpoint_rate)
+        rates = (qvel if self.params.measurement_rate is not None else None, self._setpoint_rate)
         if self._whole:
             self.state, effort, *aux = advance_with_mass_matrix(
                 self._coefficients,
@@ -192,7 +192,7 @@ class EffortControl(Control):
 CONTROLS = ("pid", "drive", "effort")
 
 
-def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, size: int, measurement_rate: bool) -> Control:
+def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, size: int) -> Control:
     """Build the control of that name for ``size`` envs, with ``params`` of one row or ``size``."""
     inertia = params.gain_units is not None
     kinds = {
@@ -200,7 +200,7 @@ def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, size: int, m
         "drive": DriveControl,
         "effort": EffortControl,
     }
-    return kinds[name](scene, params, size, measurement_rate)
+    return kinds[name](scene, params, size)
 
 
 def default_params(robot: Robot, control: str) -> bp.PIDParams:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
-from sim.loop.arrays import Arrays
+from sim.loop.arrays import Arrays, Command
 from sim.loop.control import make_control
 from sim.loop.faults import Containment, finite
 from sim.loop.snapshot import EnvStates
@@ -32,16 +32,15 @@ class EnvGroup:
         *,
         control: str,
         compensate: tuple[bool, bool],
-        measurement_rate: bool,
         on_fault: str,
         speed_limit: NDArray[np.float64] | None,
     ) -> None:
         self.pack, self.envs = pack, envs
         # The control asks about the robot alone, whatever else the scenes hold.
         self._scene = replace(scene, build=None)
-        self._kind, self._measurement_rate = control, measurement_rate
+        self._kind = control
         self._gravity, self._coriolis = compensate
-        self._control = make_control(control, self._scene, params, pack.size, measurement_rate)
+        self._control = make_control(control, self._scene, params, pack.size)
         self._qpos = pack.read_qpos()
         self._watch = Containment(pack.size, pack.dof, on_fault, speed_limit)
         self._steps = 0
@@ -50,8 +49,7 @@ class EnvGroup:
         """Change gains, limits and times in flight; the controller's state is kept."""
         old = self._control
         if (params.gain_units is None) != (old.params.gain_units is None):
-            scene, size, rate = self._scene, self.pack.size, self._measurement_rate
-            self._control = make_control(self._kind, scene, params, size, rate)
+            self._control = make_control(self._kind, self._scene, params, self.pack.size)
             self._control.state, self._control.saturated = old.state, old.saturated
         self._control.set_params(self.pack, params)
         if self._control.state is not None:
@@ -70,34 +68,30 @@ class EnvGroup:
             watch.fail(entries, cause, steps, watch.home_qpos)
         self._put_back()
 
-    def run(self, steps: int, substeps: int, *command: NDArray[np.float64] | None) -> None:
-        """Run ``substeps`` sim steps under setpoint, setpoint rate and feedforward, after ``steps`` in the past."""
+    def run(self, steps: int, substeps: int, command: Command) -> None:
+        """Run ``substeps`` sim steps under ``command``, after ``steps`` in the past."""
         watch = self._watch
         self._steps, watch.flagged = steps, watch.stopped.copy()
         if watch.stopped.any() or not finite(*command):
             command = self._admit(command)
         with np.errstate(all="ignore"):  # what overflows or is not finite becomes a fault
-            self._run(substeps, *command)
+            self._run(substeps, command)
             if not finite(self._qpos, self.pack.read_qvel()):
                 self._contain(self._qpos, substeps)
 
     def observe(self, rows: Arrays) -> None:
-        """Write what the caller is to see into these envs' rows."""
-        watch = self._watch
-        rows.qpos[...] = self._qpos
-        rows.qvel[...] = self.pack.read_qvel(np.float32)
-        rows.effort[...] = self.pack.qf
-        rows.saturated[...] = self._control.saturated
-        rows.ok[...] = ~watch.flagged
-        rows.fault_step[...], rows.fault_joint[...], rows.fault_cause[...] = (
-            watch.step,
-            watch.joint,
-            watch.cause,
-        )
+        """Write observation and faults into these envs' rows."""
+        watch, seen = self._watch, rows.observation
+        seen.qpos[...] = self._qpos
+        seen.qvel[...] = self.pack.read_qvel(np.float32)
+        seen.effort[...] = self.pack.qf
+        seen.saturated[...] = self._control.saturated
+        seen.ok[...] = ~watch.flagged
+        rows.fault.step[...], rows.fault.joint[...], rows.fault.cause[...] = watch.step, watch.joint, watch.cause
         if watch.stopped.any():
             held = watch.stopped
-            rows.qpos[held] = watch.held_qpos[held]
-            rows.qvel[held] = rows.effort[held] = rows.saturated[held] = 0
+            seen.qpos[held] = watch.held_qpos[held]
+            seen.qvel[held] = seen.effort[held] = seen.saturated[held] = 0
 
     def read(self) -> EnvStates:
         """State of these envs, physics and controller."""
@@ -148,15 +142,15 @@ class EnvGroup:
         self._qpos = np.where(bad, self._qpos, qpos)
         self._put_back()
 
-    def _admit(self, command: tuple[NDArray[np.float64] | None, ...]) -> tuple[NDArray[np.float64] | None, ...]:
-        """Stop the envs whose commands are not finite; the commands, harmless for all that are stopped."""
+    def _admit(self, command: Command) -> Command:
+        """Stop the envs whose commands are not finite; return the commands, harmless for all that are stopped."""
         watch = self._watch
-        for cause, rows in zip(("setpoint", "setpoint_rate", "feedforward"), command, strict=True):
+        for cause, rows in command._asdict().items():
             if rows is not None:
                 watch.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._put_back()
         harmless = (0.0 if self._kind == "effort" else self._qpos, 0.0, 0.0)
-        return tuple(
+        return Command._make(
             None if rows is None else np.where(watch.flagged[:, None], value, rows)
             for rows, value in zip(command, harmless, strict=True)
         )
@@ -180,17 +174,17 @@ class EnvGroup:
 
     # -- the closed loop --------------------------------------------------------------------------------------
 
-    def _run(self, substeps: int, setpoint: Any, setpoint_rate: Any, feedforward: Any) -> None:
+    def _run(self, substeps: int, command: Command) -> None:
         """At every sim step: compensate, control, write, step, read."""
         pack, control = self.pack, self._control
-        control.begin(pack, substeps, setpoint, setpoint_rate)
+        control.begin(pack, substeps, command.setpoint, command.setpoint_rate)
         for step in range(substeps):
             last = step == substeps - 1
-            forward = self._feedforward(feedforward)
+            forward = self._feedforward(command.feedforward)
             if not control.reads_qpos_each_step and not self._sound(forward):
                 # Without a look at qpos, the passive force is what tells of a state that has failed.
                 self._contain(pack.read_qpos(), step)
-                forward = self._feedforward(feedforward)
+                forward = self._feedforward(command.feedforward)
             effort = control.effort(pack, self._qpos, forward, step, last)
             if effort is not None:
                 pack.write_qf(effort)

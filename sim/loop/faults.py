@@ -72,12 +72,13 @@ class FaultLog:
 
     def note(self, arrays: Arrays, stacklevel: int = 4) -> None:
         """Add what failed since the last look."""
-        if arrays.ok.all():
+        fault = arrays.fault
+        if arrays.observation.ok.all():
             return
-        steps = arrays.fault_step.copy()
+        steps = fault.step.copy()
         for env in np.flatnonzero((steps >= 0) & (steps != self._steps)).tolist():
             step = int(steps[env])
-            joint, cause = self._joint_names[arrays.fault_joint[env]], CAUSES[arrays.fault_cause[env]]
+            joint, cause = self._joint_names[fault.joint[env]], CAUSES[fault.cause[env]]
             self.faults.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
         self._steps = steps
         if self.faults and not self._warned:

@@ -17,7 +17,7 @@ from sim.engine.building import SceneSpec, parse
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.engine.variation import Variation, VariedPack
-from sim.loop.arrays import Arrays
+from sim.loop.arrays import Arrays, Command
 from sim.loop.env_group import EnvGroup
 from sim.loop.snapshot import EnvStates, Snapshot
 
@@ -40,7 +40,6 @@ class LoopSpec:
     params: bp.PIDParams
     control: str = "pid"
     compensate: str = "gravity+coriolis"
-    measurement_rate: bool = False
     pack_size: int = 4
     first_env: int = 0
     variation: Variation | None = None
@@ -70,7 +69,6 @@ class Loop:
                 spec.params.for_envs(envs),
                 control=spec.control,
                 compensate=COMPENSATE[spec.compensate],
-                measurement_rate=spec.measurement_rate,
                 on_fault=spec.on_fault,
                 speed_limit=spec.speed_limit,
             )
@@ -90,7 +88,7 @@ class Loop:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
         for group in self.groups:
             group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
-            group.observe(self.ticks[0].rows(group.envs))
+            group.observe(self.ticks[0].for_envs(group.envs))
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
@@ -102,14 +100,10 @@ class Loop:
         began = time.perf_counter()
         for group in self.groups:
             for done, tick in enumerate(self.ticks[:ticks]):
-                rows = tick.rows(group.envs)
-                group.run(
-                    self._steps + done * substeps,
-                    substeps,
-                    rows.setpoint,
-                    rows.setpoint_rate if use_rate else None,
-                    rows.feedforward if use_feedforward else None,
-                )
+                rows = tick.for_envs(group.envs)
+                setpoint, rate, feedforward = rows.command
+                command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
+                group.run(self._steps + done * substeps, substeps, command)
                 group.observe(rows)
         self._steps += ticks * substeps
         return time.perf_counter() - began
@@ -126,7 +120,7 @@ class Loop:
         self.set_params(snapshot.params)
         self._place(snapshot.states)
         for group in self.groups:
-            group.observe(self.ticks[0].rows(group.envs))
+            group.observe(self.ticks[0].for_envs(group.envs))
 
     def _place(self, states: EnvStates) -> None:
         # The engine's contact caches, and the order in which it solves contacts, depend on its past. Only a new

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from sim.observation import Rollout
+from sim.observation import OBSERVED, Observation, Rollout
 from sim.recording.reader import read_recording
 from sim.robot.robot import Robot
 
@@ -60,13 +60,17 @@ def read_rollout(path: str | Path, *, every: int = 1) -> Recorded:
     path = Path(path)
     if path.suffix in (".h5", ".hdf5") or ".partial" in path.suffix:
         found = read_recording(path, every=every)
-        rollout = Rollout(*(getattr(found, name) for name in Rollout._fields))
+        seen = Observation._make(getattr(found, name) for name in OBSERVED)
+        tick = float(found.attributes["timestep"]) * int(found.attributes["substeps"]) * every
+        rollout = Rollout(found.time, found.setpoint, seen, tick)
         return _recorded(rollout, found.attributes, found.complete)
     if not path.is_file():
         raise InvalidArgumentError("path", "is no file", value=str(path), remedy="check the spelling")
     try:
         with np.load(path, allow_pickle=False) as data:
-            return _recorded(Rollout(*(data[name][::every] for name in Rollout._fields)), data)
+            seen = Observation._make(data[name][::every] for name in OBSERVED)
+            rollout = Rollout(data["time"][::every], data["setpoint"][::every], seen, float(data["tick"]) * every)
+            return _recorded(rollout, data)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InvalidArgumentError(
             "path",

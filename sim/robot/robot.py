@@ -156,14 +156,14 @@ class Robot(RobotDescription):
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
         if gain_units != "mass_matrix":
-            return bp.design_gains(self, 2.25, gain_units=gain_units)
+            return bp.design_gains(self, 2.25, gain_units=gain_units, measurement_rate="measured")
         integral_time = 4.5 / (2 * np.pi * DESIGN_HZ)
-        return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=integral_time, gain_units=gain_units)
+        return bp.design_gains(
+            self, DESIGN_HZ, 0.82, integral_time=integral_time, gain_units=gain_units, measurement_rate="measured"
+        )
 
-    def tuned(self) -> dict[str, Any]:
-        """Options of :class:`sim.Runner` with which a bundled robot settles: tuned params, and what they need.
-
-        ``Runner(robot, 64, **robot.tuned())``. See docs/choosing-gains.md.
+    def tuned(self) -> bp.PIDParams:
+        """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
 
         Raises
         ------
@@ -177,11 +177,7 @@ class Robot(RobotDescription):
                 f"{self.name!r} carries no tuned gains",
                 remedy="use batchpid.design_gains(robot), or make some with: batchpid tune",
             )
-        params, _ = bp.load_params(path, self.joint_names)
-        return {
-            "params": params,
-            "measurement_rate": bool(bp.load_about(path).get("measurement_rate", False)),
-        }
+        return bp.load_params(path, self.joint_names)[0]
 
 
 def _find(name_or_path: str | Path) -> Path:

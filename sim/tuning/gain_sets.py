@@ -26,16 +26,16 @@ def gain_set(robot: Robot, name: str) -> GainSet:
     InvalidArgumentError
         No such name or file, or the robot carries no gains of that name.
     """
-    from batchpid import load_about, load_params
+    from batchpid import load_params
     from batchpid.errors import InvalidArgumentError
     from sim.tuning.search import start_gains
 
     if name == "tutorial":
         return GainSet(name, {"params": robot.params()})
     if name == "tuned":
-        return GainSet(name, robot.tuned())
+        return GainSet(name, {"params": robot.tuned()})
     if name == "designed":
-        return GainSet(name, {"params": start_gains(robot), "measurement_rate": True})
+        return GainSet(name, {"params": start_gains(robot)})
     if name.partition(":")[0] == "drive":
         try:
             stiffness, damping = (float(part) for part in (name.partition(":")[2] or "20,5").split(","))
@@ -51,5 +51,4 @@ def gain_set(robot: Robot, name: str) -> GainSet:
             "gains", "is neither a name nor a file", value=name, remedy=f"use a file or {', '.join(NAMES)}"
         )
     params, _ = load_params(path, robot.joint_names)
-    told = load_about(path).get("measurement_rate", False)
-    return GainSet(path.name, {"params": params, "measurement_rate": bool(told)})
+    return GainSet(path.name, {"params": params})

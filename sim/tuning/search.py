@@ -91,9 +91,11 @@ def start_gains(robot: Robot, gain_units: str = "mass_matrix") -> bp.PIDParams:
     effort of three equal poles that are as fast. With other units joints disturb each other, which those bear better.
     """
     if gain_units != "mass_matrix":
-        return bp.design_gains(robot, 2.25, gain_units=gain_units)
+        return bp.design_gains(robot, 2.25, gain_units=gain_units, measurement_rate="measured")
     integral_time = 4.5 / (2 * math.pi * START_HZ)
-    return bp.design_gains(robot, START_HZ, 0.82, integral_time=integral_time, gain_units=gain_units)
+    return bp.design_gains(
+        robot, START_HZ, 0.82, integral_time=integral_time, gain_units=gain_units, measurement_rate="measured"
+    )
 
 
 class Tuning(NamedTuple):
@@ -122,7 +124,6 @@ def tune(
     weights: Weights | None = None,
     moves: Moves | None = None,
     variation: Mapping[str, Any] | None = None,
-    measurement_rate: bool = True,
     workers: int | None = None,
     time_limit: float | None = None,
     history: Path | str | None = None,
@@ -150,8 +151,6 @@ def tune(
     variation
         Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: each move gets a robot of its
         own payload and friction, the same for all candidates. None: the robot as it is.
-    measurement_rate
-        Use the simulator's joint velocity for the derivative.
     workers
         Processes; the result does not depend on it.
     time_limit
@@ -195,7 +194,6 @@ def tune(
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
         "variation": None if variation is None else dict(variation),
-        "measurement_rate": measurement_rate,
         **{name: str(value) for name, value in runner_options.items()},
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
@@ -203,7 +201,6 @@ def tune(
     known = _read_history(history, settings)
     options: dict[str, Any] = {
         "substeps": SUBSTEPS,
-        "measurement_rate": measurement_rate,
         "workers": workers,
         **runner_options,
     }

@@ -52,8 +52,6 @@ class Live:
         Processes in all; default one for each core.
     params
         Of the PID, one row, in whatever gain units; default the robot's designed gains, and the tutorial's to choose.
-    measurement_rate
-        As :class:`sim.Runner` takes it, for the PID.
     options
         Of :class:`sim.Runner`: physics, compensate, timestep, ...
     """
@@ -69,7 +67,6 @@ class Live:
         seed: int = 0,
         workers: int | None = None,
         params: bp.PIDParams | None = None,
-        measurement_rate: bool = False,
         **options: Any,
     ) -> None:
         self.robot = robot
@@ -112,7 +109,6 @@ class Live:
                         control=control,
                         substeps=substeps,
                         workers=share,
-                        measurement_rate=measurement_rate and control == "pid",
                         **options,
                     )
                 )

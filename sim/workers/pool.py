@@ -23,7 +23,7 @@ from typing import Any
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, WorkerError
 from sim.loop.arrays import Arrays
 from sim.loop.loop import LoopSpec
-from sim.workers.requests import Command, Run, Start, Worker
+from sim.workers.requests import Request, Run, Start, Worker
 from sim.workers.shared_memory import SharedArrays
 from sim.workers.worker import LocalWorker, ProcessWorker, WorkerLost
 
@@ -43,7 +43,7 @@ class _Slot:
     index: int
     envs: slice
     worker: Worker
-    queue: deque[Command] = field(default_factory=deque)
+    queue: deque[Request] = field(default_factory=deque)
     phase: str = "idle"  # "idle", "busy", or "torn": interrupted amid a message
     result: Any = None
     losses: int = 0
@@ -79,7 +79,7 @@ class WorkerPool:
     ) -> None:
         self._kind = ProcessWorker if count else LocalWorker
         self._recover, self._timeout = recover, timeout
-        self._journal: list[Command] = []
+        self._journal: list[Request] = []
         self._slots: list[_Slot] = []
         self._poller = select.poll()
         self._kept = True  # whether the command in hand is in the journal
@@ -114,7 +114,7 @@ class WorkerPool:
         """The workers, in the order of their envs."""
         return [slot.worker for slot in self._slots]
 
-    def run(self, command: Command, *, keep: bool = True) -> list[Any]:
+    def run(self, command: Request, *, keep: bool = True) -> list[Any]:
         """Let every worker run ``command``; return their results.
 
         ``keep`` it for replay unless it changes nothing.
@@ -132,7 +132,7 @@ class WorkerPool:
         """
         return self._exclusive(lambda: self._run(command, keep))
 
-    def _run(self, command: Command, keep: bool) -> list[Any]:
+    def _run(self, command: Request, keep: bool) -> list[Any]:
         self._settle()
         for slot in self._slots:
             slot.queue.append(command)
@@ -165,7 +165,7 @@ class WorkerPool:
                 self.close()
                 raise
 
-    def start_from(self, command: Command) -> None:
+    def start_from(self, command: Request) -> None:
         """Forget the commands so far: ``command`` takes a new worker to where the workers are now."""
         if self._recover:
             self._journal = [command]

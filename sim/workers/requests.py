@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.loop.arrays import Command
 from sim.workers.worker import LocalWorker, ProcessWorker
 
 Worker = LocalWorker | ProcessWorker
 
 
-class Command:
-    """Base of all commands."""
+class Request:
+    """Base of all requests."""
 
     idle_limit = 10.0
     """Seconds for which a worker may sleep meanwhile: it may be building, with the caller's own code."""
@@ -29,7 +29,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Start(Command):
+class Start(Request):
     """What a new process does unasked: build its loop."""
 
     def send(self, worker: Worker, envs: slice) -> None:
@@ -41,7 +41,7 @@ class Start(Command):
 
 
 @dataclass(frozen=True)
-class Call(Command):
+class Call(Request):
     """Call a method of the loop. Arrays among ``args`` have a row for each env; ``for_envs`` takes parts of others."""
 
     method: str
@@ -54,10 +54,10 @@ class Call(Command):
 
 
 @dataclass(frozen=True)
-class Run(Command):
-    """Run ticks under setpoints, their rates and feedforwards, (ticks, envs, dof) each; the latter two may be None."""
+class Run(Request):
+    """Run ticks under ``command`` (ticks, envs, dof)."""
 
-    commands: tuple[NDArray[np.float64] | None, ...]
+    command: Command
     ticks: int
     substeps: int
 
@@ -65,11 +65,11 @@ class Run(Command):
 
     def send(self, worker: Worker, envs: slice) -> None:
         """Ask ``worker``, whose envs are ``envs``."""
-        for name, rows in zip(("setpoint", "setpoint_rate", "feedforward"), self.commands, strict=True):
+        for name, rows in self.command._asdict().items():
             if rows is not None:
                 for tick, row in zip(worker.ticks, rows, strict=False):
-                    getattr(tick, name)[...] = row[envs]
-        _, rate, feedforward = self.commands
+                    getattr(tick.command, name)[...] = row[envs]
+        _, rate, feedforward = self.command
         worker.send_run(self.ticks, self.substeps, rate is not None, feedforward is not None)
 
     def limit(self, envs: int) -> float:
@@ -78,4 +78,4 @@ class Run(Command):
 
     def kept(self) -> Run:
         """Copy of it, which stays as it is when the caller writes to the arrays."""
-        return replace(self, commands=tuple(None if rows is None else rows.copy() for rows in self.commands))
+        return replace(self, command=self.command.map(np.copy))

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sim.observation import OBSERVED
+
 
 def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()) -> None:
     """Raise AssertionError unless the fields of ``second`` are bit-identical in ``first``.
@@ -15,7 +17,7 @@ def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Col
     differ.
     """
     rows = (*[slice(None)] * (second.ok.ndim - 1), envs)
-    for name in set(second._fields) - set(skip):
+    for name in ({"setpoint", "time", *OBSERVED} if hasattr(second, "time") else set(OBSERVED)) - set(skip):
         ours, theirs = getattr(first, name), getattr(second, name)
         if name != "time":
             ours, theirs = ours[rows], theirs[rows]

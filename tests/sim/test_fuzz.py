@@ -207,7 +207,6 @@ GOOD_RUNNER = {
     "control": "pid",
     "compensate": "gravity",
     "physics": "fast",
-    "measurement_rate": False,
     "ground": True,
     "build": None,
     "pack_size": 1,

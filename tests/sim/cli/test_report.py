@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim import Rollout
+from sim import Observation, Rollout
 from sim.cli import report
 from sim.tuning.evaluation import judge
 
@@ -21,11 +21,14 @@ def follow(panda, setpoint, time_constant=0.05):
     rollout = Rollout(
         time=time,
         setpoint=np.array(target),
-        qpos=qpos.astype(np.float32),
-        qvel=np.zeros(shape, np.float32),
-        effort=np.ones(shape, np.float32),
-        saturated=np.zeros(shape, bool),
-        ok=np.ones(shape[:2], bool),
+        observation=Observation(
+            qpos=qpos.astype(np.float32),
+            qvel=np.zeros(shape, np.float32),
+            effort=np.ones(shape, np.float32),
+            saturated=np.zeros(shape, bool),
+            ok=np.ones(shape[:2], bool),
+        ),
+        tick=0.01,
     )
     return rollout, np.array(start)
 

@@ -25,7 +25,7 @@ def test_file_holds_the_runner_s_rollout(batchpid, tmp_path, panda):
     with Runner(panda, 3, workers=0, substeps=10) as runner:
         runner.reset(qpos=start)
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (10, panda.dof)))
-    for name, value in expected._asdict().items():
+    for name, value in expected.arrays().items():
         np.testing.assert_array_equal(file[name], value)
     np.testing.assert_array_equal(file["start"], start)
     assert tuple(file["joint_names"]) == panda.joint_names
@@ -65,7 +65,7 @@ def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     """By name or from the file that tune wrote: with the units and the measured rate that the file tells of."""
     path = panda.path.with_name("panda.tuned.yaml")
     by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--params", each) for each in ("tuned", path))
-    with Runner(panda, 3, workers=0, **panda.tuned()) as runner:
+    with Runner(panda, 3, workers=0, params=panda.tuned()) as runner:
         runner.reset(start_poses(panda, 3, 0.3, 0))
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(by_name["qpos"], expected.qpos)

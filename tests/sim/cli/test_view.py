@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Robot, Rollout
+from sim import Observation, Robot, Rollout
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -14,9 +14,10 @@ def write(path, robot="panda", envs=1):
     """A rollout of two ticks at rest, as batchpid rollout --out writes it."""
     panda = Robot.load("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
-    rollout = Rollout(np.array([0.1, 0.2]), zeros, zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
+    seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
+    rollout = Rollout(np.array([0.1, 0.2]), zeros, seen, tick=0.1)
     told = {name: getattr(panda, name) for name in ("joint_names", "units", "lower", "upper", "effort_limit")}
-    np.savez(path, **rollout._asdict(), **told, robot=robot)
+    np.savez(path, **rollout.arrays(), tick=rollout.tick, **told, robot=robot)
     return path
 
 

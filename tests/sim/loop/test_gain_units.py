@@ -95,7 +95,7 @@ def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps
     robot = Robot.load("jaco2")
     start = robot.settings.start + np.array([0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25])
     move = robot.settings.target - start
-    with Runner(robot, 1, params=start_gains(robot), workers=0, measurement_rate=True, substeps=substeps) as runner:
+    with Runner(robot, 1, params=start_gains(robot), workers=0, substeps=substeps) as runner:
         runner.reset(start)
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (1200 // substeps, robot.dof)))
     gone = rollout.qpos[:, 0] - start

@@ -130,14 +130,15 @@ def test_no_run_is_too_odd_to_draw(tmp_path_factory, bad, first, envs, limits, u
 
 
 def test_traces_of_a_rollout_blank_what_came_after_a_divergence():
-    from sim import Robot, Rollout
+    from sim import Observation, Robot, Rollout
 
     robot = Robot.load("panda")
     shape = (TICKS, ENVS, robot.dof)
     ok = np.ones(shape[:2], bool)
     ok[10:, 2] = False
     zeros = np.zeros(shape, np.float32)
-    rollout = Rollout(np.arange(1.0, TICKS + 1), zeros.astype(float), zeros, zeros, zeros, zeros > 0, ok)
+    seen = Observation(zeros, zeros, zeros, zeros > 0, ok)
+    rollout = Rollout(np.arange(1.0, TICKS + 1), zeros.astype(float), seen, tick=1.0)
     traces = plots.Traces.of(rollout, robot, "run")
     np.testing.assert_array_equal(np.isnan(traces.qpos).all(2), ~ok)
     np.testing.assert_array_equal(np.isnan(traces.effort).any(2), ~ok)

@@ -66,10 +66,9 @@ def test_designed_gains_settle_within_two_seconds(name, units, record_property):
     moves = random_moves(robot, 4, size=1.0, ground=False)
     evaluation = evaluate_gains(
         robot,
-        bp.design_gains(robot, gain_units=units),
+        bp.design_gains(robot, gain_units=units, measurement_rate="measured"),
         moves,
         seconds=2.2,
-        measurement_rate=True,
         judge_chatter=False,
         ground=False,
         physics="fast",

@@ -77,7 +77,7 @@ def test_arm_joints_leave_out_fingers(panda):
 def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(name):
     robot = Robot.load(name)
     moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)
-    evaluation = evaluate_gains(robot, moves=moves, workers=0, **robot.tuned())
+    evaluation = evaluate_gains(robot, moves=moves, workers=0, params=robot.tuned())
     assert evaluation.rollout.ok.all()
     assert not evaluation.shortfalls(arm_joints(robot))
 
@@ -137,7 +137,7 @@ def test_variation_is_felt_and_shared_by_all_workers(panda):
     assert (drawn.friction <= 0.1).all()
     gains = bp.design_gains(panda, gain_units="mass_matrix")
     plain, *varied = (
-        evaluate_gains(panda, gains, moves, seconds=0.3, variation=v, workers=w, measurement_rate=True)
+        evaluate_gains(panda, gains, moves, seconds=0.3, variation=v, workers=w)
         for v, w in ((None, 0), (drawn, 0), (drawn, 2))
     )
     assert varied[0].rollout.qpos.tobytes() == varied[1].rollout.qpos.tobytes()
@@ -150,7 +150,7 @@ def test_a_payload_that_the_model_does_not_know_pulls_the_hand_down_and_the_inte
     hold = Moves(pose[None], pose[None], ("hold",))
     loaded = Variation(np.array([2.0]), np.zeros(1), "panda_hand")
     gains = bp.design_gains(panda, gain_units="mass_matrix")
-    evaluation = evaluate_gains(panda, gains, hold, seconds=3.0, variation=loaded, workers=0, measurement_rate=True)
+    evaluation = evaluate_gains(panda, gains, hold, seconds=3.0, variation=loaded, workers=0)
     assert evaluation.metrics.peak_deviation[0, 1] > 3e-3
     assert evaluation.metrics.steady_state_error[0, :7].max() < 1e-3
 
@@ -160,7 +160,7 @@ def test_late_efforts_and_coarse_sensors(panda):
     hold = Moves(pose, pose + 0.01 * np.array([[1, 1, 1, -1, 1, 1, 1, 0, 0]]), ("small",))
     coarse = Variation(np.zeros(1), np.zeros(1), "panda_hand", resolution=1e-3, late=True)
     gains = bp.design_gains(panda, gain_units="mass_matrix")
-    evaluation = evaluate_gains(panda, gains, hold, seconds=0.2, variation=coarse, workers=0, measurement_rate=True)
+    evaluation = evaluate_gains(panda, gains, hold, seconds=0.2, variation=coarse, workers=0)
     steps = evaluation.rollout.qpos / 1e-3
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-2)
 

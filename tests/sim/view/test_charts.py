@@ -26,13 +26,14 @@ def shown():
     """The three charts after so many rows of a wave of this height."""
 
     def shown(height, rows=50):
-        from sim import Rollout
+        from sim import Observation, Rollout
 
         robot = Robot.load("jaco2")
         time = np.linspace(0.02, 1.0, 50)
         wave = np.repeat((height * np.sin(9 * time))[:, None, None], robot.dof, axis=2).astype(np.float32)
         ok = np.ones((50, 1), bool)
-        playback = Playback(robot, Rollout(time, 0.0 * wave.astype(float), wave, wave, wave, wave > 9e9, ok))
+        seen = Observation(wave, wave, wave, wave > 9e9, ok)
+        playback = Playback(robot, Rollout(time, 0.0 * wave.astype(float), seen, tick=0.02))
         playback.seek(float(time[rows - 1] - time[0]))
         gui = Gui()
         charts = Charts(gui, playback)

@@ -149,11 +149,11 @@ def test_sets_of_gains_are_the_designed_and_the_tutorials(live):
 def test_given_params_run_as_they_are_until_a_slider_moves():
     """Tuned ones too, which are per unit of the mass matrix."""
     robot = Robot.load("panda")
-    live = Live(robot, 2, workers=0, physics="fast", **robot.tuned())
-    tuned = robot.tuned()["params"]
+    live = Live(robot, 2, workers=0, physics="fast", params=robot.tuned())
+    tuned = robot.tuned()
     assert live.gain_sets("pid") == ("given",)
     live.go_to(robot.settings.target)
-    with Runner(robot, 2, workers=0, physics="fast", **robot.tuned()) as runner:
+    with Runner(robot, 2, workers=0, physics="fast", params=robot.tuned()) as runner:
         runner.reset(live.start)
         for _ in range(3):
             live.advance()
