@@ -97,6 +97,18 @@ class Rollout:
         part = Observation._make(array[:, envs] for array in self.observation)
         return Rollout(self.time, self.setpoint[:, envs], part, self.tick)
 
+    def for_ticks(self, ticks: slice) -> Rollout:
+        """Return the rollout of some ticks."""
+        part = Observation._make(array[ticks] for array in self.observation)
+        return Rollout(self.time[ticks], self.setpoint[ticks], part, self.tick * (ticks.step or 1))
+
+    @staticmethod
+    def join(parts: Sequence[Rollout]) -> Rollout:
+        """Return successive rollouts of the same envs as one."""
+        seen = Observation._make(map(np.concatenate, zip(*(part.observation for part in parts), strict=True)))
+        time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
+        return Rollout(time, setpoint, seen, parts[0].tick)
+
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
         end = f"up to {self.time[-1]:g} s" if ticks else "empty"

@@ -111,7 +111,7 @@ def test_divergence_terminates_and_nothing_that_is_not_finite_comes_out():
     action = np.zeros((2, 9), np.float32)
     env.step(action)
     loop = env.runner._workers[0]._loop
-    loop.ticks[0].ok[0] = False
+    loop.ticks[0].observation.ok[0] = False
     tick = env.runner.step
     env.runner.step = lambda setpoint: broken(tick(setpoint))
     obs, reward, terminated, _, info = env.step(action)
