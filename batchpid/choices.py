@@ -1,7 +1,6 @@
-"""Choices of the law that carry no number, as field-less tuples.
+"""Choices of the law that carry no number, as tuples without fields.
 
-Being tuples without fields they are pytree nodes without leaves: static under every JAX transform, with nothing to
-register, and shown by name.
+To JAX they are pytree nodes without leaves: static under every transform, and nothing has to be registered.
 """
 
 from __future__ import annotations
@@ -10,52 +9,41 @@ from typing import Any, NamedTuple
 
 
 class Everywhere(NamedTuple):
-    """Marker: an option that may be chosen per joint and env holds on all of them, so no mask is needed."""
+    """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
 
 
 class IntegrateFirst(NamedTuple):
-    """Marker: the integral takes in the present error before the effort is computed."""
+    """The present error enters the integral before the effort is computed."""
 
 
 class DerivativeKick(NamedTuple):
-    """Marker: the error before the first sample counts as 0, so the first derivative is a kick (peers do it)."""
+    """The error before the first sample counts as 0, so that the first derivative is a kick."""
 
 
 class WeightFromStart(NamedTuple):
-    """Marker: setpoint weighting measures positions from the first measurement instead of from 0."""
+    """Setpoint weighting measures positions from the first measurement instead of from 0."""
 
 
 class ZeroEffort(NamedTuple):
-    """Marker: a joint with a non-finite input gets effort 0."""
+    """A joint with a non-finite input gets effort 0."""
 
 
 class HoldEffort(NamedTuple):
-    """Marker: a joint with a non-finite input gets its last effort again."""
+    """A joint with a non-finite input gets its last effort again."""
 
 
 class MeasuredRate(NamedTuple):
-    """Marker: the derivative takes the measured velocity, not the difference quotient of positions."""
+    """The derivative takes the measured velocity instead of the difference quotient of positions."""
 
 
 class PerInertia(NamedTuple):
-    """Marker: the gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
+    """Gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
 
 
 class PerMassMatrix(NamedTuple):
-    """Marker: the gains give accelerations, for the whole mass matrix to turn into efforts."""
+    """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
 
-MARKERS = (
-    Everywhere,
-    IntegrateFirst,
-    DerivativeKick,
-    WeightFromStart,
-    ZeroEffort,
-    HoldEffort,
-    MeasuredRate,
-    PerInertia,
-    PerMassMatrix,
-)
 CHOICES: dict[str, dict[str, Any]] = {
     "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
@@ -64,4 +52,9 @@ CHOICES: dict[str, dict[str, Any]] = {
     "measurement_rate": {"difference": None, "measured": MeasuredRate()},
     "gain_units": {"effort": None, "inertia": PerInertia(), "mass_matrix": PerMassMatrix()},
 }
-"""Options chosen by name, and the marker that each name puts into the params (the first is the default)."""
+"""Options chosen by name, and what each name puts into the params; the first is the default."""
+CHOICE_TYPES: tuple[type[Any], ...] = (
+    Everywhere,
+    *(type(one) for named in CHOICES.values() for one in named.values() if one is not None),
+)
+"""Types that a choice can have in the params."""

@@ -80,7 +80,7 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
         weight_origin=params.weight_origin,
         non_finite=params.non_finite,
     )
-    return coefficients if num_envs is None else _spread(coefficients, (num_envs, params.joints))
+    return coefficients if num_envs is None else _spread(coefficients, (num_envs, params.num_joints))
 
 
 def _spread(coefficients: Coefficients, shape: tuple[int, int]) -> Coefficients:

@@ -49,7 +49,7 @@ def advance_with_mass_matrix(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    aux: bool = False,
+    terms: bool = False,
 ) -> Any:
     """Do one step of the law in accelerations; return efforts. Otherwise as :func:`batchpid.advance`.
 
@@ -63,7 +63,7 @@ def advance_with_mass_matrix(
     xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
     low, high = k.effort_min, k.effort_max
     free = k._replace(effort_min=None, effort_max=None)
-    new, a, *terms = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, None, aux)
+    new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, None, terms)
     wanted = _multiply(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     share = None
@@ -76,9 +76,9 @@ def advance_with_mass_matrix(
         if not isinstance(k.conditional, Everywhere):
             deeper = deeper & (k.conditional > 0)
         new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
-    if not aux:
+    if not terms:
         return new, effort
-    t = terms[0]
+    t = shown[0]
     efforts = Terms(
         p=_multiply(mass_matrix, t.p),
         i=_multiply(mass_matrix, t.i),

@@ -69,7 +69,7 @@ class BatchPID:
         if not isinstance(params, PIDParams):
             raise _no_params(params)
         self._dt, self._backend, self._names = float(dt), backend, joint_names
-        self._shape = (int(num_envs), params.joints)
+        self._shape = (int(num_envs), params.num_joints)
         self._engine = NumPyBackend(self._dt, terms) if backend == "numpy" else JAXBackend(self._dt, terms)
         self._keeps_terms = terms
         self._state: PIDState | None = None
@@ -84,7 +84,7 @@ class BatchPID:
         return self._shape[0]
 
     @property
-    def joints(self) -> int:
+    def num_joints(self) -> int:
         """Number of joints."""
         return self._shape[1]
 
@@ -112,9 +112,9 @@ class BatchPID:
     def params(self, params: PIDParams) -> None:
         if not isinstance(params, PIDParams):
             raise _no_params(params)
-        if params.joints != self.joints:
+        if params.num_joints != self.num_joints:
             raise InvalidArgumentError(
-                "params", f"hold {params.joints} joints, not {self.joints}", remedy="give one gain per joint"
+                "params", f"hold {params.num_joints} joints, not {self.num_joints}", remedy="give one gain per joint"
             )
         params.check(self.num_envs, self._names)
         if self._params is not None and params.dtype != self._params.dtype:

@@ -32,7 +32,7 @@ def drive_target(
 
     Arrays are as in :func:`batchpid.step`; the idea is from the SAPIEN authors' answer in haosulab/SAPIEN#178.
     """
-    state, _, terms = step(
+    state, _, shown = step(
         params,
         state,
         setpoint,
@@ -41,8 +41,8 @@ def drive_target(
         measurement_rate=measurement_rate,
         setpoint_rate=setpoint_rate,
         feedforward=feedforward,
-        aux=True,
+        terms=True,
     )
-    xp = namespace(*params, terms.i, setpoint)
+    xp = namespace(*params, shown.i, setpoint)
     driven = params.kp > 0
-    return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)
+    return state, setpoint + xp.where(driven, shown.i, 0) / xp.where(driven, params.kp, 1)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.choices import MARKERS
+from batchpid.choices import CHOICE_TYPES
 
 TURN = 2 * math.pi
-_NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *MARKERS})
+_NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
 def namespace(*leaves: Any) -> Any:

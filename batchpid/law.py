@@ -71,9 +71,9 @@ def step(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    aux: bool = False,
+    terms: bool = False,
 ) -> Any:
-    """Advance the law by ``dt`` seconds; return ``(state, effort)``, with ``aux`` also :class:`Terms`.
+    """Advance the law by ``dt`` seconds; return ``(state, effort)``, with ``terms`` also :class:`Terms`.
 
     Arrays are (envs, joints), or (1, joints) for all envs alike, in the params' dtype; none is written to.
 
@@ -104,7 +104,7 @@ def step(
         measurement_rate,
         setpoint_rate,
         feedforward,
-        aux,
+        terms,
     )
 
 
@@ -116,7 +116,7 @@ def advance(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    aux: bool = False,
+    terms: bool = False,
 ) -> Any:
     """Do one step with coefficients at hand; otherwise as :func:`step`."""
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
@@ -181,7 +181,7 @@ def advance(
     if finite is not None:
         new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
         effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
-    if not aux:
+    if not terms:
         return new, effort
 
     zero = xp.zeros_like(u)

@@ -70,7 +70,7 @@ class PIDParams(NamedTuple):
     """PerInertia() or PerMassMatrix(), for who runs the law on a robot; off: the gains give efforts."""
 
     @property
-    def joints(self) -> int:
+    def num_joints(self) -> int:
         """Number of joints."""
         return int(self.kp.shape[-1])
 
@@ -101,7 +101,7 @@ class PIDParams(NamedTuple):
                 options[name] = np.array(leaf)
         if self.continuous is not None:
             options["continuous"] = options["continuous"] > 0
-        strategy = np.full((1, self.joints), "none", dtype=object)
+        strategy = np.full((1, self.num_joints), "none", dtype=object)
         if self.tracking_time is not None:
             strategy = np.where(np.isfinite(options["tracking_time"]), "back_calculation", strategy)
         if self.conditional is not None:
@@ -119,16 +119,16 @@ class PIDParams(NamedTuple):
                 known.pop(f"{end}_max", None)
         if "anti_windup" in options:
             known.pop("tracking_time", None)
-        return make_params(self.joints, **{**known, **options})
+        return make_params(self.num_joints, **{**known, **options})
 
     def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
         """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
-        expected = f"(1, {self.joints}) or ({num_envs}, {self.joints})"
+        expected = f"(1, {self.num_joints}) or ({num_envs}, {self.num_joints})"
         for name, leaf in zip(self._fields, self, strict=True):
             if not _is_array(leaf):
                 continue
             array = np.asarray(leaf)
-            if array.shape not in ((1, self.joints), (num_envs, self.joints)):
+            if array.shape not in ((1, self.num_joints), (num_envs, self.num_joints)):
                 raise InvalidArgumentError(
                     f"params.{name}",
                     f"has shape {array.shape}, not {expected}",

@@ -137,7 +137,7 @@ def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
     return [
         [
             ScalarPID(**{name: pick(value, env, joint) for name, value in options.items()})
-            for joint in range(params.joints)
+            for joint in range(params.num_joints)
         ]
         for env in range(num_envs)
     ]

@@ -69,10 +69,10 @@ def save_params(
         If the names do not fit the params, or the suffix is another.
     """
     path, names = Path(path), [str(name) for name in joint_names]
-    if len(names) != params.joints or len(set(names)) != len(names):
+    if len(names) != params.num_joints or len(set(names)) != len(names):
         raise InvalidArgumentError(
             "joint_names",
-            f"are not {params.joints} different names",
+            f"are not {params.num_joints} different names",
             value=names,
             remedy="name every joint of the params once",
         )

@@ -78,7 +78,7 @@ class PIDControl(Control):
         if not last:
             self.state, effort = bp.advance(self._coefficients, self.state, *inputs)
         else:
-            self.state, effort, terms = bp.advance(self._coefficients, self.state, *inputs, aux=True)
+            self.state, effort, terms = bp.advance(self._coefficients, self.state, *inputs, terms=True)
             self.saturated = terms.saturated
         return effort
 
@@ -113,7 +113,7 @@ class InertiaPIDControl(PIDControl):
             feedforward = viscous if feedforward is None else feedforward + viscous
         rates = (qvel if self.params.measurement_rate is not None else None, self._setpoint_rate)
         if self._whole:
-            self.state, effort, *aux = advance_with_mass_matrix(
+            self.state, effort, *terms = advance_with_mass_matrix(
                 self._coefficients,
                 self.state,
                 self._setpoint,
@@ -121,16 +121,16 @@ class InertiaPIDControl(PIDControl):
                 self._matrix,
                 *rates,
                 feedforward,
-                aux=last,
+                terms=last,
             )
         else:
             diagonal = np.diagonal(self._matrix, axis1=1, axis2=2)
             coefficients = per_inertia(self._coefficients, diagonal)
-            self.state, effort, *aux = bp.advance(
-                coefficients, self.state, self._setpoint, qpos, *rates, feedforward, aux=last
+            self.state, effort, *terms = bp.advance(
+                coefficients, self.state, self._setpoint, qpos, *rates, feedforward, terms=last
             )
         if last:
-            self.saturated = aux[0].saturated
+            self.saturated = terms[0].saturated
         return effort
 
 
@@ -235,10 +235,10 @@ def check_params(params: bp.PIDParams, robot: Robot, num_envs: int, control: str
             remedy="use control 'pid', or params with gain_units 'effort'",
         )
     check_gain_units(params)
-    if params.joints != robot.dof:
+    if params.num_joints != robot.dof:
         raise InvalidArgumentError(
             "params",
-            f"hold {params.joints} joints, robot {robot.name!r} has {robot.dof}",
+            f"hold {params.num_joints} joints, robot {robot.name!r} has {robot.dof}",
             remedy=f"give one gain for each of {', '.join(robot.joint_names)}",
         )
     if params.num_envs not in (1, num_envs):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.choices import MARKERS
+from batchpid.choices import CHOICE_TYPES
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
 from sim.loop.faults import CAUSES, Containment
@@ -184,7 +184,7 @@ class Snapshot:
 
 
 def _marker(kind: str) -> tuple[()]:
-    known = {marker.__name__: marker for marker in MARKERS}
+    known = {marker.__name__: marker for marker in CHOICE_TYPES}
     return known[kind]()
 
 

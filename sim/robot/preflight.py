@@ -73,11 +73,11 @@ def check(
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
     findings += _touching(robot, start)
     if params is not None:
-        if not isinstance(params, bp.PIDParams) or params.joints != robot.dof:
+        if not isinstance(params, bp.PIDParams) or params.num_joints != robot.dof:
             raise InvalidArgumentError(
                 "params",
                 f"must be PIDParams of {robot.dof} joints",
-                value=type(params).__name__ if not isinstance(params, bp.PIDParams) else params.joints,
+                value=type(params).__name__ if not isinstance(params, bp.PIDParams) else params.num_joints,
                 remedy="build them with robot.params()",
             )
         findings += _params(robot, params, control)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DT, ENVS, GAINS, JOINTS, LIMITED, OPTIONS
+from law_cases import DT, ENVS, GAINS, JOINTS, LIMITED, OPTIONS
 
 import batchpid as bp
 from batchpid import backends

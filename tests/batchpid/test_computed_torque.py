@@ -33,7 +33,7 @@ def test_the_effort_is_within_limits_and_keeps_the_direction_of_the_acceleration
     y, r = rng.normal(size=(2, envs, joints))
     k = bp.discretise(p, DT)
     state = bp.init(p, y)
-    new, effort, terms = advance_with_mass_matrix(k, state, r, y, matrix, feedforward=passive, aux=True)
+    new, effort, terms = advance_with_mass_matrix(k, state, r, y, matrix, feedforward=passive, terms=True)
     free = k._replace(effort_min=None, effort_max=None)
     _, acceleration = bp.advance(free, state, r, y)
     np.testing.assert_allclose(terms.unsaturated, np.einsum("eij,ej->ei", matrix, acceleration) + passive)
@@ -80,7 +80,7 @@ def test_every_joint_of_a_coupled_robot_responds_alike_and_on_a_straight_line():
         state = bp.init(p, q)
         saturated = False
         for _ in range(400):
-            state, effort, terms = advance_with_mass_matrix(k, state, goal, q, matrix, aux=True)
+            state, effort, terms = advance_with_mass_matrix(k, state, goal, q, matrix, terms=True)
             saturated |= bool(terms.saturated.any())
             v = v + DT * np.einsum("eij,ej->ei", inverse, effort)
             q = q + DT * v

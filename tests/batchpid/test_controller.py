@@ -6,7 +6,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from conftest import DT, ENVS, JOINTS, LIMITED
+from law_cases import DT, ENVS, JOINTS, LIMITED
 
 import batchpid as bp
 

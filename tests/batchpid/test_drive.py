@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import DT, ENVS, JOINTS
+from law_cases import DT, ENVS, JOINTS
 
 import batchpid as bp
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import DT, ENVS, JOINTS, Backend, read_only
+from law_cases import DT, ENVS, JOINTS, Backend, read_only
 
 import batchpid as bp
 from batchpid.reference import ScalarPID, SimplePID, scalar_pids
@@ -38,7 +38,7 @@ def compare(backend, options, inputs, given):
             backend.array(inputs.setpoint[t]),
             backend.array(inputs.measurement[t]),
             dt=DT,
-            aux=True,
+            terms=True,
             **keywords,
         )
         expected = np.array(
@@ -80,7 +80,7 @@ def test_terms_add_up(options, inputs):
             inputs.measurement[t],
             DT,
             feedforward=inputs.feedforward[t],
-            aux=True,
+            terms=True,
         )
         assert np.array_equal(terms.feedforward, inputs.feedforward[t])
         np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from conftest import DT, ENVS, JOINTS, LIMITED, OPTIONS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from law_cases import DT, ENVS, JOINTS, LIMITED, OPTIONS
 
 import batchpid as bp
 
@@ -21,7 +21,7 @@ def roll(params, r, y, ff=None, state=None):
     """Return the states and the terms of a run."""
     state, states, terms = bp.init(params, y[0]) if state is None else state, [], []
     for t in range(len(r)):
-        state, _, shown = bp.step(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], aux=True)
+        state, _, shown = bp.step(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], terms=True)
         states.append(state)
         terms.append(shown)
     return states, terms
@@ -120,7 +120,7 @@ def test_a_non_finite_input_stays_where_it_is(run, bad, which, policy):
 def test_opposite_infinities_and_huge_numbers_are_told_apart():
     params = bp.make_params(2, 1e-9, non_finite="zero")
     r, y = np.array([[np.inf, 1e308]]), np.array([[np.inf, 1e308]])
-    _, effort, terms = bp.step(params, bp.init(params, np.ones((1, 2))), r, y, DT, aux=True)
+    _, effort, terms = bp.step(params, bp.init(params, np.ones((1, 2))), r, y, DT, terms=True)
     assert terms.finite.tolist() == [[False, True]]
     assert effort.tolist() == [[0, 0]]
 
@@ -128,7 +128,7 @@ def test_opposite_infinities_and_huge_numbers_are_told_apart():
 def test_without_the_option_a_nan_is_passed_on():
     params = bp.make_params(2, 1.0, 1.0, 1.0, effort_limit=3.0, anti_windup="conditional")
     y = np.array([[0.0, np.nan]])
-    _, effort, terms = bp.step(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT, aux=True)
+    _, effort, terms = bp.step(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT, terms=True)
     assert np.isfinite(effort[0, 0])
     assert np.isnan(effort[0, 1])
     assert terms.finite.tolist() == [[True, False]]
@@ -261,7 +261,7 @@ def test_nothing_given_is_written_to_or_kept(case, run):
         for leaf in state:
             if leaf is not None:
                 leaf.setflags(write=False)
-        state, effort, terms = bp.step(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], aux=True)
+        state, effort, terms = bp.step(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], terms=True)
         kept = effort.copy()
         effort += 1e6  # the caller's own, from here on
     assert np.array_equal(kept, expected.effort)

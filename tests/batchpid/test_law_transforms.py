@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DT, ENVS, JOINTS
+from law_cases import DT, ENVS, JOINTS
 
 import batchpid as bp
 

@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from conftest import ENVS, JOINTS
+from law_cases import ENVS, JOINTS
 
 import batchpid as bp
 
@@ -17,7 +17,7 @@ def test_scalars_and_vectors_broadcast():
     assert params.ki.tolist() == [[1, 2, 3]]
     assert params.kd.tolist() == per_env.tolist()
     assert params.deadband.tolist() == [[0.1] * 3, [0.2] * 3]
-    assert (params.joints, params.num_envs, params.dtype) == (3, 2, np.float64)
+    assert (params.num_joints, params.num_envs, params.dtype) == (3, 2, np.float64)
     assert params.for_envs(slice(1, 2)).kd.tolist() == [[3, 4, 5]]
     assert params.for_envs(slice(1, 2)).kp is params.kp
 

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from conftest import JOINTS, OPTIONS
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from law_cases import JOINTS, OPTIONS
 
 import batchpid as bp
 
