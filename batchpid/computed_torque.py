@@ -116,6 +116,30 @@ def check_gain_units(params: PIDParams) -> None:
             )
 
 
+def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Any) -> PIDState:
+    """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of gain_units.
+
+    I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes M^-1 I, an
+    acceleration M I. The integral limits of ``new`` hold.
+
+    Parameters
+    ----------
+    old, new
+        Params before and after the change.
+    mass_matrix
+        (envs, joints, joints) at the present positions [kg m^2 or kg].
+    """
+    was, becomes = (isinstance(params.gain_units, PerMassMatrix) for params in (old, new))
+    if state.integral is None or was == becomes:
+        return state
+    xp = namespace(state.integral, mass_matrix)
+    if was:
+        integral = _multiply(mass_matrix, state.integral)
+    else:
+        integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
+    return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
+
+
 def _multiply(matrix: Any, vector: Any) -> Any:
     """Return matrix @ vector for each env; the sum of each row is taken in one order, whatever the number of envs."""
     return (matrix * vector[:, None, :]).sum(-1)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia
+from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
 from batchpid.errors import InvalidArgumentError
 
 DT = 1e-3
@@ -123,3 +123,27 @@ def test_options_without_meaning_are_refused_by_name():
         with pytest.raises(InvalidArgumentError, match="mass_matrix"):
             check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="mass_matrix", **options))
         check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="inertia", **options))
+
+
+@pytest.mark.parametrize("unit", ["effort", "inertia"])
+def test_a_change_of_gain_units_keeps_the_effort_of_the_integral(unit):
+    """Both ways, in the middle of a run; a change that keeps the integral's unit keeps the state."""
+    rng = np.random.default_rng(5)
+    matrix, y = mass(rng, 3, 4), rng.normal(size=(3, 4))
+    whole, other = params(4), params(4).replace(gain_units=unit)
+    state = bp.init(other, y)._replace(integral=rng.normal(size=(3, 4)))
+    there = convert_integral(state, other, whole, matrix)
+    *_, terms = advance_with_mass_matrix(bp.discretise(whole, DT), there, y, y, matrix, terms=True)
+    np.testing.assert_allclose(terms.i, state.integral)
+    back = convert_integral(there, whole, other, matrix)
+    np.testing.assert_allclose(back.integral, state.integral)
+    assert convert_integral(state, other, params(4).replace(gain_units="effort"), matrix) is state
+    assert convert_integral(bp.PIDState(), other, whole, matrix) == bp.PIDState()
+
+
+def test_a_converted_integral_is_within_its_limits():
+    limited = params(1, integral_limit=2.0)
+    state = convert_integral(
+        bp.PIDState(np.full((1, 1), 6.0)), params(1).replace(gain_units="effort"), limited, 2.0 * np.ones((1, 1, 1))
+    )
+    assert state.integral.tolist() == [[2.0]]
