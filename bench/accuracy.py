@@ -1,6 +1,6 @@
-"""What error each physics preset makes, as a table: ``python bench/accuracy.py [--json FILE]`` (two minutes).
+"""Table of each physics preset's errors: ``python bench/accuracy.py [--json FILE]`` (two minutes).
 
-The figures do not depend on the machine's speed. What a preset costs, ``batchpid bench`` tells.
+The figures do not depend on the machine's speed. ``batchpid bench`` measures the speed of the presets.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ from typing import Any
 import tyro
 
 from sim import Robot
-from sim.benchmark.accuracy import REFERENCES, TIMESTEP, measure
+from sim.benchmark.accuracy import REFERENCES, TIMESTEP, measure_errors
 from sim.cli.report import table
 
-THINNED = 20
+EVERY = 20
+"""Sim steps from one written error to the next."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Errors of the physics presets beside references 20 times finer, under the robots' tuned gains."""
+    """Errors of the physics presets against references 20 times finer, under the robots' tuned gains."""
 
     count: int = 8
-    """Moves of each kind."""
+    """Number of moves of each kind."""
     seconds: float = 1.0
     """Length of a move."""
     json: Path | None = None
@@ -32,11 +33,11 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Print the table, and write the figures."""
+    """Print the table and write the figures."""
     figures: list[dict[str, Any]] = []
     for name in Robot.bundled():
         for motion in REFERENCES:
-            errors = measure(Robot.load(name), motion, count=options.count, seconds=options.seconds)
+            errors = measure_errors(Robot.load(name), motion, count=options.count, seconds=options.seconds)
             for (physics, reference), error in errors.items():
                 figures.append(
                     {
@@ -47,8 +48,8 @@ def main(options: Options) -> None:
                         "max": error.largest,
                         "rms": error.rms,
                         "over_time": {
-                            "seconds": THINNED * TIMESTEP,
-                            "max": [float(f"{value:.3g}") for value in error.over_time[THINNED - 1 :: THINNED]],
+                            "seconds": EVERY * TIMESTEP,
+                            "max": [float(f"{value:.3g}") for value in error.over_time[EVERY - 1 :: EVERY]],
                         },
                     }
                 )

@@ -1,15 +1,14 @@
-"""What else steps many robots on a CPU: MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop.
+"""Time of an env step of third-party baselines: MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop.
 
 The same moves as in ``test_throughput.py``, and the same groups. ``batchpid bench --peers`` prints them paired.
 """
 
 import pytest
-from test_throughput import ROUNDS, record
+from test_throughput import measure
 
 from sim import Robot
-from sim.benchmark.benchmark import check_motion
 from sim.benchmark.peers import PEERS, make_peer
-from sim.benchmark.setup import Setup
+from sim.benchmark.workload import Workload
 
 
 @pytest.mark.parametrize("peer", PEERS)
@@ -17,13 +16,5 @@ from sim.benchmark.setup import Setup
 def test_peer(benchmark, name, peer):
     pytest.importorskip(PEERS[peer].package)
     benchmark.group = f"{name}, accurate"
-    setup = Setup(Robot.load(name))
-    stepper = make_peer(peer, setup)
-    try:
-        steps, final = benchmark.pedantic(
-            stepper.run, (setup.ticks,), setup=stepper.reset, rounds=ROUNDS, warmup_rounds=1
-        )
-    finally:
-        stepper.close()
-    check_motion(peer, final, setup)
-    record(benchmark, steps)
+    workload = Workload(Robot.load(name))
+    measure(benchmark, workload, peer, make_peer(peer, workload))

@@ -1,11 +1,11 @@
-"""Env-steps per second of the closed loop by the number of envs, of workers, and of sim steps in a tick."""
+"""Time of an env step of the closed loop by the number of envs, of workers, and of sim steps in a tick."""
 
 import numpy as np
 import pytest
-from test_throughput import ROUNDS, record
+from test_throughput import ROUNDS, report_per_env_step
 
 from sim import Robot, Runner
-from sim.benchmark.setup import Setup
+from sim.benchmark.workload import Workload
 
 
 @pytest.mark.parametrize("num_envs", [1, 8, 64, 512, 2048])
@@ -27,19 +27,18 @@ def test_scaling_substeps(benchmark, substeps):
 
 
 def run_scaling(benchmark, num_envs, workers, substeps, steps):
-    """``steps`` sim steps in ticks of ``substeps``."""
+    """Measure ``steps`` sim steps in ticks of ``substeps``."""
     robot = Robot.load("panda")
-    setup = Setup(robot)
-    ticks = max(1, steps // substeps)
-    with Runner(robot, num_envs, workers=workers, substeps=substeps) as runner:
-        runner.reset(setup.start)
+    workload, ticks = Workload(robot), max(1, steps // substeps)
+    with Runner(robot, num_envs, params=robot.params(), workers=workers, substeps=substeps) as runner:
+        runner.reset(workload.start)
 
         def run():
             for _ in range(ticks):
-                obs = runner.step(setup.target)
+                obs = runner.step(workload.target)
             return obs
 
         obs = benchmark.pedantic(run, rounds=ROUNDS, warmup_rounds=1)
     assert obs.ok.all()
-    assert (np.abs(obs.qpos - setup.start)[:, setup.moving].max(axis=1) > 1e-4).all(), "the robots did not move"
-    record(benchmark, num_envs * ticks * substeps)
+    assert (np.abs(obs.qpos - workload.start)[:, workload.moving].max(axis=1) > 1e-4).all(), "the robots did not move"
+    report_per_env_step(benchmark, num_envs * ticks * substeps)

@@ -1,14 +1,14 @@
-r"""What error the engine makes at the runner's timestep, beside a reference that steps 20 times as often.
+r"""Error of the engine at the runner's timestep, against references that step 20 times as often.
 
-The robots of engine and reference are under the same controller, which works at the runner's rate in both: between two
-of its efforts the reference makes 20 steps. So the error is the engine's, as it remains under feedback.
+Engine and reference are under the same controller at the runner's rate: between two of its efforts the reference makes
+20 steps. So the error is the engine's, as it remains under feedback.
 
-In free motion the reference is the equation of motion itself, in double precision, by a Runge-Kutta method::
+In free motion the reference is the equation of motion, in double precision, by a Runge-Kutta method::
 
     M(q) q'' + C(q, q') q' + B q' + g(q) = u
 
-In contact it is the engine with a twentieth of the timestep. It has two solvers, which resolve friction differently
-where links slide, however fine the steps; so there are two references, and each error is told against both.
+In contact it is the engine with a twentieth of the timestep. Its two solvers resolve friction differently where links
+slide, however fine the steps; so there are two references, and an error against each.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from sim.tuning.moves import Moves, random_moves
 Float64 = NDArray[np.float64]
 
 TIMESTEP = 1 / 2000
-FINER = 20
+REFINEMENT = 20
 """Steps of the reference in one of the engine's."""
 REFERENCES: dict[str, dict[str, Physics | None]] = {
-    # motion: name of each reference -> its solver; None is the equation of motion
+    # motion: {name of a reference: its solver, or None for the equation of motion}
     "free": {"equation of motion": None},
     "contact": {"PGS, finer": Physics("PGS", 50), "TGS, finer": Physics("TGS", 10)},
     "limit": {"PGS, finer": Physics("PGS", 50)},
 }
-"""What the engine is compared with."""
+"""References of each kind of motion."""
 APPROACH, PRESS = 0.2, 0.02
-"""A move into contact begins this far before the first touch, and its target is this far behind it [rad or m]."""
+"""Distance before the first touch at which a move into contact begins, and behind it at which it ends [rad or m]."""
 BEYOND = 0.1
-"""How far beyond its limit a joint is sent [rad]."""
+"""Distance beyond its limit to which a joint is sent [rad]."""
 _LINE = 60
 _TRIES = 100
 
 
 class Plant(Protocol):
-    """What is under control: the part of :class:`sim.engine.pack.Pack` that a loop needs. Arrays are (M, dof)."""
+    """Robots under control: the part of :class:`sim.engine.pack.Pack` that a loop needs. Arrays are (M, dof)."""
 
     def read_qpos(self) -> Float64: ...  # noqa: D102
     def read_qvel(self) -> Float64: ...  # noqa: D102
@@ -61,33 +61,33 @@ class Plant(Protocol):
 
 
 class EquationOfMotion:
-    """Robots without contact and joint limits in double precision, by steps of the Runge-Kutta method of order 4."""
+    """:class:`Plant` without contact and joint limits, by steps of the Runge-Kutta method of order 4."""
 
-    def __init__(self, probe: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
-        self._probe, self._damping, self._h = probe, damping, timestep
+    def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
+        self._dynamics, self._damping, self._h = dynamics, damping, timestep
         self._qpos, self._qvel = qpos.copy(), np.zeros_like(qpos)
         self._effort = np.zeros_like(qpos)
 
     def read_qpos(self) -> Float64:
-        """Joint positions [rad or m]."""
+        """Return the joint positions [rad or m]."""
         return self._qpos
 
     def read_qvel(self) -> Float64:
-        """Joint velocities [rad/s or m/s]."""
+        """Return the joint velocities [rad/s or m/s]."""
         return self._qvel
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        """Joint efforts that cancel gravity and Coriolis and centrifugal forces [N m or N]."""
-        still, dynamics = np.zeros_like(self._qpos), self._probe.inverse_dynamics
-        bias = dynamics(self._qpos, self._qvel if coriolis else still, still)
-        return bias if gravity else bias - dynamics(self._qpos, still, still)
+        """Return the joint efforts that cancel gravity and Coriolis and centrifugal forces [N m or N]."""
+        still, inverse_dynamics = np.zeros_like(self._qpos), self._dynamics.inverse_dynamics
+        bias = inverse_dynamics(self._qpos, self._qvel if coriolis else still, still)
+        return bias if gravity else bias - inverse_dynamics(self._qpos, still, still)
 
     def write_qf(self, effort: Float64) -> None:
         """Apply joint efforts [N m or N] from now on."""
         self._effort = effort
 
     def step(self) -> None:
-        """One step."""
+        """Make one step."""
         q, v, h = self._qpos, self._qvel, self._h
         a1 = self._acceleration(q, v)
         a2 = self._acceleration(q + h / 2 * v, v + h / 2 * a1)
@@ -97,7 +97,7 @@ class EquationOfMotion:
         self._qvel = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
 
     def _acceleration(self, qpos: Float64, qvel: Float64) -> Float64:
-        return self._probe.forward_dynamics(qpos, qvel, self._effort - self._damping * qvel)
+        return self._dynamics.forward_dynamics(qpos, qvel, self._effort - self._damping * qvel)
 
 
 class Accuracy(NamedTuple):
@@ -111,10 +111,10 @@ class Accuracy(NamedTuple):
     """Largest over joints and envs at each sim step (steps,) [rad]."""
 
 
-def measure(
+def measure_errors(
     robot: Robot, motion: str, physics: dict[str, Physics] = PHYSICS, count: int = 8, seconds: float = 1.0
 ) -> dict[tuple[str, str], Accuracy]:
-    """Errors of each solver of ``physics`` under the robot's tuned gains, against each reference, by their names.
+    """Return the errors of each solver of ``physics`` under the robot's tuned gains, by (solver, reference).
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def measure(
         "free": to random poses, touching nothing; "contact": until a link presses on the ground or on another;
         "limit": a joint against its limit.
     count
-        How many moves, run side by side.
+        Number of moves, run side by side.
 
     Raises
     ------
@@ -134,37 +134,35 @@ def measure(
     moves = _MOVES[motion](robot, integer("count", count, 1, 10_000))
     revolute = np.array([joint.type != "prismatic" for joint in robot.joints])
     turn = 2 * np.pi * robot.continuous[revolute]
-    runs = {name: follow(robot, moves, steps, solver) for name, solver in physics.items()}
+    runs = {name: _simulate(robot, moves, steps, solver) for name, solver in physics.items()}
     result = {}
     for other, solver in references.items():
-        reference = follow(robot, moves, steps, solver, FINER)
+        reference = _simulate(robot, moves, steps, solver, REFINEMENT)
         for name, run in runs.items():
             error = (run - reference)[..., revolute]
             error -= turn * np.round(error / (2 * np.pi))
-            result[name, other] = Accuracy(
-                float(np.abs(error).max()),
-                float(np.sqrt((error**2).mean())),
-                np.abs(error).max((1, 2)),
-            )
+            largest = np.abs(error).max((1, 2))
+            result[name, other] = Accuracy(float(largest.max()), float(np.sqrt((error**2).mean())), largest)
     return result
 
 
-def follow(robot: Robot, moves: Moves, steps: int, solver: Physics | None, finer: int = 1) -> Float64:
-    """Positions (steps, moves, dof) after each period of the controller, from rest at the moves' starts.
+def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, refinement: int = 1) -> Float64:
+    """Return the positions (steps, moves, dof) after each period of the controller, from rest at the moves' starts.
 
-    ``solver`` None is the equation of motion. ``finer`` steps are made in each period.
+    ``solver`` None is the equation of motion. ``refinement`` sim steps are made in each period.
     """
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
-    size, plant = len(moves.start), _plant(robot, moves, solver, TIMESTEP / finer)
-    control = make_control("pid", spec, robot.tuned(), size)
-    control.set_params(plant, robot.tuned())  # type: ignore[arg-type]
+    size, plant = len(moves.start), _plant(robot, moves, solver, TIMESTEP / refinement)
+    params = robot.tuned()
+    control = make_control("pid", spec, params, size)
+    control.set_params(plant, params)  # type: ignore[arg-type]
     control.reset(plant.read_qpos(), np.ones(size, bool))
     control.begin(plant, steps, moves.target)  # type: ignore[arg-type]
     table = np.empty((steps, *moves.start.shape))
     for step in range(steps):
         passive = plant.passive_force(True, True)
         plant.write_qf(control.effort(plant, plant.read_qpos(), passive, step, False))  # type: ignore
-        for _ in range(finer):
+        for _ in range(refinement):
             plant.step()
         table[step] = plant.read_qpos()
     return table
@@ -180,29 +178,26 @@ def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) 
 
 
 def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
-    """``count`` seeded moves from free poses until some link presses on the ground or on another link, gently."""
-    probe, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+    """Return ``count`` seeded moves from free poses until some link presses gently on the ground or on another."""
+    dynamics, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
 
     def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
         here, there = robot.sample(2, seed=int(rng.integers(2**31)))
-        touches = probe.touches(here + line * (there - here))
+        touches = dynamics.touches(here + line * (there - here))
         touch = here + line[np.argmax(touches)] * (there - here)
         if touches[0] or not touches.any() or np.abs(touch - here).max() < APPROACH:
             return None
-        way = (there - here) / np.abs(there - here).max()
-        return touch - APPROACH * way, np.clip(touch + PRESS * way, robot.lower, robot.upper)
+        direction = (there - here) / np.abs(there - here).max()
+        return touch - APPROACH * direction, np.clip(touch + PRESS * direction, robot.lower, robot.upper)
 
-    return _draw(robot, "contact", count, seed, draw)
+    return _draw_moves(robot, "contact", count, seed, draw)
 
 
 def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
-    """``count`` seeded moves, each of one revolute joint to beyond one of its limits, touching nothing."""
-    probe, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
-    joints = [
-        index
-        for index, joint in enumerate(robot.joints)
-        if joint.type != "prismatic" and np.isfinite([joint.lower, joint.upper]).all()
-    ]
+    """Return ``count`` seeded moves, each of one revolute joint to beyond one of its limits, touching nothing."""
+    dynamics, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+    bounded = np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    joints = [j for j, joint in enumerate(robot.joints) if joint.type != "prismatic" and bounded[j]]
 
     def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
         start = robot.sample(1, seed=int(rng.integers(2**31)))[0]
@@ -211,14 +206,14 @@ def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
         start[joint] = limit - sign * APPROACH
         target = start.copy()
         target[joint] = limit + sign * BEYOND
-        return None if probe.touches(start + line * (target - start)).any() else (start, target)
+        return None if dynamics.touches(start + line * (target - start)).any() else (start, target)
 
-    return _draw(robot, "limit", count, seed, draw if joints else lambda rng: None)
+    return _draw_moves(robot, "limit", count, seed, draw if joints else lambda rng: None)
 
 
-def _draw(
+def _draw_moves(
     robot: Robot,
-    what: str,
+    motion: str,
     count: int,
     seed: int,
     draw: Callable[[np.random.Generator], tuple[Float64, Float64] | None],
@@ -229,11 +224,11 @@ def _draw(
     if len(pairs) < count:
         raise InvalidArgumentError(
             "robot",
-            f"{robot.name!r} has hardly a move of kind {what!r}: {len(pairs)} of {count} were found",
+            f"{robot.name!r} has hardly a move of kind {motion!r}: {len(pairs)} of {count} were found",
             remedy="look at its collision shapes and limits with: batchpid inspect",
         )
     starts, targets = zip(*pairs, strict=True)
-    return Moves(np.array(starts), np.array(targets), (what,) * count)
+    return Moves(np.array(starts), np.array(targets), (motion,) * count)
 
 
 _MOVES = {"free": random_moves, "contact": contact_moves, "limit": limit_moves}

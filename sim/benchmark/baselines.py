@@ -1,26 +1,26 @@
-"""Processes that step scenes without a Runner: baselines of :mod:`sim.benchmark.benchmark`."""
+"""Baselines of the benchmark that step SAPIEN without a Runner, in worker processes."""
 
 from __future__ import annotations
 
 import gc
 import multiprocessing
 import os
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.benchmark.setup import Setup
 from sim.benchmark.tutorial import TutorialLoop
+from sim.benchmark.workload import Case, Workload
 from sim.engine.building import parse
 from sim.engine.pack import Pack
 from sim.workers.pool import cores_of_their_own
 from sim.workers.worker import ONE_THREAD
 
 Float64 = NDArray[np.float64]
+TUTORIALS = ("tutorial", "tutorial, a process a core")
 ENGINES = {
     # case: (scenes to a PhysX system, whether all systems are stepped in turn)
     "drive, a scene a robot": (1, True),
@@ -30,58 +30,56 @@ ENGINES = {
 }
 
 
-def run_baseline(case: str, processes: Sequence[BaselineProcess], setup: Setup) -> tuple[float, int, Float64]:
-    """Run one round of ``case`` on ``processes`` at once: (seconds, env-steps, where the first env ended)."""
-    for process in processes:
-        process.prepare(case)
-    began = time.perf_counter()
-    for process in processes:
-        process.go()
-    results = [process.result() for process in processes]
-    seconds = time.perf_counter() - began
-    return seconds, sum(steps for steps, _ in results), results[0][1]
-
-
-class BaselineProcess:
-    """A process that steps its share of the scenes by process, case after case."""
-
-    def __init__(self, setup: Setup, index: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        count = max(setup.workers, 1)
-        share = setup.num_envs * (index + 1) // count - setup.num_envs * index // count
+def make_baselines(workload: Workload) -> dict[str, Case]:
+    """Return every baseline, by name. All run in one set of processes, each of which steps its share of the envs."""
+    count = workload.processes
+    bounds = [workload.num_envs * index // count for index in range(count + 1)]
+    context, cores = multiprocessing.get_context("spawn"), cores_of_their_own(count)
+    connections, processes = [], []
+    for index in range(count):
+        ours, theirs = context.Pipe()
+        arguments = (theirs, workload, bounds[index + 1] - bounds[index])
+        process = context.Process(target=_serve, args=arguments, daemon=True)
         with single_threaded():
-            self._process = context.Process(target=_serve, args=(theirs, setup, share), daemon=True)
-            self._process.start()
+            process.start()
         theirs.close()
-        if cores := cores_of_their_own(count):
-            os.sched_setaffinity(self._process.pid or 0, {cores[index]})
+        if cores:
+            os.sched_setaffinity(process.pid or 0, {cores[index]})
+        connections.append(ours)
+        processes.append(process)
 
-    def prepare(self, case: str) -> None:
-        """Build what ``case`` needs, and put its robots at the start."""
-        self._connection.send(case)
-        self._connection.recv()
+    def close() -> None:
+        for connection in connections:
+            connection.close()
+        for process in processes:
+            process.join(5.0)
+            if process.is_alive():
+                process.kill()
 
-    def go(self) -> None:
-        """Begin to step."""
-        self._connection.send(None)
+    def case(name: str) -> Case:
+        used = connections[:1] if name == "tutorial" else connections
+        envs = len(used) if name in TUTORIALS else workload.num_envs
 
-    def result(self) -> tuple[int, Float64]:
-        """Wait for the env-steps made, and where the first env ended."""
-        steps, final = self._connection.recv()
-        return steps, final
+        def reset() -> None:
+            for connection in used:
+                connection.send(name)
+            for connection in used:
+                connection.recv()
 
-    def close(self) -> None:
-        """End the process."""
-        self._connection.close()
-        self._process.join(5.0)
-        if self._process.is_alive():
-            self._process.kill()
+        def run() -> Float64:
+            for connection in used:
+                connection.send(None)
+            finals = [connection.recv() for connection in used]
+            return finals[0]
+
+        return Case(workload.steps * envs, reset, run, close)
+
+    return {name: case(name) for name in (*TUTORIALS, *ENGINES)}
 
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Let processes that start now keep to one thread in their BLAS, as the Runner's workers do."""
+    """Limit the BLAS of processes that start now to one thread, as the Runner does with its workers."""
     saved = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
@@ -91,68 +89,50 @@ def single_threaded() -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _serve(connection: Connection, setup: Setup, share: int) -> None:
-    cases: dict[str, _Tutorial | _Engine] = {}
+def _serve(connection: Connection, workload: Workload, share: int) -> None:
+    """Reset to the start, and then run a round of, each case whose name comes; until the connection is closed."""
+    cases: dict[str, TutorialLoop | _DriveLoop] = {}
     gc.disable()
     try:
         while True:
-            case: str = connection.recv()
-            if case not in cases:
-                cases[case] = _Tutorial(setup) if case.startswith("tutorial") else _Engine(case, setup, share)
-            cases[case].reset()
+            name: str = connection.recv()
+            if name not in cases:
+                cases[name] = (
+                    TutorialLoop(workload.robot, workload.target, start=workload.start)
+                    if name in TUTORIALS
+                    else _DriveLoop(name, workload, share)
+                )
+            cases[name].reset()
             connection.send(None)
             connection.recv()
-            connection.send(cases[case].run(setup.ticks * setup.substeps))
+            connection.send(cases[name].run(workload.steps))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass
 
 
-class _Tutorial:
-    """The tutorial's loop, alone in its process."""
+class _DriveLoop:
+    """Scenes under PhysX's drive without control, and without gravity, so that the drive reaches the PID's place."""
 
-    def __init__(self, setup: Setup) -> None:
-        self._start = setup.start
-        self._loop = TutorialLoop(setup.robot, setup.target, start=setup.start)
-
-    def reset(self) -> None:
-        self._loop.reset(self._start)
-
-    def run(self, steps: int) -> tuple[int, Float64]:
-        final = self._loop.run(steps).astype(np.float64)
-        return steps, final
-
-
-class _Engine:
-    """Scenes under PhysX's drive and nothing else: no gravity, so that the drive reaches what the PID reaches."""
-
-    def __init__(self, case: str, setup: Setup, share: int) -> None:
-        assert setup.robot.settings is not None
-        spec = setup.scene(gravity=False)
-        size, self._in_turn = ENGINES[case]
-        self._substeps = setup.substeps
+    def __init__(self, name: str, workload: Workload, share: int) -> None:
+        spec, settings = workload.scene(gravity=False), workload.settings
+        size, self._in_turn = ENGINES[name]
+        self._start, self._substeps = workload.start, workload.substeps
         builder = parse(spec)
         sizes = [min(size, share - first) for first in range(0, share, size)]
         self._packs = [Pack(builder, spec, count, system_size=size, isolates=False) for count in sizes]
-        self._start, self._share = setup.start, share
         for pack in self._packs:
-            stiffness, damping = setup.robot.settings.drive_stiffness, setup.robot.settings.drive_damping
-            pack.write_drive(np.array(stiffness), np.array(damping), np.array(np.inf))
-            pack.write_drive_target(np.tile(setup.target, (pack.size, 1)))
+            pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
+            pack.write_drive_target(np.tile(workload.target, (pack.size, 1)))
 
     def reset(self) -> None:
         for pack in self._packs:
             rows = np.tile(self._start, (pack.size, 1))
             pack.write_state(range(pack.size), rows, np.zeros_like(rows))
 
-    def run(self, steps: int) -> tuple[int, Float64]:
-        packs = self._packs
-        if self._in_turn:
-            for _ in range(steps):
-                for pack in packs:
+    def run(self, steps: int) -> Float64:
+        at_once = 1 if self._in_turn else self._substeps
+        for _ in range(steps // at_once):
+            for pack in self._packs:
+                for _ in range(at_once):
                     pack.step()
-        else:
-            for _ in range(steps // self._substeps):
-                for pack in packs:
-                    for _ in range(self._substeps):
-                        pack.step()
-        return steps * self._share, packs[0].read_qpos()[0]
+        return self._packs[0].read_qpos()[0]

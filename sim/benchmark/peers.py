@@ -1,189 +1,149 @@
-"""What else steps many robots on a CPU, beside the Runner in one run of the benchmark (:mod:`sim.benchmark.benchmark`).
+"""Third-party baselines of the benchmark: MuJoCo, Gymnasium.
 
-Each peer comes with a package that nothing else here needs: the extra ``peers``.
+Each needs a package that nothing else here needs: the extra ``peers``.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import multiprocessing
-import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
 from sim.benchmark.baselines import single_threaded
-from sim.benchmark.setup import Setup
 from sim.benchmark.tutorial import TutorialLoop
+from sim.benchmark.workload import Case, Workload
 
 Float64 = NDArray[np.float64]
 
 
-class Stepper(Protocol):
-    """What a peer is to the benchmark."""
-
-    def reset(self) -> None:
-        """Put the robots at the start."""
-
-    def run(self, ticks: int) -> tuple[int, Float64]:
-        """Step; the env-steps made, and where the first env ended (dof,)."""
-
-    def close(self) -> None:
-        """Free what it holds."""
-
-
 class Peer(NamedTuple):
-    """A peer: what it is, the package it takes, and how to make it."""
+    """Third-party baseline: a description, the package that it needs, and its constructor."""
 
     description: str
     package: str
-    make: Callable[[Setup], Stepper]
+    make: Callable[[Workload], Case]
 
 
-class AsyncVector:
-    """Gymnasium's AsyncVectorEnv around the tutorial's loop: a process for each of ``count`` envs."""
+def _async_vector(workload: Workload, count: int) -> Case:
+    """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with a process for each of ``count`` envs."""
+    import gymnasium
 
-    def __init__(self, setup: Setup, count: int) -> None:
-        import gymnasium
+    # Processes are forked from one that has loaded all packages; otherwise many would take a minute to start.
+    multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
+    make_envs = [lambda: _tutorial_env(workload)] * count
+    with single_threaded():
+        envs = gymnasium.vector.AsyncVectorEnv(make_envs, context="forkserver")
+    actions = np.tile(workload.target, (count, 1))
 
-        self._setup, self._count = setup, count
-        # The processes are forks of one that has loaded all packages: else many would take a minute to start.
-        multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
-        with single_threaded():
-            self._envs = gymnasium.vector.AsyncVectorEnv([lambda: _tutorial_env(setup)] * count, context="forkserver")
-        self._actions = np.tile(setup.target, (count, 1))
+    def run() -> NDArray[np.float32]:
+        for _ in range(workload.ticks):
+            qpos = envs.step(actions)[0]
+        return qpos[0]
 
-    def reset(self) -> None:
-        """Put the robots at the start."""
-        self._envs.reset()
-
-    def run(self, ticks: int) -> tuple[int, Float64]:
-        """Step all envs tick by tick."""
-        for _ in range(ticks):
-            qpos = self._envs.step(self._actions)[0]
-        return ticks * self._setup.substeps * self._count, qpos[0].astype(np.float64)
-
-    def close(self) -> None:
-        """End the processes."""
-        self._envs.close()
+    return Case(workload.steps * count, envs.reset, run, envs.close)
 
 
-def _tutorial_env(setup: Setup) -> Any:
-    """The tutorial's loop as an env: the action is the target, a step is ``setup.substeps`` of the loop."""
+def _tutorial_env(workload: Workload) -> Any:
+    """Return the tutorial's loop as an env: the action is the target, one step is ``workload.substeps`` sim steps."""
     import gymnasium
 
     class TutorialEnv(gymnasium.Env):
         def __init__(self) -> None:
-            self._loop = TutorialLoop(setup.robot, setup.target, start=setup.start)
-            shape = setup.target.shape
+            self._loop = TutorialLoop(workload.robot, workload.target, start=workload.start)
+            shape = workload.target.shape
             self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
             self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
 
         def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
             super().reset(seed=seed)
-            self._loop.reset(setup.start)
+            self._loop.reset()
             return self._loop.robot.get_qpos(), {}
 
         def step(self, action: Float64) -> tuple[Any, float, bool, bool, dict[str, Any]]:
             self._loop.target = action
-            return self._loop.run(setup.substeps), 0.0, False, False, {}
+            return self._loop.run(workload.substeps), 0.0, False, False, {}
 
     return TutorialEnv()
 
 
-class MuJoCo:
-    """MuJoCo's ``rollout`` on the same URDF, a thread for each worker.
+def _mujoco_rollout(workload: Workload) -> Case:
+    """Return MuJoCo's ``rollout`` on the same URDF, with a thread for each worker.
 
-    Joints are moved by its PD position actuators with the PID's kp and kd, gravity is compensated body by body, and
-    there is a ground. Solver and integrator are MuJoCo's own: Newton, and "implicitfast", which it recommends.
+    Joints are driven by its actuator ``pid`` with the same kp, ki and kd, or, before MuJoCo 3.12, by ``position`` with
+    kp and kd. Gravity is compensated body by body, and the sum of both stays within the URDF's effort limits. There is
+    a ground. Solver and integrator are MuJoCo's: Newton, and "implicitfast", which its documentation recommends.
     """
+    import mujoco
+    import mujoco.rollout
 
-    def __init__(self, setup: Setup) -> None:
-        import mujoco
-        import mujoco.rollout
-
-        robot, settings = setup.robot, setup.robot.settings
-        assert settings is not None
-        spec = mujoco.MjSpec.from_string(robot.urdf)
-        spec.option.timestep = 1 / 2000
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
-        for body in spec.bodies:
-            body.gravcomp = 1
-        for joint, kp, kd in zip(robot.joints, settings.kp, settings.kd, strict=True):
-            actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    robot, settings = workload.robot, workload.settings
+    spec = mujoco.MjSpec.from_string(robot.urdf)
+    spec.option.timestep = 1 / 2000
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    for body in spec.bodies:
+        body.gravcomp = 1
+    for joint in spec.joints:
+        joint.actgravcomp = True  # counts within the effort limits, which MuJoCo reads from the URDF
+    for name, kp, ki, kd in zip(robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True):
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        if hasattr(actuator, "set_to_pid"):
+            actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
+        else:
             actuator.set_to_position(kp=kp, kv=kd)
-        self._setup, self._model = setup, spec.compile()
-        self._columns = [self._model.joint(name).qposadr[0] for name in robot.joint_names]
-        self._kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        threads = max(setup.workers, 1)
-        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self._pool = mujoco.rollout.Rollout(nthread=threads)
-        self._engine = mujoco
-        self._state: Float64 = np.empty((0, 0))
+    model, kind = spec.compile(), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    columns = [model.joint(name).qposadr[0] for name in robot.joint_names]
+    data = [mujoco.MjData(model) for _ in range(workload.processes)]
+    pool = mujoco.rollout.Rollout(nthread=workload.processes)
+    state = np.empty((workload.num_envs, mujoco.mj_stateSize(model, kind)))
+    control = np.tile(workload.target, (workload.num_envs, workload.substeps, 1))
 
-    def reset(self) -> None:
-        """Put the robots at the start."""
-        data, size = self._data[0], self._engine.mj_stateSize(self._model, self._kind)
-        self._engine.mj_resetData(self._model, data)
-        data.qpos[self._columns] = self._setup.start
-        row = np.empty(size)
-        self._engine.mj_getState(self._model, data, row, self._kind)
-        self._state = np.tile(row, (self._setup.num_envs, 1))
+    def reset() -> None:
+        mujoco.mj_resetData(model, data[0])
+        data[0].qpos[columns] = workload.start
+        mujoco.mj_getState(model, data[0], state[0], kind)
+        state[:] = state[0]
 
-    def run(self, ticks: int) -> tuple[int, Float64]:
-        """Step all envs, ``substeps`` at a time under one target."""
-        setup = self._setup
-        control = np.tile(setup.target, (setup.num_envs, setup.substeps, 1))
-        for _ in range(ticks):
-            states, _ = self._pool.rollout(self._model, self._data, self._state, control)
-            self._state = states[:, -1]
-        data = self._data[0]
-        self._engine.mj_setState(self._model, data, self._state[0], self._kind)
-        return ticks * setup.substeps * setup.num_envs, data.qpos[self._columns].copy()
+    def run() -> Float64:
+        for _ in range(workload.ticks):
+            state[:] = pool.rollout(model, data, state, control)[0][:, -1]
+        mujoco.mj_setState(model, data[0], state[0], kind)
+        return data[0].qpos[columns]
 
-    def close(self) -> None:
-        """End the threads."""
-        self._pool.close()
-
-
-def run_peer(peer: Stepper, setup: Setup) -> tuple[float, int, Float64]:
-    """Run one round of ``peer``: (seconds, env-steps, where the first env ended)."""
-    peer.reset()
-    began = time.perf_counter()
-    steps, final = peer.run(setup.ticks)
-    return time.perf_counter() - began, steps, final
+    return Case(workload.num_envs * workload.steps, reset, run, pool.close)
 
 
 PEERS = {
     "gymnasium, an env a core": Peer(
         "AsyncVectorEnv around the tutorial's loop, one env for each core",
         "gymnasium",
-        lambda setup: AsyncVector(setup, max(setup.workers, 1)),
+        lambda workload: _async_vector(workload, workload.processes),
     ),
     "gymnasium, all envs": Peer(
         "the same, all envs at once, a process to each",
         "gymnasium",
-        lambda setup: AsyncVector(setup, setup.num_envs),
+        lambda workload: _async_vector(workload, workload.num_envs),
     ),
     "mujoco": Peer(
-        "MuJoCo's rollout on the same URDF, a thread a core: PD actuators, gravity compensation, its own solver",
+        "MuJoCo's rollout on the same URDF, a thread a core: its PID actuators, gravity compensation and solver",
         "mujoco",
-        MuJoCo,
+        _mujoco_rollout,
     ),
 }
 
 
-def installed() -> tuple[str, ...]:
-    """Names of the peers whose package is there."""
+def installed_peers() -> tuple[str, ...]:
+    """Return the names of the peers whose package is installed."""
     return tuple(name for name, peer in PEERS.items() if importlib.util.find_spec(peer.package) is not None)
 
 
-def make_peer(name: str, setup: Setup) -> Stepper:
-    """Build a peer.
+def make_peer(name: str, workload: Workload) -> Case:
+    """Return a peer, ready to run.
 
     Raises
     ------
@@ -193,4 +153,4 @@ def make_peer(name: str, setup: Setup) -> Stepper:
     peer = PEERS[name]
     if importlib.util.find_spec(peer.package) is None:
         raise MissingDependencyError(peer.package, f"peer {name!r}", "peers")
-    return peer.make(setup)
+    return peer.make(workload)

@@ -14,15 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.errors import InvalidArgumentError
 from batchpid.reference import SimplePID
 from sim.engine.building import bare_scene
 from sim.robot.robot import Robot
 
 
 class TutorialLoop:
-    """The tutorial's scene and loop for one bundled robot, with SAPIEN's default friction and damping.
+    """Scene and loop of the tutorial for one bundled robot, with SAPIEN's default friction and damping.
 
-    ``external_pid`` and ``internal_drive`` are the tutorial's two switches; ``target`` (dof,) [rad or m].
+    ``external_pid`` and ``internal_drive`` are the tutorial's two switches; ``target`` and ``start`` (dof,) [rad or m],
+    the start by default the robot's own.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot is not bundled, so that it carries no gains of the tutorial.
     """
 
     def __init__(
@@ -36,7 +43,12 @@ class TutorialLoop:
     ) -> None:
         settings = robot.settings
         if settings is None:
-            raise ValueError("the tutorial's loop needs a bundled robot, which carries the tutorial's gains")
+            raise InvalidArgumentError(
+                "robot",
+                "carries no gains of the tutorial",
+                value=robot.name,
+                remedy=f"use one of {', '.join(Robot.bundled())}",
+            )
         self.scene = bare_scene()
         self.scene.set_timestep(1 / settings.rate_hz)
         self.scene.add_ground(0, render=False)
@@ -48,20 +60,21 @@ class TutorialLoop:
             self.robot: Any = loader.load(str(path))
         self._gains = list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
         self.target = target
-        self.reset(settings.start if start is None else start)
+        self._start = settings.start if start is None else start
+        self.reset()
         if internal_drive:
             for joint, position in zip(self.robot.get_active_joints(), target, strict=True):
                 joint.set_drive_property(stiffness=settings.drive_stiffness, damping=settings.drive_damping)
                 joint.set_drive_target(position)
 
-    def reset(self, qpos: NDArray[np.float64]) -> None:
-        """Start anew from ``qpos`` (dof,), at rest."""
-        self.robot.set_qpos(qpos)
-        self.robot.set_qvel(np.zeros_like(qpos))
+    def reset(self) -> None:
+        """Put the robot at the start, at rest, with new PID objects."""
+        self.robot.set_qpos(self._start)
+        self.robot.set_qvel(np.zeros_like(self._start))
         self.pids = [SimplePID(*gains) for gains in self._gains]
 
     def step(self) -> None:
-        """One sim step: passive force, one PID object per joint, set_qf, scene.step."""
+        """Make one sim step: passive force, one PID object per joint, set_qf, scene.step."""
         qf = self.robot.compute_passive_force(gravity=True, coriolis_and_centrifugal=True)
         if self.pids:
             qf = qf + self._pid_forward(self.robot.get_qpos(), self.scene.get_timestep())
@@ -69,7 +82,7 @@ class TutorialLoop:
         self.scene.step()
 
     def run(self, steps: int, record: Callable[[NDArray[np.float32]], None] | None = None) -> NDArray[np.float32]:
-        """``steps`` sim steps; ``record`` is given qpos after each. Returns the last qpos (dof,)."""
+        """Make ``steps`` sim steps, calling ``record`` with qpos after each; return the last qpos (dof,)."""
         for _ in range(steps):
             self.step()
             if record is not None:

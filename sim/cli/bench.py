@@ -10,7 +10,7 @@ from sim.cli.optional import OptionalPath
 
 if TYPE_CHECKING:
     from sim.benchmark.benchmark import Result
-    from sim.benchmark.setup import Setup
+    from sim.benchmark.workload import Workload
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Bench:
         """Run it."""
         from batchpid.validate import integer
         from sim import Robot
-        from sim.benchmark.benchmark import CASES, compare, phases
-        from sim.benchmark.peers import PEERS, installed
-        from sim.benchmark.setup import Setup
+        from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
+        from sim.benchmark.peers import PEERS, installed_peers
+        from sim.benchmark.workload import Workload
         from sim.cli import report
         from sim.cli.progress import bar
 
-        setup = Setup(
+        workload = Workload(
             Robot.load(self.robot),
             num_envs=integer("num_envs", self.num_envs, 1, 1_000_000),
             workers=integer("workers", self.workers, 0, 1024),
@@ -59,16 +59,16 @@ class Bench:
             ticks=integer("ticks", self.ticks, 1, 1_000_000),
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
-        peers = installed() if self.peers else ()
+        peers = installed_peers() if self.peers else ()
         what = CASES | {name: PEERS[name].description for name in peers}
-        advance = iter(bar("bench")(range(setup.rounds * len(what))))
-        results = compare(setup, progress=lambda case: next(advance, None), peers=peers)
+        advance = iter(bar("bench")(range(workload.rounds * len(what))))
+        results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers)
         next(advance, None)  # the bar closes
-        spent = phases(setup)
+        spent = measure_phases(workload)
 
         print(
-            f"{setup.robot.name}, {setup.num_envs} envs, {max(setup.workers, 1)} processes, "
-            f"physics {setup.physics!r}, {setup.substeps} substeps, {setup.rounds} rounds\n"
+            f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, "
+            f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds\n"
         )
         rows = [
             [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", what[case]]
@@ -82,7 +82,7 @@ class Bench:
             print(f"\nnot installed: {', '.join(absent)} (pip install 'batchpid[peers]')")
         if self.json is not None:
             self.json.parent.mkdir(parents=True, exist_ok=True)
-            self.json.write_text(_as_json(setup, results, spent))
+            self.json.write_text(_as_json(workload, results, spent))
             print(f"\nfigures: {self.json}")
 
 
@@ -94,18 +94,18 @@ def ratio(results: dict[str, Result], case: str) -> float:
     return statistics.median(ours / theirs for ours, theirs in pairs)
 
 
-def _as_json(setup: Setup, results: dict[str, Result], spent: dict[str, float]) -> str:
+def _as_json(workload: Workload, results: dict[str, Result], spent: dict[str, float]) -> str:
     import json
 
     figures = {
         "setup": {
-            "robot": setup.robot.name,
-            "num_envs": setup.num_envs,
-            "workers": setup.workers,
-            "physics": setup.physics,
-            "substeps": setup.substeps,
-            "ticks": setup.ticks,
-            "rounds": setup.rounds,
+            "robot": workload.robot.name,
+            "num_envs": workload.num_envs,
+            "workers": workload.workers,
+            "physics": workload.physics,
+            "substeps": workload.substeps,
+            "ticks": workload.ticks,
+            "rounds": workload.rounds,
         },
         "machine": machine(),
         "cases": {

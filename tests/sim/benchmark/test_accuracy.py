@@ -1,16 +1,16 @@
-"""The reference that the engine is judged by, and the errors that README and docs tell of."""
+"""References of the engine's accuracy, and the errors that README and docs state."""
 
 import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure
+from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
 from sim.engine.physics import PHYSICS
 
 
 def falling(robot, qpos, timestep, seconds):
-    """The robot without effort, after ``seconds``."""
+    """Return the robot without effort, after ``seconds``."""
     plant = EquationOfMotion(robot.dynamics(), np.zeros(robot.dof), qpos, timestep)
     for _ in range(round(seconds / timestep)):
         plant.step()
@@ -27,19 +27,19 @@ def test_equation_of_motion_converges_with_the_fourth_order(panda):
 def test_equation_of_motion_keeps_the_energy(panda):
     """Kinetic energy is the work of gravity: the integral of -g(q) q'."""
     qpos, timestep = panda.sample(1, seed=3), 1 / 4000
-    probe, still = panda.dynamics(), np.zeros((1, panda.dof))
-    plant = EquationOfMotion(probe, np.zeros(panda.dof), qpos, timestep)
+    dynamics, still = panda.dynamics(), np.zeros((1, panda.dof))
+    plant = EquationOfMotion(dynamics, np.zeros(panda.dof), qpos, timestep)
     powers = []
     for _ in range(401):
-        gravity = probe.inverse_dynamics(plant.read_qpos(), still, still)
+        gravity = dynamics.inverse_dynamics(plant.read_qpos(), still, still)
         powers.append(-(gravity * plant.read_qvel()).sum())
         plant.step()
     # The state is one step ahead of the last power: bring that up to date, too.
-    gravity = probe.inverse_dynamics(plant.read_qpos(), still, still)
+    gravity = dynamics.inverse_dynamics(plant.read_qpos(), still, still)
     powers.append(-(gravity * plant.read_qvel()).sum())
     work = np.trapezoid(powers, dx=timestep)
     qvel = plant.read_qvel()[0]
-    kinetic = qvel @ probe.mass_matrix(plant.read_qpos())[0] @ qvel / 2
+    kinetic = qvel @ dynamics.mass_matrix(plant.read_qpos())[0] @ qvel / 2
     assert kinetic > 0.1
     assert kinetic == pytest.approx(work, rel=1e-5)
 
@@ -54,9 +54,9 @@ def test_passive_force_holds_still(panda):
 
 
 def test_contact_moves_begin_free_and_end_in_contact(panda):
-    moves, probe = contact_moves(panda, 4, seed=1), panda.dynamics()
-    assert not probe.touches(moves.start).any()
-    assert probe.touches(moves.target).all()
+    moves, dynamics = contact_moves(panda, 4, seed=1), panda.dynamics()
+    assert not dynamics.touches(moves.start).any()
+    assert dynamics.touches(moves.target).all()
 
 
 def test_limit_moves_leave_the_limits_of_one_joint(panda):
@@ -67,22 +67,22 @@ def test_limit_moves_leave_the_limits_of_one_joint(panda):
 
 
 def test_free_motion_hardly_depends_on_the_solver(panda):
-    errors = measure(panda, "free", count=2, seconds=0.2)
+    errors = measure_errors(panda, "free", count=2, seconds=0.2)
     accurate, fast = (errors[name, "equation of motion"] for name in PHYSICS)
     assert 0 < fast.rms <= fast.largest == fast.over_time.max()
     assert fast.largest == pytest.approx(accurate.largest, rel=0.05)
 
 
-def test_unknown_motion(panda):
+def test_unknown_motion_is_refused(panda):
     with pytest.raises(InvalidArgumentError, match="motion"):
-        measure(panda, "dance")
+        measure_errors(panda, "dance")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_order_of_magnitude(name):
-    """The table in docs/performance.md, within a factor: what a preset may cost in accuracy, and no more."""
+def test_errors_are_of_the_documented_order_of_magnitude(name):
+    """The table of docs/performance.md, within a factor."""
     robot = Robot.load(name)
     bounds = {  # motion: (max, RMS) [rad]
         "free": (5e-2, 5e-3),
@@ -90,9 +90,9 @@ def test_order_of_magnitude(name):
         "limit": (2e-2, 1e-3),
     }
     for motion, (largest, rms) in bounds.items():
-        for case, error in measure(robot, motion).items():
+        for case, error in measure_errors(robot, motion).items():
             assert 1e-6 < error.rms < rms, (motion, case)
             assert error.largest < largest, (motion, case)
-    free = measure(robot, "free")
+    free = measure_errors(robot, "free")
     fast, accurate = (free[physics, "equation of motion"].rms for physics in ("fast", "accurate"))
     assert fast == pytest.approx(accurate, rel=0.1)

@@ -1,66 +1,85 @@
-"""The benchmark measures what it says, and refuses to measure robots that do not move."""
+"""Cases of the benchmark move their robots and have a rate; robots that do not move are refused."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from sim import Robot
-from sim.benchmark.benchmark import CASES, check_motion, compare, phases
-from sim.benchmark.peers import PEERS, make_peer, run_peer
-from sim.benchmark.setup import Setup
+from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
+from sim.benchmark.peers import PEERS, make_peer
+from sim.benchmark.workload import Workload, run_round
 
 
 @pytest.fixture(scope="module")
-def setup():
-    return Setup(Robot.load("panda"), num_envs=4, workers=1, ticks=100, rounds=1)
+def workload(panda):
+    return Workload(panda, num_envs=4, workers=1, ticks=100, rounds=1)
 
 
-def test_every_case_moves_and_has_a_rate(setup):
-    results = compare(setup)
+def test_every_case_moves_and_has_a_rate(workload):
+    results = measure_rates(workload)
     assert list(results) == list(CASES)
     assert all(result.rate > 0 and len(result.rates) == 1 for result in results.values())
     # All drives bring the robot to the same place; so do the PIDs, the tutorial's and ours.
     places = {case: result.final for case, result in results.items()}
     assert np.abs(places["bare engine"] - places["bare engine, pack by pack"]).max() < 1e-6
     np.testing.assert_array_equal(places["closed loop"], places["closed loop, tick by tick"])
-    assert np.abs(places["tutorial"] - places["closed loop"])[setup.moving].max() < 0.06
+    assert np.abs(places["tutorial"] - places["closed loop"])[workload.moving].max() < 0.06
 
 
-def test_robots_that_rest_are_no_result(setup):
+def test_robots_that_rest_are_refused(workload):
     with pytest.raises(BatchPIDError, match="did not move"):
-        check_motion("some case", setup.start, setup)
+        workload.check_motion("some case", workload.start)
 
 
-def test_nothing_to_move_to():
-    robot = Robot.load(Robot.load("panda").path)
-    bare = Setup(type(robot)(**{**vars(robot), "settings": None}))
+def test_robot_without_gains_is_refused(panda):
+    bare = Workload(dataclasses.replace(panda, settings=None))
     with pytest.raises(InvalidArgumentError, match="robot"):
-        compare(bare)
+        measure_rates(bare)
 
 
-def test_phases_add_up(setup):
-    spent = phases(setup)
+def test_phases_are_positive_and_the_engine_takes_most(workload):
+    spent = measure_phases(workload)
     assert list(spent) == ["read", "control", "passive", "write", "step", "waiting"]
     assert all(value > 0 for value in spent.values())
     assert spent["step"] == max(spent[phase] for phase in ("read", "passive", "write", "step"))
 
 
 @pytest.mark.parametrize("name", [name for name in PEERS if name != "gymnasium, all envs"])
-def test_peers_reach_the_same_place(setup, name):
+def test_peers_reach_the_same_place_in_every_round(workload, name):
     pytest.importorskip(PEERS[name].package)
-    peer = make_peer(name, setup)
+    peer = make_peer(name, workload)
     try:
-        seconds, steps, final = run_peer(peer, setup)
-        again = run_peer(peer, setup)
+        seconds, final = run_round(peer)
+        _, again = run_round(peer)
     finally:
         peer.close()
     assert seconds > 0
-    assert steps == setup.ticks * setup.substeps * (setup.num_envs if name == "mujoco" else 1)
-    check_motion(name, final, setup)
-    np.testing.assert_array_equal(again[2], final)
+    assert peer.env_steps == workload.ticks * workload.substeps * (workload.num_envs if name == "mujoco" else 1)
+    workload.check_motion(name, final)
+    np.testing.assert_array_equal(again, final)
 
 
-def test_a_peer_that_is_not_installed(setup, monkeypatch):
+def test_mujoco_runs_the_whole_pid(workload):
+    """With the integral it ends nearer to the tutorial's loop than without."""
+    mujoco = pytest.importorskip("mujoco")
+    if not hasattr(mujoco.MjsActuator, "set_to_pid"):
+        pytest.skip("MuJoCo before 3.12 has no actuator pid")
+    settings = workload.settings
+
+    def final(ki):
+        robot = dataclasses.replace(workload.robot, settings=dataclasses.replace(settings, ki=ki))
+        peer = make_peer("mujoco", dataclasses.replace(workload, robot=robot))
+        try:
+            return run_round(peer)[1]
+        finally:
+            peer.close()
+
+    moved = np.abs(final(settings.ki) - final(0 * settings.ki))[workload.moving]
+    assert moved.max() > 1e-3
+
+
+def test_peer_that_is_not_installed_is_named_with_its_extra(workload, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingDependencyError, match="peers"):
-        make_peer("mujoco", setup)
+        make_peer("mujoco", workload)

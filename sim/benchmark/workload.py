@@ -1,0 +1,129 @@
+"""Workload of the benchmark: the robots and the motion that every case steps, and the interface of a case."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import BatchPIDError
+from sim.engine.building import SceneSpec
+from sim.engine.physics import PHYSICS
+from sim.robot.description import Settings
+from sim.robot.robot import Robot
+from sim.runner import Runner
+
+Float64 = NDArray[np.float64]
+DISTANCE = 0.3
+"""Distance of the start from the target, per joint [rad]."""
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps of 0.5 ms."""
+
+    robot: Robot
+    num_envs: int = 64
+    workers: int = 2
+    physics: str = "accurate"
+    substeps: int = 20
+    ticks: int = 100
+    rounds: int = 5
+
+    @property
+    def settings(self) -> Settings:
+        """Gains, start and target of the tutorial."""
+        assert self.robot.settings is not None
+        return self.robot.settings
+
+    @property
+    def target(self) -> Float64:
+        """Setpoint of every case (dof,) [rad or m]."""
+        return self.settings.target
+
+    @property
+    def start(self) -> Float64:
+        """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target on the joints that have the room."""
+        away = self.target - DISTANCE
+        roomy = (self.robot.upper - self.robot.lower > 1.0) & (away > self.robot.lower)
+        return np.where(roomy, away, self.target)
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """Joints that start away from their target (dof,)."""
+        return self.start != self.target
+
+    @property
+    def steps(self) -> int:
+        """Sim steps of one round, per env."""
+        return self.ticks * self.substeps
+
+    @property
+    def processes(self) -> int:
+        """Number of processes that step: the workers, or this process."""
+        return max(self.workers, 1)
+
+    def scene(self, gravity: bool) -> SceneSpec:
+        """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
+        robot = self.robot
+        spec = SceneSpec(
+            urdf=robot.urdf,
+            srdf=robot.srdf,
+            joints=robot.joints,
+            timestep=1 / 2000,
+            physics=PHYSICS[self.physics],
+            dissipation="sapien",
+        )
+        return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
+
+    def runner(self) -> Runner:
+        """Return a runner of the robots with the tutorial's gains and SAPIEN's default friction and damping."""
+        robot = Robot.load(self.robot.path, dissipation="sapien")
+        return Runner(
+            robot,
+            self.num_envs,
+            params=robot.params(),
+            workers=self.workers,
+            physics=self.physics,
+            substeps=self.substeps,
+        )
+
+    def check_motion(self, case: str, final: Float64) -> None:
+        """Raise unless the robot at ``final`` (dof,) has moved from the start towards the target.
+
+        Raises
+        ------
+        BatchPIDError
+            It has not; the figures of ``case`` would mean nothing.
+        """
+        moved, left = (np.abs(final - place)[self.moving] for place in (self.start, self.target))
+        if not np.isfinite(final).all() or moved.min() < 0.1 * DISTANCE or left.max() > DISTANCE:
+            raise BatchPIDError(
+                f"case {case!r}: the robots did not move as they should (moved {moved.round(3)}, left "
+                f"{left.round(3)}); its speed would mean nothing: run more ticks"
+            )
+
+
+class Case(NamedTuple):
+    """Way of stepping the robots of a workload."""
+
+    env_steps: int
+    """Env-steps of one round."""
+    reset: Callable[[], object]
+    """Puts the robots at the start."""
+    run: Callable[[], NDArray[Any]]
+    """Steps one round; returns the final positions of the first env (dof,) [rad or m]."""
+    close: Callable[[], None]
+    """Frees processes and scenes; may be called again."""
+
+
+def run_round(case: Case) -> tuple[float, Float64]:
+    """Run one round of ``case``; return the seconds of stepping and the final positions of the first env (dof,)."""
+    case.reset()
+    began = time.perf_counter()
+    final = case.run()
+    return time.perf_counter() - began, final.astype(np.float64)
