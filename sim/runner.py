@@ -92,7 +92,7 @@ class Runner:
     variation
         How each env's robot differs from the model: :func:`sim.tuning.randomization.draw_variation`. It is not part
         of snapshots, so with it there is no recovery and no checkpoint.
-    non_finite
+    on_invalid_input
         What a NaN or infinity in a setpoint, its rate, a feedforward or a pose to reset to does: ``"raise"`` an
         error, or ``"contain"`` it: the env that it is for fails.
     recover
@@ -130,7 +130,7 @@ class Runner:
         on_fault: str = "hold",
         speed_limit: ArrayLike | None = None,
         variation: Variation | None = None,
-        non_finite: str = "raise",
+        on_invalid_input: str = "raise",
         recover: bool = True,
         checkpoint_steps: int | None = 8000,
         timeout: float = 60.0,
@@ -158,7 +158,7 @@ class Runner:
             raise InvalidArgumentError("build", "must be a function", value=build, remedy="define build(scene, env)")
         self._on_fault = choice("on_fault", on_fault, ACTIONS)
         limit = None if speed_limit is None else joint_speeds("speed_limit", speed_limit, robot.joint_names)
-        self._contains = choice("non_finite", non_finite, ("raise", "contain")) == "contain"
+        self._contains = choice("on_invalid_input", on_invalid_input, ("raise", "contain")) == "contain"
         self._checkpoint_steps = (
             None if checkpoint_steps is None else integer("checkpoint_steps", checkpoint_steps, 1, 10**9)
         )

@@ -144,7 +144,7 @@ def runner():
 
 @pytest.fixture(scope="module")
 def containing():
-    with Runner(ROBOT, N, workers=0, substeps=2, non_finite="contain") as made:
+    with Runner(ROBOT, N, workers=0, substeps=2, on_invalid_input="contain") as made:
         yield made
 
 
@@ -213,7 +213,7 @@ GOOD_RUNNER = {
     "on_fault": "hold",
     "speed_limit": 100.0,
     "variation": None,
-    "non_finite": "raise",
+    "on_invalid_input": "raise",
     "recover": True,
     "checkpoint_steps": 100,
     "timeout": 10.0,

@@ -80,7 +80,7 @@ def test_ticks_sent_at_once_are_the_same_as_one_by_one(workers):
     noise = np.random.default_rng(1).uniform(-0.05, 0.05, (3, ticks, envs, model.dof))
     setpoints = np.clip(model.settings.target + noise[0], model.lower, model.upper)
     setpoints[20, 3, 2] = np.nan
-    options = {"workers": workers, "substeps": 3, "checkpoint_steps": 100, "non_finite": "contain"}
+    options = {"workers": workers, "substeps": 3, "checkpoint_steps": 100, "on_invalid_input": "contain"}
     options |= {"on_fault": "reset"}
     with Runner(model, envs, **options) as runner, Runner(model, envs, **options) as other:
         assert len(runner._pool.ticks) > ticks

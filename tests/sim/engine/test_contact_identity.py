@@ -102,7 +102,7 @@ def test_neighbours_of_an_env_that_fails():
     effort = np.random.default_rng(0).normal(size=(TICKS, N, model.dof)) * model.effort_limit
     effort[7, 5, 3] = np.nan
     options = {"control": "effort", "params": model.params(**OPEN_LOOP), "workers": 0, "pack_size": 8}
-    with Runner(model, N, non_finite="contain", **options) as runner, warnings.catch_warnings():
+    with Runner(model, N, on_invalid_input="contain", **options) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         rollout = runner.rollout(effort)
     assert not rollout.ok[7:, 5].any()

@@ -22,7 +22,7 @@ def setpoints(ticks, num_envs=N, seed=0):
 
 
 def make(num_envs=N, **options):
-    options = {"workers": 0, "substeps": 4, "non_finite": "contain"} | options
+    options = {"workers": 0, "substeps": 4, "on_invalid_input": "contain"} | options
     return Runner(PANDA, num_envs, **options)
 
 
@@ -174,14 +174,14 @@ def test_a_pose_that_is_not_finite_starts_its_env_where_it_started_last():
             obs = runner.reset(qpos=qpos)
         assert obs.ok.tolist() == [env != 3 for env in range(N)]
         assert np.isfinite(obs.qpos).all()
-    with make(non_finite="raise") as runner, pytest.raises(InvalidArgumentError, match=r"qpos.*env 3"):
+    with make(on_invalid_input="raise") as runner, pytest.raises(InvalidArgumentError, match=r"qpos.*env 3"):
         runner.reset(qpos=qpos)
 
 
 @pytest.mark.parametrize("what", WHAT)
 def test_by_default_it_raises_and_changes_nothing(what):
     table = setpoints(2)
-    with make(non_finite="raise") as runner, make(non_finite="raise") as other:
+    with make(on_invalid_input="raise") as runner, make(on_invalid_input="raise") as other:
         runner.step(table[0])
         other.step(table[0])
         bad = {"setpoint": table[1], what: np.full((N, 9), np.nan)}

@@ -111,7 +111,7 @@ def test_it_holds_faults_params_and_content():
 
     table = commands(robot, 30)
     table[5, 2] = np.nan
-    options = {"workers": 0, "non_finite": "contain", "build": box}
+    options = {"workers": 0, "on_invalid_input": "contain", "build": box}
     with Runner(robot, N, **options) as runner:
         with pytest.warns(UserWarning, match="env 2"):
             runner.rollout(table[:15])

@@ -159,7 +159,7 @@ def test_a_file_made_meanwhile_is_kept(tmp_path):
 
 
 def test_faults_are_told(tmp_path):
-    with make(non_finite="contain") as runner, Recorder(tmp_path / "run.h5", runner):
+    with make(on_invalid_input="contain") as runner, Recorder(tmp_path / "run.h5", runner):
         setpoints = table(4)
         setpoints[2, 1, 3] = np.nan
         with pytest.warns(FaultWarning):
