@@ -1,13 +1,15 @@
 # make demo    64 robots under one batch PID: a table, and a picture in out/demo.png
-# make test    every test but the minutes-long ones
-# make check   linter, formatter and types: what CI runs before the tests
-# make bench   benchmarks, with the baselines to beat
-# make figures measure what docs/performance.md shows, and draw it (5 minutes, on a machine that does nothing else)
-# make soak    the minutes-long tests
+# make test     all tests but the minutes-long ones
+# make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
+# make check    linter, formatter, types, floors and docs: what CI runs before the tests
+# make docs     the API reference and the guides, as pages in out/site
+# make bench    benchmarks and their baselines
+# make figures  measure and redraw docs/performance.md (5 minutes, on an idle machine)
+# make soak     the minutes-long tests
 #
-# Each builds .venv when it is missing or older than pyproject.toml. Another Python: make PYTHON=/path/to/python3.12
+# Each builds .venv if it is missing or older than pyproject.toml. Another Python: make PYTHON=/path/to/python3.12
 
-# The first Python that is new enough, looked for only when .venv is built.
+# The first Python that is new enough; evaluated only when .venv is built.
 PYTHON ?= $(or $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done),python3)
 VENV := .venv
@@ -15,7 +17,7 @@ RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
 
-.PHONY: demo test check format bench figures accuracy soak clean
+.PHONY: demo test test-isa check docs format bench figures accuracy soak clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
@@ -24,11 +26,27 @@ demo: $(VENV)/.base
 test: $(VENV)/.dev
 	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $(ARGS)
 
+# Features that NumPy chooses at run time and this processor has, by NumPy's own list (its names change by version).
+numpy_features = $(RUN) -c "from numpy._core._multiarray_umath import __cpu_dispatch__ as d, __cpu_features__ as f; \
+	print(*[name for name in d if f[name] and ($(1))])"
+
+test-isa: $(VENV)/.dev
+	@echo "without AVX-512, OpenBLAS for another maker's processor"
+	@NPY_DISABLE_CPU_FEATURES="$$($(call numpy_features,'512' in name or name == 'X86_V4'))" OPENBLAS_CORETYPE=Haswell \
+		XLA_FLAGS=--xla_cpu_max_isa=AVX2 $(MAKE) --no-print-directory test
+	@echo "without AVX"
+	@NPY_DISABLE_CPU_FEATURES="$$($(call numpy_features,True))" OPENBLAS_CORETYPE=Barcelona \
+		XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 $(MAKE) --no-print-directory test
+
 check: $(VENV)/.dev
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
-	$(VENV)/bin/lint-imports
+	$(VENV)/bin/lint-imports 
+	@$(MAKE) --no-print-directory docs
+
+docs: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 
 format: $(VENV)/.dev
 	$(RUN) -m ruff check --fix .
@@ -48,7 +66,7 @@ figures: $(VENV)/.dev
 	@$(RUN) -m pytest bench/test_scaling.py bench/test_resources.py --benchmark-json $(MEASURED)/pytest.json
 	@$(RUN) bench/draw.py $(MEASURED)
 
-# The errors of the physics presets do not depend on the machine's speed: only new physics or gains change them.
+# The errors of the physics presets depend on physics and gains, not on the machine's speed.
 accuracy: $(VENV)/.dev
 	@$(RUN) bench/accuracy.py --json $(MEASURED)/accuracy.json
 	@$(RUN) bench/draw.py $(MEASURED)
@@ -59,7 +77,7 @@ soak: $(VENV)/.dev
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
 
-# Stamp files: .base has what the product needs, .dev what it takes to work on it.
+# Stamp files: .base for what the product needs, .dev for what its development needs as well.
 $(VENV)/.base: pyproject.toml | $(RUN)
 	@echo "installing batchpid into $(VENV) (once)"
 	@$(PIP) --editable .
