@@ -16,7 +16,7 @@ for _name in ("batchpid", "assets"):
 
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
-from sim.observation import Observation, Rollout
+from sim.observation import Observation, Rollout, RunInfo
 from sim.recording.reader import Recording, read_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, RobotDescription, register_dynamics
@@ -40,6 +40,7 @@ __all__ = [
     "RecoveryWarning",
     "Robot",
     "Rollout",
+    "RunInfo",
     "Runner",
     "SetpointWarning",
     "Snapshot",

@@ -1,13 +1,15 @@
-"""Observations and rollouts. What is observed of an env is defined here, once: a new quantity is one line."""
+"""Observations, and rollouts with the info of their run. A new observed quantity is one line here, and no other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+
+from batchpid.params import PIDParams
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -21,6 +23,11 @@ class Quantity(NamedTuple):
     meaning: str
     unit: str = "1"
     per_joint: bool = True
+
+    def unit_for(self, position: str) -> str:
+        """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
+        rotational, _, linear = self.unit.partition("|")
+        return linear if linear and position == "m" else rotational
 
 
 class Observation(NamedTuple):
@@ -61,6 +68,64 @@ def empty_observation(*shape: int) -> Observation:
 
 
 @dataclass(frozen=True, eq=False)
+class RunInfo:
+    """Robot, options and origin of a run; ``robot.run_info()`` gives that of a robot. None where it is not known."""
+
+    robot: str
+    """Name."""
+    joint_names: tuple[str, ...]
+    units: tuple[str, ...]
+    """Unit of each joint's position: "rad" or "m"."""
+    lower: Float64
+    """Lower position limits (joints,) [rad or m]."""
+    upper: Float64
+    """Upper position limits (joints,) [rad or m]."""
+    effort_limit: Float64
+    """(joints,) [N m or N]."""
+    urdf: str | None = None
+    """Text of the robot description."""
+    dissipation: str | None = None
+    timestep: float | None = None
+    """Of simulation and control [s]."""
+    substeps: int | None = None
+    """Sim steps of a tick."""
+    control: str | None = None
+    compensate: str | None = None
+    physics: str | None = None
+    """Name of a preset, or the solver settings in words."""
+    params: PIDParams | None = None
+    """PID parameters at the start."""
+    start: NDArray[Any] | None = None
+    """Positions before the first tick (envs, joints) [rad or m]."""
+    seed: int | None = None
+    versions: Mapping[str, str] | None = None
+    """Of the packages that results depend on, by name."""
+    begun: str | None = None
+    """Local date and time of the start, ISO 8601."""
+    complete: bool = True
+    """False for a recording that was cut short, or is still being written."""
+    faults: tuple[Any, ...] = ()
+    """Each :class:`sim.Fault` of the runner up to the end of the run."""
+
+    def units_of(self, name: str) -> tuple[str, ...]:
+        """Return the unit for each joint of the quantity ``name`` of :data:`RECORDED`."""
+        quantity = RECORDED["effort" if name == "setpoint" and self.control == "effort" else name]
+        return tuple(map(quantity.unit_for, self.units))
+
+    def for_envs(self, envs: slice | Any) -> RunInfo:
+        """Return the info of some envs (a slice or an index array)."""
+        return replace(
+            self,
+            params=None if self.params is None else self.params.for_envs(envs),
+            start=None if self.start is None else self.start[envs],
+        )
+
+    def __repr__(self) -> str:
+        control = f", control {self.control!r}" if self.control else ""
+        return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
+
+
+@dataclass(frozen=True, eq=False)
 class Rollout:
     """Record of a run. Row k is the state at the end of tick k, at ``time[k]``.
 
@@ -76,10 +141,12 @@ class Rollout:
     """Observations, stacked."""
     tick: float
     """Time from one row to the next [s]."""
+    info: RunInfo
+    """Robot, options and origin of the run."""
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name not in OBSERVED:
-            raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, {', '.join(OBSERVED)}")
+            raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {', '.join(OBSERVED)}")
         array: NDArray[Any] = getattr(self.observation, name)
         return array
 
@@ -95,19 +162,20 @@ class Rollout:
     def for_envs(self, envs: slice | Sequence[int] | Any) -> Rollout:
         """Return the rollout of some envs (a slice or an index array)."""
         part = Observation._make(array[:, envs] for array in self.observation)
-        return Rollout(self.time, self.setpoint[:, envs], part, self.tick)
+        return Rollout(self.time, self.setpoint[:, envs], part, self.tick, self.info.for_envs(envs))
 
     def for_ticks(self, ticks: slice) -> Rollout:
         """Return the rollout of some ticks."""
         part = Observation._make(array[ticks] for array in self.observation)
-        return Rollout(self.time[ticks], self.setpoint[ticks], part, self.tick * (ticks.step or 1))
+        return Rollout(self.time[ticks], self.setpoint[ticks], part, self.tick * (ticks.step or 1), self.info)
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
-        """Return successive rollouts of the same envs as one."""
+        """Return successive rollouts of the same envs as one, with the info of the first and the faults of the last."""
         seen = Observation._make(map(np.concatenate, zip(*(part.observation for part in parts), strict=True)))
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
-        return Rollout(time, setpoint, seen, parts[0].tick)
+        info = replace(parts[0].info, faults=parts[-1].info.faults)
+        return Rollout(time, setpoint, seen, parts[0].tick, info)
 
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape

@@ -6,8 +6,10 @@ import hashlib
 import os
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import astuple
+from dataclasses import astuple, replace
+from functools import cached_property
 from pathlib import Path
+from time import strftime
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -17,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.validate import array, choice, env_mask, flag, integer, joint_speeds, number, read_array, within
+from batchpid.versions import package_versions
 from sim.engine.building import SceneSpec
 from sim.engine.physics import PHYSICS, Physics
 from sim.engine.variation import Variation
@@ -25,7 +28,7 @@ from sim.loop.control import CONTROLS, check_params, default_params
 from sim.loop.faults import ACTIONS, Fault, FaultLog
 from sim.loop.loop import COMPENSATE, LoopSpec
 from sim.loop.snapshot import EnvStates, Snapshot
-from sim.observation import Observation, Rollout, empty_observation
+from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.robot.limits import LimitWatch
 from sim.robot.robot import Robot
 from sim.workers.pool import WorkerPool, packing
@@ -151,6 +154,7 @@ class Runner:
         self.substeps = integer("substeps", substeps, 1, 1_000_000)
         self.control = choice("control", control, CONTROLS)
         self.compensate = choice("compensate", compensate, COMPENSATE)
+        self._physics = str(physics)
         if not isinstance(physics, Physics):
             physics = PHYSICS[choice("physics", physics, PHYSICS)]
         pack_size = packing(self.num_envs, integer("pack_size", pack_size, 1, 65535))
@@ -347,8 +351,7 @@ class Runner:
             self._limits.check("setpoint", targets)
         seen = empty_observation(ticks, self.num_envs, self.robot.dof)
         times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
-        result = Rollout(times, targets.copy(), seen, self.timestep * self.substeps)
-        done = 0
+        info, done = self.info, 0
         for tick in range(ticks) if progress is None else progress(range(ticks)):
             if tick == done:  # a tick for which no worker has been sent ahead
                 done = min(ticks, tick + self._room())
@@ -357,7 +360,8 @@ class Runner:
                 for row, arrays in zip(range(tick, done), pool.ticks, strict=False):
                     for table, now in zip(seen, arrays.observation, strict=True):
                         table[row] = now
-        return result
+        info = replace(info, faults=tuple(self.faults))
+        return Rollout(times, targets.copy(), seen, self.timestep * self.substeps, info)
 
     def observe(self) -> Observation:
         """State of every env now, as fresh arrays."""
@@ -392,6 +396,26 @@ class Runner:
         params = check_params(params, self.robot, self.num_envs, self.control)
         pool.run(Call("set_params", (params,)))
         self._params = params
+
+    @property
+    def info(self) -> RunInfo:
+        """Robot, options and origin of a run that starts now."""
+        return self.robot.run_info(
+            timestep=self.timestep,
+            substeps=self.substeps,
+            control=self.control,
+            compensate=self.compensate,
+            physics=self._physics,
+            params=self._params,
+            start=self.observe().qpos,
+            versions=self._versions,
+            begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
+            faults=tuple(self.faults),
+        )
+
+    @cached_property
+    def _versions(self) -> dict[str, str]:
+        return package_versions()
 
     def snapshot(self) -> Snapshot:
         """State of all envs, physics and controller, to go on from: :meth:`restore`.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from sim.observation import OBSERVED, Observation, Rollout
+from sim.observation import OBSERVED, Observation, Rollout, RunInfo
 from sim.recording.reader import read_recording
 from sim.robot.robot import Robot
 
@@ -62,14 +62,15 @@ def read_rollout(path: str | Path, *, every: int = 1) -> Recorded:
         found = read_recording(path, every=every)
         seen = Observation._make(getattr(found, name) for name in OBSERVED)
         tick = float(found.attributes["timestep"]) * int(found.attributes["substeps"]) * every
-        rollout = Rollout(found.time, found.setpoint, seen, tick)
+        rollout = Rollout(found.time, found.setpoint, seen, tick, _info(found.attributes, found.complete))
         return _recorded(rollout, found.attributes, found.complete)
     if not path.is_file():
         raise InvalidArgumentError("path", "is no file", value=str(path), remedy="check the spelling")
     try:
         with np.load(path, allow_pickle=False) as data:
             seen = Observation._make(data[name][::every] for name in OBSERVED)
-            rollout = Rollout(data["time"][::every], data["setpoint"][::every], seen, float(data["tick"]) * every)
+            tick = float(data["tick"]) * every
+            rollout = Rollout(data["time"][::every], data["setpoint"][::every], seen, tick, _info(data))
             return _recorded(rollout, data)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InvalidArgumentError(
@@ -78,6 +79,12 @@ def read_rollout(path: str | Path, *, every: int = 1) -> Recorded:
             value=str(path),
             remedy="give a file that batchpid rollout --out wrote",
         ) from error
+
+
+def _info(about: Mapping[str, Any], complete: bool = True) -> RunInfo:
+    names, units = (tuple(map(str, about[name])) for name in ("joint_names", "units"))
+    lower, upper, limit = (np.asarray(about[name], np.float64) for name in ("lower", "upper", "effort_limit"))
+    return RunInfo(str(about["robot"]), names, units, lower, upper, limit, complete=complete)
 
 
 def _recorded(rollout: Rollout, about: Mapping[str, Any], complete: bool = True) -> Recorded:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from sim.observation import RunInfo
 from sim.robot.urdf import Joint, Link
 
 Float64 = NDArray[np.float64]
@@ -163,6 +164,20 @@ class RobotDescription:
                 remedy="pass kp=, ki=, kd= (scalar or per joint)",
             )
         return bp.make_params(joints=self.dof, **(known | options))
+
+    def run_info(self, **options: Any) -> RunInfo:
+        """Return the info of a run of this robot; ``options`` are further fields of :class:`sim.RunInfo`."""
+        return RunInfo(
+            robot=self.name,
+            joint_names=self.joint_names,
+            units=self.units,
+            lower=self.lower,
+            upper=self.upper,
+            effort_limit=self.effort_limit,
+            urdf=self.urdf,
+            dissipation=self.dissipation,
+            **options,
+        )
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """``count`` seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""

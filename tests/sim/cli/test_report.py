@@ -29,6 +29,7 @@ def follow(panda, setpoint, time_constant=0.05):
             ok=np.ones(shape[:2], bool),
         ),
         tick=0.01,
+        info=panda.run_info(),
     )
     return rollout, np.array(start)
 

@@ -15,7 +15,7 @@ def write(path, robot="panda", envs=1):
     panda = Robot.load("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
-    rollout = Rollout(np.array([0.1, 0.2]), zeros, seen, tick=0.1)
+    rollout = Rollout(np.array([0.1, 0.2]), zeros, seen, tick=0.1, info=panda.run_info())
     told = {name: getattr(panda, name) for name in ("joint_names", "units", "lower", "upper", "effort_limit")}
     np.savez(path, **rollout.arrays(), tick=rollout.tick, **told, robot=robot)
     return path

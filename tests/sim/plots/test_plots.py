@@ -138,7 +138,7 @@ def test_traces_of_a_rollout_blank_what_came_after_a_divergence():
     ok[10:, 2] = False
     zeros = np.zeros(shape, np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, ok)
-    rollout = Rollout(np.arange(1.0, TICKS + 1), zeros.astype(float), seen, tick=1.0)
+    rollout = Rollout(np.arange(1.0, TICKS + 1), zeros.astype(float), seen, tick=1.0, info=robot.run_info())
     traces = plots.Traces.of(rollout, robot, "run")
     np.testing.assert_array_equal(np.isnan(traces.qpos).all(2), ~ok)
     np.testing.assert_array_equal(np.isnan(traces.effort).any(2), ~ok)

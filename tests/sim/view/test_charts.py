@@ -33,7 +33,7 @@ def shown():
         wave = np.repeat((height * np.sin(9 * time))[:, None, None], robot.dof, axis=2).astype(np.float32)
         ok = np.ones((50, 1), bool)
         seen = Observation(wave, wave, wave, wave > 9e9, ok)
-        playback = Playback(robot, Rollout(time, 0.0 * wave.astype(float), seen, tick=0.02))
+        playback = Playback(robot, Rollout(time, 0.0 * wave.astype(float), seen, 0.02, robot.run_info()))
         playback.seek(float(time[rows - 1] - time[0]))
         gui = Gui()
         charts = Charts(gui, playback)
