@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from batchpid.display import array_summary
 from batchpid.elementwise import TURN, namespace, tiny_of
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
@@ -42,9 +41,6 @@ class Coefficients(NamedTuple):
     integration: Any
     weight_origin: Any
     non_finite: Any
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
 
 
 def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:

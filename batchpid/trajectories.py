@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.display import array_summary
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
 Float64 = NDArray[np.float64]
@@ -40,9 +39,6 @@ class Trajectory(NamedTuple):
     position: Float64
     velocity: Float64
     acceleration: Float64
-
-    def __repr__(self) -> str:
-        return array_summary(self, "ticks", *["envs"] * (self.position.ndim - 2), "joints")
 
     @property
     def ticks(self) -> int:

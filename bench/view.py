@@ -1,11 +1,10 @@
-"""How many frames a second a page of ``batchpid view`` gets, and draws, while the simulation keeps real time.
+"""Frame rate of ``batchpid view``: frames served and drawn per second, and the real-time factor of the simulation.
 
     python bench/view.py --width 800 --height 600
     python bench/view.py --robot panda --num-envs 8 --control pid drive --width 1440 --height 900 --picture view.png
 
-Everything runs on this machine: workers, page server, and headless Chromium drawing in software, which is put behind
-the others (nice 19). ``served`` is what the view sends, ``drawn`` what the browser shows
-of it.
+Everything runs on this machine: workers, page server, and headless Chromium, which draws in software at the lowest
+priority (nice 19). ``served`` counts the frames that the view sends, ``drawn`` those that the browser shows.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from PIL import Image
 from selenium import webdriver
 
 from sim import Robot
-from sim.view import Live, View
+from sim.view import LiveSimulation, View
 
 FLAGS = (
     "--headless=new",
@@ -46,7 +45,7 @@ COUNT = "window.drawn = 0; const tick = () => { window.drawn++; requestAnimation
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure."""
+    """Options of the measurement."""
 
     robot: str = "jaco2"
     num_envs: int = 16
@@ -56,15 +55,15 @@ class Options:
     height: int = 800
     seconds: float = 8.0
     picture: Path | None = None
-    """Keep what the page looks like 2 s after all robots were sent to their targets."""
+    """Save a picture of the page 2 s after a step from the start pose to the target."""
 
 
 def main(options: Options) -> None:
-    """Serve, open, wait until all is loaded, count."""
+    """Serve a page, open it in a browser, and count frames once everything is loaded."""
     robot = Robot.load(options.robot)
-    live = Live(robot, options.num_envs, controls=options.control, physics=options.physics)
+    live = LiveSimulation(robot, options.num_envs, controls=options.control, physics=options.physics)
     target = robot.settings.target if robot.settings is not None else robot.start
-    live.go_to(target)
+    live.set_setpoints(target)
     first = live.frame().qpos
     with View(live, port=18200) as view, tempfile.TemporaryDirectory() as profile:
         thread = threading.Thread(target=view.run)
@@ -75,7 +74,7 @@ def main(options: Options) -> None:
         for flag in (*FLAGS, f"--window-size={options.width},{options.height}", f"--user-data-dir={profile}"):
             chrome.add_argument(flag)
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
-        # A browser that is slow draws fewer pixels by and by; not so for a picture.
+        # viser lowers the resolution in a slow browser, unless told not to for a picture.
         page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
         browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
         for process in browser:
@@ -97,32 +96,32 @@ def main(options: Options) -> None:
         thread.join()
         assert moved > 0.1, "the robots did not move"
     print(
-        f"{options.num_envs} x {robot.name}, {' beside '.join(options.control)}, {options.physics}, "
+        f"{options.num_envs} x {robot.name}, {' and '.join(options.control)}, {options.physics}, "
         f"{options.width} x {options.height}: "
         f"{served:.1f} frames/s served, {min(served, drawn / wall):.1f} drawn, {factor:.2f} x real time, "
-        f"{1e3 * spent / max(1.0, min(served * wall, drawn)):.0f} ms of processor time in the browser for each drawn"
+        f"{1e3 * spent / max(1.0, min(served * wall, drawn)):.0f} ms of processor time in the browser per drawn frame"
     )
 
 
 def _spent(processes: list[psutil.Process]) -> float:
-    """Processor time so far [s]."""
+    """Return the processor time of ``processes`` [s]."""
     times = [process.cpu_times() for process in processes if process.is_running()]
     return sum(time.user + time.system for time in times)
 
 
-def _picture(page: webdriver.Chrome, live: Live, target: np.ndarray, path: Path) -> None:
-    """Send the robots to the start, then to the target, and take the page as it is 2 s later."""
+def _picture(page: webdriver.Chrome, live: LiveSimulation, target: np.ndarray, path: Path) -> None:
+    """Save a picture of the page 2 s after a step from the start pose to the target."""
     for toast in page.find_elements("css selector", ".mantine-Notification-closeButton"):
-        toast.click()  # that WebGL runs in software
-    live.go_to(live.robot.start)
+        toast.click()  # the notice that WebGL runs in software
+    live.set_setpoints(live.robot.start)
     _until(live, 4.0)
-    live.go_to(target)
+    live.set_setpoints(target)
     _until(live, 2.0)
     with Image.open(io.BytesIO(page.get_screenshot_as_png())) as image:
         image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def _until(live: Live, seconds: float) -> None:
+def _until(live: LiveSimulation, seconds: float) -> None:
     end = live.time + seconds
     while live.time < end:
         time.sleep(0.02)

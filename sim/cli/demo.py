@@ -47,7 +47,7 @@ class Demo:
 
         out = plots.check_path(self.out)
         if self.viewer:
-            from sim.view.film import check_renderer, window
+            from sim.view.film import check_renderer, show_window
 
             check_renderer()
         robot = Robot.load(self.robot)
@@ -92,4 +92,4 @@ class Demo:
         )
         print(f"\npicture: {plots.save(figure, out)}")
         if self.viewer:
-            window(run.rollout.for_envs(slice(0, 16)), robot)
+            show_window(run.rollout.for_envs(slice(0, 16)))

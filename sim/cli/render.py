@@ -40,7 +40,7 @@ class Render:
         from batchpid.validate import integer
         from sim import Robot
         from sim.recording.dataset import read_rollout
-        from sim.view.film import film
+        from sim.view.film import write_film
 
         recorded = read_rollout(self.run_file)
         robot = Robot.load(self.robot or recorded.robot)
@@ -49,5 +49,7 @@ class Render:
         def progress(rows: object) -> object:
             return tqdm(rows, desc="filming", unit="frame", leave=False)
 
-        path = film(rollout, robot, self.out, fps=self.fps, width=self.width, height=self.height, progress=progress)
+        path = write_film(
+            rollout, self.out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
+        )
         print(f"film: {path}")

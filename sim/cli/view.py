@@ -32,7 +32,7 @@ class View:
     """What moves them: pid, drive, or both side by side."""
     params: OptionalStr = None
     """Gains of the PID to begin with: a file that `batchpid tune` or batchpid.save_params wrote, or one of tuned,
-    designed, tutorial. Default: designed ones, per unit of effort."""
+    designed, tutorial. Default: tuned ones where the robot has them, else designed ones."""
     compensate: Literal["gravity+coriolis", "gravity", "none"] = "gravity+coriolis"
     """Passive force added to the joints."""
     physics: Literal["accurate", "fast"] = "accurate"
@@ -58,15 +58,15 @@ class View:
         from batchpid.validate import integer
         from sim import Robot
         from sim.tuning.gain_sets import gain_set
-        from sim.view import Live, View
-        from sim.view.data import Source
+        from sim.view import LiveSimulation, View
+        from sim.view.data import ViewData
 
         port = integer("port", self.port, 1, 65535)
         if not 1.0 <= self.fps <= 120.0:
             raise InvalidArgumentError("fps", "out of range", value=self.fps, remedy="use 1 to 120")
-        source: Source
+        data: ViewData
         if self.play is not None:
-            source = _recorded(self.play, self.robot, 1 / self.fps)
+            data = _recorded(self.play, self.robot, 1 / self.fps)
         else:
             robot = Robot.load(self.robot or "panda")
             gains = {} if self.params is None else gain_set(robot, self.params).options
@@ -74,7 +74,7 @@ class View:
                 raise InvalidArgumentError(
                     "params", "are the PID's", value=self.params, remedy="use --control drive for a drive"
                 )
-            live = Live(
+            live = LiveSimulation(
                 robot,
                 self.num_envs,
                 controls=self.control,
@@ -85,9 +85,9 @@ class View:
                 **gains,
             )
             if robot.settings is not None:
-                live.go_to(robot.settings.target)
-            source = live
-        with View(source, host=self.host, port=port) as view:
+                live.set_setpoints(robot.settings.target)
+            data = live
+        with View(data, host=self.host, port=port) as view:
             if self.host not in LOOPBACK:
                 print(
                     f"batchpid: warning: listening on {self.host}: whoever reaches it can move the sliders",
@@ -105,7 +105,7 @@ def _recorded(path: Path, name: str | None, period: float) -> Playback:
     from sim import Robot
     from sim.recording.dataset import read_rollout
     from sim.view import Playback
-    from sim.view.simulation import MOST
+    from sim.view.layout import MAX_ROBOTS
 
     recorded = read_rollout(path)
     try:
@@ -119,7 +119,7 @@ def _recorded(path: Path, name: str | None, period: float) -> Playback:
             value=str(path),
             remedy=f"pass its URDF too: batchpid view path/to/{recorded.robot}.urdf --play {path}",
         ) from error
-    count = recorded.rollout.qpos.shape[1]
-    if count > MOST:
-        print(f"showing the first {MOST} of {count} envs")
-    return Playback(robot, recorded.rollout.for_envs(slice(0, MOST)), period=period)
+    count = recorded.rollout.num_envs
+    if count > MAX_ROBOTS:
+        print(f"showing the first {MAX_ROBOTS} of {count} envs")
+    return Playback(recorded.rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=period)

@@ -1,29 +1,27 @@
-"""Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees.
-
-lxml's own options do it: they cover what ``defusedxml`` checks, whose lxml module is deprecated, and libxml2 limits
-nesting and the size of text, which the standard library's parser does not.
-"""
+"""Reading XML that may come from a stranger: no entities, no DTD, no network, no oversized trees."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
-import numpy as np
 from lxml import etree
-from numpy.typing import NDArray
 
-from batchpid.errors import RobotError
+from batchpid.errors import RobotError, RobotNotFoundError
 
 
 def parse_xml(path: Path) -> etree._Element:
-    """Return the root element of the file at ``path``, without comments.
+    """Root element of the file at ``path``, without comments.
 
     Raises
     ------
+    RobotNotFoundError
+        There is no such file.
     RobotError
-        The file cannot be read, is not well-formed, or has a DTD.
+        It is not well-formed, or has a DTD.
     """
+    if not path.is_file():
+        raise RobotNotFoundError(f"no file at {path}; check the path")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True)
     try:
         tree = etree.parse(str(path), parser)
@@ -37,22 +35,24 @@ def parse_xml(path: Path) -> etree._Element:
 
 
 def number(element: etree._Element, key: str, default: float, where: str) -> float:
-    """Return an attribute as a number, NaN and infinity included; ``where`` is for the RobotError if it is none."""
+    """Attribute ``key`` as a number, NaN and infinity included."""
     text = element.get(key)
+    if text is None:
+        return default
     try:
-        return default if text is None else float(text)
+        return float(text)
     except ValueError:
         raise RobotError(f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF") from None
 
 
-def numbers(element: etree._Element | None, key: str, default: str, where: str) -> NDArray[np.float64]:
-    """Return the finite numbers in an attribute, as many as there are in ``default``, which replaces a missing one."""
-    text, count = default if element is None else element.get(key, default), len(default.split())
+def numbers(element: etree._Element, key: str, count: int, where: str) -> list[float]:
+    """Attribute ``key`` as ``count`` finite numbers."""
+    text = element.get(key, "")
     try:
-        values = [float(word) for word in text.split()]
+        values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if element is not None and (len(values) != count or not all(map(math.isfinite, values))):
-        need = "one finite number" if count == 1 else f"{count} finite numbers"
+    if len(values) != count or not all(map(math.isfinite, values)):
+        need = "one finite number" if count == 1 else "three numbers, all finite"
         raise RobotError(f"{where}: <{element.tag} {key}={text!r}> needs {need}; correct the URDF")
-    return np.array(values)
+    return values

@@ -1,10 +1,10 @@
-"""A page on localhost that shows robots as they move; see docs/view.md.
+"""Page on localhost that shows robots as they move, and films; see docs/view.md.
 
-Nothing here touches the simulation's loop: link poses are computed beside it, from qpos.
+Link poses are computed from qpos by forward kinematics, so that showing robots does not slow the runner's loop.
 """
 
 from sim.view.playback import Playback
 from sim.view.session import View
-from sim.view.simulation import Live
+from sim.view.simulation import LiveSimulation
 
-__all__ = ["Live", "Playback", "View"]
+__all__ = ["LiveSimulation", "Playback", "View"]

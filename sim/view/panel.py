@@ -1,6 +1,6 @@
-"""The panel beside the robots: run and pause, what to watch, setpoints, gains, disturbances.
+"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances.
 
-The page calls back from other threads. What it asks for is queued, and done between two frames.
+The page calls back from other threads; its requests are queued and carried out between two frames.
 """
 
 from __future__ import annotations
@@ -13,241 +13,215 @@ from typing import Any
 
 import numpy as np
 
+from sim.observation import Rollout
 from sim.robot.robot import Robot
-from sim.view.data import Frame, Source
+from sim.view.data import ViewData
+from sim.view.gains import GAINS
 from sim.view.playback import Playback
-from sim.view.simulation import Live
+from sim.view.simulation import LiveSimulation
+
+_DIRECTIONS = {
+    "+x": (1, 0, 0),
+    "-x": (-1, 0, 0),
+    "+y": (0, 1, 0),
+    "-y": (0, -1, 0),
+    "up": (0, 0, 1),
+    "down": (0, 0, -1),
+}
+_MILLISECONDS = {"derivative_filter_time": 1e3}
+"""Factor from a gain to the number on its slider, where that is not 1."""
 
 
 class Panel:
-    """The controls of ``source`` on ``server``; :meth:`work` does what was asked for since the last call."""
+    """Controls of ``data`` on a viser ``server``."""
 
-    def __init__(self, server: Any, source: Source) -> None:
-        self._gui, self._source = server.gui, source
-        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+    def __init__(self, server: Any, data: ViewData) -> None:
+        self._gui, self._data = server.gui, data
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.playing = True
+        """Whether time passes."""
         self.steps = 0
         """Frames still to run while paused."""
-        self._names = short_names(source.robot)
+        self._names = short_names(data.robot)
         gui = self._gui
         self._status = gui.add_markdown("starting ...")
-        self._run = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
-        self._on(self._run, self._pressed)
+        self._on(gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset")), self._control_motion)
         self._speed = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
-        if isinstance(source, Playback):
-            self._place = gui.add_slider("Time [s]", 0.0, source.duration, source.period, 0.0)
-            self._on(self._place, source.seek)
+        if isinstance(data, Playback):
+            self._time = gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0)
+            self._on(self._time, data.seek)
         with gui.add_folder("Watch"):
-            self._robot = gui.add_slider("Robot", min=0, max=max(1, source.per_group - 1), step=1, initial_value=0)
-            self._robot.disabled = source.per_group == 1
-            self._joint = gui.add_dropdown("Joint", self._names, initial_value=self._names[_first_moving(source.robot)])
-            self._ghost = gui.add_checkbox("Show its setpoint", True)
-        if isinstance(source, Live):
-            self._live(source)
+            self._robot = gui.add_slider("Robot", min=0, max=max(1, data.per_group - 1), step=1, initial_value=0)
+            self._robot.disabled = data.per_group == 1
+            # At first the joint that moves farthest to the target.
+            settings = data.robot.settings
+            first = 0 if settings is None else int(np.argmax(np.abs(settings.target - data.robot.start)))
+            self._joint = gui.add_dropdown("Joint", self._names, initial_value=self._names[first])
+            self._show_setpoint = gui.add_checkbox("Show its setpoint", True)
+        if isinstance(data, LiveSimulation):
+            tabs = gui.add_tab_group()
+            with tabs.add_tab("Setpoint"):
+                self._add_setpoints(data)
+            with tabs.add_tab("Gains"):
+                self._add_gains(data)
+            with tabs.add_tab("Disturb"):
+                self._add_disturbances(data)
 
     @property
     def env(self) -> int:
-        """The robot of each group that is watched."""
-        return min(int(self._robot.value), self._source.per_group - 1)
+        """Watched robot of each group."""
+        return min(int(self._robot.value), self._data.per_group - 1)
 
     @property
     def joint(self) -> int:
-        """The joint that is watched."""
+        """Watched joint."""
         return self._names.index(self._joint.value)
 
     @property
-    def ghost(self) -> bool:
-        """Whether the watched robot's setpoint is shown."""
-        return bool(self._ghost.value)
+    def show_setpoint(self) -> bool:
+        """Whether the setpoint of the watched robot is shown."""
+        return bool(self._show_setpoint.value)
 
     @property
     def speed(self) -> float:
-        """Simulated seconds a second."""
+        """Requested real-time factor."""
         return float(self._speed.value)
 
     def select(self, robot: int) -> None:
-        """Watch a robot; called when it is clicked."""
-        self._robot.value = robot % self._source.per_group
+        """Watch a robot."""
+        self._robot.value = robot % self._data.per_group
 
-    def work(self) -> None:
-        """Do what was asked for since the last call."""
-        while True:
-            try:
-                job = self._asked.get_nowait()
-            except queue.Empty:
-                return
-            job()
+    def run_requests(self) -> None:
+        """Carry out the requests of the page since the last call."""
+        while not self._requests.empty():
+            self._requests.get()()
 
-    def tell(self, frame: Frame, factor: float, rate: float) -> None:
-        """Show time, speed and what is wrong."""
-        source = self._source
+    def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
+        """Show time, real-time factor, frame rate, and the robots that diverged or saturate."""
+        data, time = self._data, float(frame.time[0])
+        diverged, saturated = int((~frame.ok).sum()), int(frame.saturated.any(-1).sum())
+        speed = f"{factor:.2f} x real time · {rate:.0f} frames/s" if self.playing else "paused"
         lines = [
-            f"**{source.per_group} x {source.robot.name}** · {' beside '.join(source.groups)}",
-            f"t = {frame.time:.2f} s · "
-            + (f"{factor:.2f} x real time · {rate:.0f} frames/s" if self.playing else "paused"),
+            f"**{data.per_group} x {data.robot.name}** · {' and '.join(data.groups)}",
+            f"t = {time:.2f} s · {speed}",
+            f"{saturated} of {frame.num_envs} saturated" if saturated else "no effort at its limit",
         ]
-        dead, strained = int((~frame.ok).sum()), int(frame.saturated.sum())
-        if dead:
-            lines.append(f"**{dead} diverged** (red): these gains are unstable; Reset brings them back")
-        lines.append(f"{strained} of {len(frame.ok)} saturated" if strained else "no effort at its limit")
+        if diverged:
+            lines.insert(2, f"**{diverged} diverged** (red): these gains are unstable; Reset brings them back")
         self._status.content = "  \n".join(lines)
-        if isinstance(source, Playback):
-            self._place.value = frame.time
+        if isinstance(data, Playback):
+            self._time.value = time
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
-    def _on(self, handle: Any, do: Callable[[Any], None]) -> None:
-        """Queue ``do(value)`` when the page (and not this program) changes a control."""
+    def _on(self, handle: Any, action: Callable[[Any], None]) -> None:
+        """Queue ``action(value)`` whenever a user, and not this program, changes a control."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
-                self._asked.put(partial(do, handle.value))
+                self._requests.put(partial(action, handle.value))
 
         (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(changed)
 
-    def _pressed(self, button: str) -> None:
+    def _control_motion(self, button: str) -> None:
         if button == "Step":
             self.playing, self.steps = False, self.steps + 1
         elif button == "Reset":
-            self._source.reset()
+            self._data.reset()
         else:
             self.playing = button == "Run"
 
-    def _live(self, live: Live) -> None:
-        tabs = self._gui.add_tab_group()
-        with tabs.add_tab("Setpoint"):
-            self._setpoints(live)
-        with tabs.add_tab("Gains"):
-            self._gains(live)
-        with tabs.add_tab("Disturb"):
-            self._disturbances(live)
-
-    def _setpoints(self, live: Live) -> None:
+    def _add_setpoints(self, live: LiveSimulation) -> None:
         gui, robot = self._gui, live.robot
         poses = {"start": robot.start} | ({} if robot.settings is None else {"target": robot.settings.target})
-        go = gui.add_button_group("Go to", (*poses, "random"))
-        only = gui.add_checkbox("Watched robot only", False)
+        buttons = gui.add_button_group("Go to", (*poses, "random"))
+        watched_only = gui.add_checkbox("Watched robot only", False)
         sliders: list[Any] = []
 
-        def env() -> int | None:
-            return self.env if only.value else None
-
-        def show() -> None:
+        def update() -> None:
             for slider, value in zip(sliders, live.setpoint[self.env], strict=True):
                 slider.value = float(np.clip(value, slider.min, slider.max))
 
-        def pressed(name: str) -> None:
-            if name == "random":
-                live.go_anywhere()
+        def go_to(pose: str) -> None:
+            if pose == "random":
+                live.randomize_setpoints()
             else:
-                live.go_to(poses[name])
-            show()
+                live.set_setpoints(poses[pose])
+            update()
 
-        def go_one(joint: int, position: float) -> None:
-            live.go(joint, position, env())
+        def move(joint: int, position: float) -> None:
+            live.set_setpoint(joint, position, self.env if watched_only.value else None)
 
-        self._on(go, pressed)
+        self._on(buttons, go_to)
         for index, (name, joint) in enumerate(zip(self._names, robot.joints, strict=True)):
             low, high = max(joint.lower, -2 * math.pi), min(joint.upper, 2 * math.pi)
             low, high = math.ceil(1e3 * low) / 1e3, math.floor(1e3 * high) / 1e3  # fewer digits to read
             value = float(np.clip(live.setpoint[0, index], low, high))
-            slider = gui.add_slider(f"{name} [{joint.unit}]", low, high, min(_step(high - low), 0.01), value)
-            self._on(slider, partial(go_one, index))
+            slider = gui.add_slider(f"{name} [{joint.unit}]", low, high, min(_slider_step(high - low), 0.01), value)
+            self._on(slider, partial(move, index))
             sliders.append(slider)
-        self._robot.on_update(lambda _: self._asked.put(show))
+        self._robot.on_update(lambda _: self._requests.put(update))
 
-    def _gains(self, live: Live) -> None:
+    def _add_gains(self, live: LiveSimulation) -> None:
         gui = self._gui
-        control = gui.add_dropdown("Of", live.groups) if len(live.groups) > 1 else None
-        says = gui.add_markdown("")
-        rows: dict[str, tuple[Any, float]] = {}
+        group = gui.add_dropdown("Of", live.groups)
+        group.visible = len(live.groups) > 1
+        description = gui.add_markdown("")
+        sliders: dict[str, Any] = {}
 
-        def group() -> str:
-            return live.groups[0] if control is None else str(control.value)
+        def change(gain: str, number: float) -> None:
+            live.gains[group.value].set(gain, self.joint, number / _MILLISECONDS.get(gain, 1.0))
 
-        def change(gain: str, factor: float, value: float) -> None:
-            live.tune(group(), gain, self.joint, value / factor)
+        for gain in GAINS:
+            label = "filter [ms]" if gain in _MILLISECONDS else gain.replace("_", " ")
+            sliders[gain] = gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)
+            self._on(sliders[gain], partial(change, gain))
+        names = dict.fromkeys(name for gains in live.gains.values() for name in gains.set_names)
+        buttons = gui.add_button_group("All joints to", tuple(names))
 
-        for gain, label, factor in (
-            ("kp", "kp", 1.0),
-            ("ki", "ki", 1.0),
-            ("kd", "kd", 1.0),
-            ("derivative_filter_time", "filter [ms]", 1e3),
-            ("setpoint_weight", "setpoint weight", 1.0),
-            ("effort_limit", "effort limit", 1.0),
-        ):
-            slider = gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)
-            rows[gain] = (slider, factor)
-            self._on(slider, partial(change, gain, factor))
-        names = tuple(dict.fromkeys(name for each in live.groups for name in live.gain_sets(each)))
-        back = gui.add_button_group("All joints to", names)
+        def update() -> None:
+            joint, gains = live.robot.joints[self.joint], live.gains[group.value]
+            effort, position = joint.effort_unit, joint.unit
+            units = f"kp in {effort}/{position}, ki in {effort}/({position} s), kd in {effort} s/{position}."
+            if gains.params.gain_units is not None:
+                units = "kp in 1/s², ki in 1/s³, kd in 1/s, times the inertia."
+            description.content = f"Of **{self._names[self.joint]}**, on every robot. {units}"
+            for gain, slider in sliders.items():
+                # Four digits: the box next to a slider holds no more.
+                value, high = (
+                    float(f"{_MILLISECONDS.get(gain, 1.0) * n:.4g}") for n in gains.slider_range(gain, self.joint)
+                )
+                slider.max, slider.step, slider.value = max(value, high), _slider_step(high), value
 
-        def show(_: Any = None) -> None:
-            joint = live.robot.joints[self.joint]
-            of_joint = f"Of **{self._names[self.joint]}**, on every robot"
-            says.content = f"{of_joint}. {_gain_units(live, group(), joint.unit, joint.effort_unit)}"
-            for gain, (slider, factor) in rows.items():
-                value, top = (_short(factor * n) for n in live.gain_range(group(), gain, self.joint))
-                slider.max, slider.step = max(value, top), _step(top)
-                slider.value = value
+        def apply(name: str) -> None:
+            if name in live.gains[group.value].set_names:
+                live.gains[group.value].apply_set(name)
+                update()
 
-        def restore(name: str) -> None:
-            if name in live.gain_sets(group()):
-                live.take_gains(group(), name)
-                show()
+        self._on(buttons, apply)
+        for chooser in (self._joint, group):
+            chooser.on_update(lambda _: self._requests.put(update))
+        update()
 
-        self._on(back, restore)
-        for chooser in (self._joint, control):
-            if chooser is not None:
-                chooser.on_update(lambda _: self._asked.put(show))
-        show()
-
-    def _disturbances(self, live: Live) -> None:
+    def _add_disturbances(self, live: LiveSimulation) -> None:
         gui, links = self._gui, live.kinematics.links
-        where = gui.add_dropdown("On link", links, initial_value=links[live.load_link])
-        weight = gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0)
+        link = gui.add_dropdown("On link", links, initial_value=links[live.load_link])
+        payload = gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0)
         force = gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0)
-        push = gui.add_button_group("Push along", ("+x", "-x", "+y", "-y", "up", "down"))
-        directions = dict(zip(("+x", "-x", "+y", "-y", "up", "down"), np.repeat(np.eye(3), 2, axis=0), strict=True))
-        for name in ("-x", "-y", "down"):
-            directions[name] = -directions[name]
-
-        def hang(value: float) -> None:
-            live.payload = value
-
-        def move(link: str) -> None:
-            live.load_link = live.kinematics.index(link)
-
-        self._on(where, move)
-        self._on(weight, hang)
-        self._on(push, lambda name: live.push(tuple(float(force.value) * directions[name])))
+        push = gui.add_button_group("Push along", tuple(_DIRECTIONS))
+        self._on(link, lambda name: setattr(live, "load_link", live.kinematics.index(name)))
+        self._on(payload, partial(setattr, live, "payload"))
+        self._on(push, lambda name: live.push(float(force.value) * np.array(_DIRECTIONS[name])))
 
 
 def short_names(robot: Robot) -> tuple[str, ...]:
     """Return the joint names without the words that all of them begin with; a bare number keeps the word before."""
     words = [name.split("_") for name in robot.joint_names]
-    first, last = min(words), max(words)  # what these two share, all share
+    first, last = min(words), max(words)  # their common start is that of all names
     shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
     return tuple("_".join(each[shared - (shared > 0 and each[shared].isdigit()) :]) for each in words)
 
 
-def _first_moving(robot: Robot) -> int:
-    """Return the joint that the tutorial moves farthest, to begin with."""
-    return 0 if robot.settings is None else int(np.argmax(np.abs(robot.settings.target - robot.start)))
-
-
-def _gain_units(live: Live, control: str, position: str, effort: str) -> str:
-    """Return the units of kp, ki and kd, in words."""
-    if control == "pid" and live.gain_units != "effort":
-        return "kp in 1/s², ki in 1/s³, kd in 1/s, times the inertia."
-    return f"kp in {effort}/{position}, ki in {effort}/({position} s), kd in {effort} s/{position}."
-
-
-def _short(value: float) -> float:
-    """Return a number of four digits to show: the box beside a slider holds no more."""
-    return float(f"{value:.4g}")
-
-
-def _step(width: float) -> float:
-    """Return a slider's step: a power of ten that makes some hundred steps or more of the width."""
+def _slider_step(width: float) -> float:
+    """Return a power of ten that divides ``width`` into a hundred steps or more."""
     return 10.0 ** math.floor(math.log10(max(width, 1e-9) / 100))

@@ -1,50 +1,72 @@
-"""A rollout that has been: played in the same page as a running one."""
+"""Playback of a recorded run."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
-from sim.observation import Rollout
+from sim.observation import Observation, Rollout
 from sim.robot.robot import Robot
-from sim.view.data import Frame, Traces
+
+HISTORY_SECONDS = 8.0
+"""Longest past that the charts show [s]."""
 
 
 class Playback:
-    """``rollout`` of ``robot``, from its first row to its last and then again."""
+    """Recorded run as the data of a page; after the last row it starts over. Time counts from the first row.
 
-    def __init__(self, robot: Robot, rollout: Rollout, label: str = "recorded", period: float = 1 / 30) -> None:
-        if rollout.qpos.shape[2] != robot.dof:
+    Parameters
+    ----------
+    robot
+        Robot of the run; default the bundled one of its name.
+    period
+        Time between frames [s], at least a tick of the run.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The run has another number of joints than the robot.
+    RobotNotFoundError
+        The robot of the run is not bundled.
+    """
+
+    def __init__(self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30) -> None:
+        robot = Robot.load(rollout.info.robot) if robot is None else robot
+        joints = rollout.qpos.shape[2]
+        if joints != robot.dof:
             raise InvalidArgumentError(
                 "rollout",
-                f"has {rollout.qpos.shape[2]} joints, robot {robot.name!r} has {robot.dof}",
+                f"has {joints} joints, robot {robot.name!r} has {robot.dof}",
                 remedy="give the robot that was recorded",
             )
-        self.robot, self.per_group = robot, rollout.qpos.shape[1]
-        self.groups: tuple[str, ...] = (label,)
-        self._rollout = rollout
-        self._time = rollout.time - rollout.time[0]
-        self.duration = float(self._time[-1])
-        tick = self.duration / max(1, len(self._time) - 1)
-        self.period = max(period, tick) if self.duration else period
+        self.robot, self.per_group = robot, rollout.num_envs
+        self.groups = ("recorded",)
+        self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
+        self.duration = float(self._rollout.time[-1])
+        """Time from the first row to the last [s]."""
+        self.period = max(period, rollout.tick)
         self._now = 0.0
 
-    def frame(self) -> Frame:
-        """Return the recorded state nearest to the present time."""
-        k = self._row()
-        rollout, ok = self._rollout, self._rollout.ok[k]
-        last = np.nan_to_num(rollout.qpos[k]) if not ok.all() else rollout.qpos[k]
-        return Frame(
-            time=float(self._time[k]),
-            qpos=last,
-            setpoint=rollout.setpoint[k],
-            effort=rollout.effort[k].astype(np.float64),
-            saturated=rollout.saturated[k].any(1),
-            ok=ok,
-        )
+    def frame(self) -> Rollout:
+        """Return the state recorded at the present time, as a rollout of one tick."""
+        row = int(rows_at(self._rollout, self._now))
+        return self._finite(slice(row, row + 1))
+
+    def history(self) -> Rollout:
+        """Return the rows up to the present one, of the last :data:`HISTORY_SECONDS`."""
+        first, last = rows_at(self._rollout, np.array([self._now - HISTORY_SECONDS, self._now]))
+        return self._finite(slice(int(first), int(last) + 1))
+
+    def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
+        """Return the effort limits in the URDF [N m or N]."""
+        limit = float(self.robot.effort_limit[joint])
+        return -limit, limit
 
     def advance(self) -> None:
-        """Go on by a frame; after the last begin again."""
+        """Go to the next frame; after the last to the first."""
         self._now = 0.0 if self._now >= self.duration else min(self._now + self.period, self.duration)
 
     def seek(self, time: float) -> None:
@@ -52,27 +74,19 @@ class Playback:
         self._now = min(max(0.0, time), self.duration)
 
     def reset(self) -> None:
-        """Go back to the beginning."""
+        """Go to the first row."""
         self._now = 0.0
 
-    def traces(self, robot: int, joint: int) -> Traces:
-        """Return a joint's past up to now."""
-        rows = slice(0, self._row() + 1)
-        rollout = self._rollout
-        return Traces(
-            self._time[rows],
-            rollout.qpos[rows, robot, joint].astype(np.float64),
-            rollout.setpoint[rows, robot, joint],
-            rollout.effort[rows, robot, joint].astype(np.float64),
-        )
-
-    def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
-        """Return the limits that the URDF gives."""
-        limit = float(self.robot.effort_limit[joint])
-        return -limit, limit
-
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: a playback holds no resources."""
 
-    def _row(self) -> int:
-        return int(np.searchsorted(self._time, self._now - 1e-9).clip(0, len(self._time) - 1))
+    def _finite(self, rows: slice) -> Rollout:
+        part = self._rollout.for_ticks(rows)
+        finite = (np.nan_to_num(array, posinf=0.0, neginf=0.0) for array in part.observation)
+        return replace(part, observation=Observation._make(finite))
+
+
+def rows_at(rollout: Rollout, seconds: float | NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the rows of ``rollout`` that are shown at times [s] since its first row."""
+    elapsed = rollout.time - rollout.time[0]
+    return np.searchsorted(elapsed, np.asarray(seconds) - 1e-9).clip(0, len(elapsed) - 1)

@@ -100,7 +100,7 @@ BAD = {
     ),
     "integration": (
         '{"format": "batchpid-params-1", "integration": [], "joints": {"elbow": {"kp": 1.0}}}',
-        "integration.*use one of 'output_first'",
+        "integration.*choose from",
     ),
     "dtype": (
         '{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}',

@@ -1,4 +1,4 @@
-"""A page with robots, and a headless browser to look at it."""
+"""Fixtures: a served page and a headless browser."""
 
 import shutil
 import threading
@@ -28,14 +28,14 @@ FLAGS = [
 
 @pytest.fixture
 def serve():
-    """Serve a source in a thread for as long as the test lasts."""
+    """Return a function that serves data in a thread until the end of the test."""
     pytest.importorskip("viser")
     from sim.view import View
 
     running = []
 
-    def serve(source, port=18080):
-        view = View(source, port=port)
+    def serve(data, port=18080):
+        view = View(data, port=port)
         thread = threading.Thread(target=view.run)
         thread.start()
         running.append((view, thread))
@@ -50,7 +50,7 @@ def serve():
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory):
-    """Headless Chromium that draws in software, started once; skipped where it is not installed."""
+    """Headless Chromium that draws in software; tests skip where it is not installed."""
     webdriver = pytest.importorskip("selenium.webdriver")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
@@ -68,7 +68,7 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def open_page(browser):
-    """Open a page, left again at the end of the test."""
+    """Return a function that opens a page until the end of the test."""
 
     def open_page(url):
         browser.get(url)
@@ -80,15 +80,15 @@ def open_page(browser):
 
 @pytest.fixture
 def until():
-    """Wait until a condition holds, and return what it returned."""
+    """Return a function that waits for a condition and returns its value."""
 
-    def until(condition, seconds=200, what="it"):
+    def until(condition, seconds=200, what="the condition"):
         deadline, pause = time.monotonic() + seconds, 0.05
         while time.monotonic() < deadline:
             if found := condition():
                 return found
             time.sleep(pause)
-            pause = min(0.5, 1.5 * pause)  # a look costs what the page needs to go on
+            pause = min(0.5, 1.5 * pause)  # each check takes time from the page
         raise AssertionError(f"{what} did not happen within {seconds} s")
 
     return until

@@ -1,29 +1,29 @@
-"""The page as a person meets it, in a real browser: robots are there, sliders move them, charts draw."""
+"""The page in a real browser: robots, sliders, charts."""
 
 import io
 
 import numpy as np
 import pytest
 
-from sim import Robot, Runner
-from sim.view import Live, Playback
+from sim import Runner
+from sim.view import LiveSimulation, Playback
 
 
 def picture(page):
-    """The page as an array (height, width, 3)."""
+    """Return a screenshot (height, width, 3)."""
     from PIL import Image
 
     return np.asarray(Image.open(io.BytesIO(page.get_screenshot_as_png())).convert("RGB")).astype(int)
 
 
 def dark(image):
-    """How many pixels between the panels are as dark as the robots' links, which the floor is not."""
+    """Count the pixels between the panels that are as dark as the robots' links; the floor is brighter."""
     middle = image[:, 400 : image.shape[1] - 360]
     return int((middle.max(-1) < 110).sum())
 
 
 def number_box(page, label):
-    """The number box beside the slider of this label."""
+    """Return the number box of the slider with this label."""
     from selenium.webdriver.common.by import By
 
     return page.find_element(By.XPATH, f"//label[text()='{label}']/following::input[@type='text'][1]")
@@ -54,19 +54,22 @@ def slide(page, label, steps):
 
 
 @pytest.fixture
-def live(serve):
-    # Ten frames a second leave a busy machine time for the page.
-    live = Live(Robot.load("panda"), 2, workers=0, spread=0.0, physics="fast", period=0.1)
+def live(panda):
+    # Ten frames per second leave a busy machine time for the page.
+    return LiveSimulation(panda, 2, workers=0, spread=0.0, physics="fast", period=0.1)
+
+
+@pytest.fixture
+def view(live, serve):
     view = serve(live)
-    view.panel.playing = False  # a page that stands still answers at once
-    return live, view
+    view.panel.playing = False  # a paused page answers at once
+    return view
 
 
-def test_robots_are_there_and_a_slider_moves_them(live, open_page, until):
-    live, view = live
+def test_robots_are_drawn_and_a_slider_moves_them(live, view, open_page, until):
     page = open_page(view.url)
     until(lambda: dark(picture(page)) > 500, what="drawing the robots")
-    before, pose = picture(page), live.frame().qpos.copy()
+    before, pose = picture(page), live.frame().qpos[0]
     assert abs(pose[0, 0]) < 0.1
     enter(page, "joint1 [rad]", 1.5)
     until(lambda: live.setpoint[0, 0] == 1.5, what="the number's setpoint")
@@ -74,15 +77,14 @@ def test_robots_are_there_and_a_slider_moves_them(live, open_page, until):
     until(lambda: live.setpoint[0, 0] == pytest.approx(1.55), what="the slider's setpoint")
     assert (live.setpoint[:, 0] == live.setpoint[0, 0]).all()
     press(page, "Run")
-    until(lambda: live.frame().qpos[:, 0].min() > 1.0, what="the motion")
+    until(lambda: live.frame().qpos[0, :, 0].min() > 1.0, what="the motion")
     until(
         lambda: (np.abs(picture(page) - before)[:, 400:-360].max(-1) > 40).sum() > 500,
         what="seeing the motion",
     )
 
 
-def test_gains_pause_step_reset_and_push(live, open_page, until):
-    live, view = live
+def test_gains_pause_step_reset_and_push(live, view, open_page, until):
     page = open_page(view.url)
     until(lambda: "no effort at its limit" in page.page_source, what="loading")
     press(page, "Step")
@@ -90,25 +92,23 @@ def test_gains_pause_step_reset_and_push(live, open_page, until):
     press(page, "Gains")
     until(lambda: number_box(page, "kp").is_displayed(), what="the gains tab")
     enter(page, "kp", 77)
-    until(lambda: 77.0 in live.gains["pid"]["kp"], what="the gain")
+    until(lambda: 77.0 in live.gains["pid"].params.kp, what="the gain")
     press(page, "Disturb")
     until(lambda: number_box(page, "Payload [kg]").is_displayed(), what="the disturbance tab")
     enter(page, "Payload [kg]", 2)
     until(lambda: live.payload == 2.0, what="the payload")
     press(page, "+y")
     press(page, "Run")
-    until(lambda: np.abs(live.frame().qpos - live.start).max() > 0.02, what="the push")
-    assert 77.0 in np.asarray(live._runners[0].params.kp)
+    until(lambda: np.abs(live.frame().qpos[0] - live.start).max() > 0.02, what="the push")
     press(page, "Pause")
     until(lambda: not view.panel.playing, what="the pause")
     press(page, "Reset")
     until(lambda: live.time == 0.0, what="the reset")
-    np.testing.assert_allclose(live.frame().qpos, live.start, atol=1e-6)
+    np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
 
 
-def test_charts_draw_the_watched_joint(live, open_page, until):
-    live, view = live
-    live.go_to(live.robot.settings.target)
+def test_charts_draw_the_watched_joint(live, view, open_page, until):
+    live.set_setpoints(live.robot.settings.target)
     view.panel.steps = 10
     page = open_page(view.url)
     until(lambda: "joint1 [rad]" in page.page_source, what="the chart's title")
@@ -120,15 +120,14 @@ def test_charts_draw_the_watched_joint(live, open_page, until):
     until(ink, what="the curve")
 
 
-def test_a_recorded_rollout_plays(serve, open_page, until):
-    robot = Robot.load("jaco2")
-    with Runner(robot, 2, workers=0, substeps=66) as runner:
-        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (45, robot.dof)))
-    playback = Playback(robot, rollout)
+def test_a_recorded_run_plays(jaco2, serve, open_page, until):
+    with Runner(jaco2, 2, workers=0, substeps=66) as runner:
+        rollout = runner.rollout(np.broadcast_to(jaco2.settings.target, (45, jaco2.dof)))
+    playback = Playback(rollout, jaco2)
     view = serve(playback, port=18090)
     page = open_page(view.url)
     until(lambda: dark(picture(page)) > 500, what="drawing the robots")
-    until(lambda: playback.frame().time > 0.5, what="playing")
+    until(lambda: playback.frame().time[0] > 0.5, what="playing")
     view.panel.playing = False
     enter(page, "Time [s]", 0.1)
-    until(lambda: playback.frame().time == pytest.approx(0.1, abs=playback.period), what="seeking")
+    until(lambda: playback.frame().time[0] == pytest.approx(0.1, abs=playback.period), what="seeking")

@@ -1,17 +1,17 @@
-"""The charts: what they draw of a joint, and what would spoil them."""
+"""Charts of one joint: finite curves, limits, noise."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim import Robot
+from sim import Observation, Rollout
 from sim.view import Playback
 from sim.view.charts import Charts
 
 
 class Gui:
-    """What Charts asks of viser's gui."""
+    """The part of viser's gui that Charts uses."""
 
     def __init__(self):
         self.charts = []
@@ -22,30 +22,26 @@ class Gui:
 
 
 @pytest.fixture
-def shown():
-    """The three charts after so many rows of a wave of this height."""
+def draw(jaco2):
+    """Return a function that draws the charts of a sine wave of some height."""
 
-    def shown(height, rows=50):
-        from sim import Observation, Rollout
-
-        robot = Robot.load("jaco2")
+    def draw(height):
         time = np.linspace(0.02, 1.0, 50)
-        wave = np.repeat((height * np.sin(9 * time))[:, None, None], robot.dof, axis=2).astype(np.float32)
+        wave = np.repeat((height * np.sin(9 * time))[:, None, None], jaco2.dof, axis=2).astype(np.float32)
         ok = np.ones((50, 1), bool)
         seen = Observation(wave, wave, wave, wave > 9e9, ok)
-        playback = Playback(robot, Rollout(time, 0.0 * wave.astype(float), seen, 0.02, robot.run_info()))
-        playback.seek(float(time[rows - 1] - time[0]))
+        playback = Playback(Rollout(time, 0.0 * wave.astype(float), seen, 0.02, jaco2.run_info()), jaco2)
+        playback.seek(1.0)
         gui = Gui()
-        charts = Charts(gui, playback)
-        charts.show(0, 6)
-        return charts, gui.charts
+        Charts(gui, playback).update(0, 6)
+        return gui.charts
 
-    return shown
+    return draw
 
 
 @pytest.mark.parametrize("height", [1e-7, 0.3, 18.0])
-def test_what_is_drawn_is_finite_and_has_a_series(shown, height):
-    _, charts = shown(height)
+def test_curves_are_finite_one_for_each_series(draw, height):
+    charts = draw(height)
     for chart in charts:
         assert len(chart.data) == len(chart.series)
         assert all(np.isfinite(column).all() for column in chart.data)  # a gap would empty the chart
@@ -54,15 +50,15 @@ def test_what_is_drawn_is_finite_and_has_a_series(shown, height):
     np.testing.assert_allclose(position.data[1], -error.data[1], atol=6e-5)
 
 
-def test_near_limits_are_drawn_and_far_ones_lie_under_the_curve(shown):
-    time, lower, upper, effort = shown(18.0)[1][2].data
+def test_near_limits_are_drawn_and_far_ones_repeat_the_curve(draw):
+    time, lower, upper, effort = draw(18.0)[2].data
     assert (lower == -20).all()
     assert (upper == 20).all()
-    time, lower, upper, effort = shown(0.3)[1][2].data
+    time, lower, upper, effort = draw(0.3)[2].data
     assert time[-1] == 0
     np.testing.assert_array_equal(lower, effort)
     np.testing.assert_array_equal(upper, effort)
 
 
-def test_noise_at_rest_is_a_flat_line(shown):
-    assert np.ptp(shown(1e-5)[1][0].data[1]) == 0
+def test_noise_at_rest_is_a_flat_line(draw):
+    assert np.ptp(draw(1e-5)[0].data[1]) == 0

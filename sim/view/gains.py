@@ -1,0 +1,125 @@
+"""Gains of a group of robots, changed from the page while the robots move."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice
+from sim.loop.control import check_params, default_params
+from sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+
+GAINS = ("kp", "ki", "kd", "derivative_filter_time", "setpoint_weight", "effort_limit")
+"""Gains that can be changed."""
+# Switching an option on or off would change the state of the law, so filter and weight are never quite off.
+_OPTIONS = {
+    "kp": (0.0, 0.0, np.inf),
+    "ki": (0.0, 0.0, np.inf),
+    "kd": (0.0, 0.0, np.inf),
+    "derivative_filter_time": (0.0, 1e-6, np.inf),
+    "setpoint_weight": (1.0, 0.0, 1 - 1e-9),
+    "effort_min": (-np.inf, -np.inf, np.inf),
+    "effort_max": (np.inf, -np.inf, np.inf),
+}
+"""Options of make_params behind the gains: the value where an option is off, and the range of values."""
+_MAX_EFFORT = 1e3
+"""Largest effort limit on a slider [N m or N]."""
+
+
+class GroupGains:
+    """Gains of one group, the same on each of its robots.
+
+    ``sets`` are params by name, of one row and in the same gain units. The group starts with the first.
+    """
+
+    def __init__(self, robot: Robot, sets: dict[str, bp.PIDParams]) -> None:
+        self._robot, self._base = robot, next(iter(sets.values()))
+        if self._base.setpoint_weight is None:  # without effect as long as the weight is 1
+            self._base = self._base.replace(weight_origin="start")
+        self._sets = {name: _values(params) for name, params in sets.items()}
+        self.set_names = tuple(sets)
+        """Names that :meth:`apply_set` takes."""
+        self.apply_set(self.set_names[0])
+
+    def apply_set(self, name: str) -> None:
+        """Give every joint the gains of a named set; the other options stay those of the first set."""
+        self._apply(self._sets[choice("name", name, self._sets)])
+
+    def set(self, gain: str, joint: int, value: float) -> None:
+        """Set one of :data:`GAINS` of a joint."""
+        changes = {choice("gain", gain, GAINS): value}
+        if gain == "effort_limit":
+            changes = {"effort_min": -value, "effort_max": value}
+        values = {name: row.copy() for name, row in self.values.items()}
+        for name, changed in changes.items():
+            values[name][joint] = np.clip(changed, *_OPTIONS[name][1:])
+        self._apply(values)
+
+    def slider_range(self, gain: str, joint: int) -> tuple[float, float]:
+        """Return a gain of a joint, and the upper end of the range worth trying."""
+        name = "effort_max" if gain == "effort_limit" else choice("gain", gain, GAINS)
+        value = float(self.values[name][joint])
+        largest = max(float(values[name][joint]) for values in self._sets.values())
+        if gain == "effort_limit":
+            return min(value, _MAX_EFFORT), min(float(self._robot.effort_limit[joint]), _MAX_EFFORT)
+        ends = {"setpoint_weight": 1.0, "derivative_filter_time": max(0.02, largest)}
+        return value, ends.get(gain, 4 * largest or float(self.values["kp"][joint]) or 1.0)
+
+    def params_under(self, disturbance: Float64) -> bp.PIDParams:
+        """Return params for a feedforward of ``disturbance`` (envs, dof) [N m or N] that acts from outside.
+
+        The effort limits move with it, so that they bound the effort of the motors alone.
+        """
+        return self.params.replace(**{end: disturbance + self.values[end] for end in ("effort_min", "effort_max")})
+
+    def _apply(self, values: dict[str, Float64]) -> None:
+        self.values = values
+        """Options of make_params in force, (dof,) each."""
+        self.params = self._base.replace(**values)
+        """Params in force."""
+
+
+def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:
+    """Return the gain sets that the page offers for a control, by name; the first is in force at the start.
+
+    For the PID these are the given ``params``, tuned, designed and tutorial gains, as far as the robot has them in the
+    gain units of the first.
+
+    Raises
+    ------
+    InvalidArgumentError
+        ``params`` are not one row of gains for the joints of ``robot``.
+    """
+    sets: dict[str, bp.PIDParams] = {}
+    if control == "pid":
+        units = "mass_matrix"
+        if params is not None:
+            sets["given"] = check_params(params, robot, 1, control)
+            units = params.options()["gain_units"]
+        for name, make in (("tuned", robot.tuned), ("designed", partial(robot.designed, units))):
+            with suppress(InvalidArgumentError):  # only bundled robots have tuned gains
+                sets |= {name: make()} if robot.fixed_base else {}
+    if robot.settings is not None:
+        sets["tutorial"] = robot.params() if control == "pid" else default_params(robot, control)
+    if not sets:  # a critically damped 10 rad/s, for an inertia of 1 where the base floats
+        inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else 1.0
+        limit = None if control == "drive" else robot.effort_limit
+        sets["default"] = robot.params(kp=100 * inertia, ki=0.0, kd=20 * inertia, effort_limit=limit)
+    marker = type(next(iter(sets.values())).gain_units)
+    return {name: params for name, params in sets.items() if isinstance(params.gain_units, marker)}
+
+
+def _values(params: bp.PIDParams) -> dict[str, Float64]:
+    """Return the options behind the gains of ``params``, (dof,) each."""
+    leaves = {name: getattr(params, name) for name in _OPTIONS}
+    return {
+        name: np.clip(np.full(params.num_joints, off) if leaves[name] is None else leaves[name][0], low, high)
+        for name, (off, low, high) in _OPTIONS.items()
+    }

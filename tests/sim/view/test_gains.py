@@ -1,0 +1,86 @@
+"""Gains on the page: the sets that are offered, and changes of single gains."""
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim.view.gains import GroupGains, offered_gains
+
+
+def test_tuned_and_designed_gains_are_offered_without_params(panda):
+    sets = offered_gains(panda, "pid", None)
+    assert list(sets) == ["tuned", "designed"]
+    np.testing.assert_array_equal(sets["designed"].kp, panda.designed().kp)
+    assert list(offered_gains(panda, "drive", None)) == ["tutorial"]
+
+
+@pytest.mark.parametrize(
+    ("units", "names"),
+    [
+        ("mass_matrix", ["given", "tuned", "designed"]),
+        ("inertia", ["given", "designed"]),
+        ("effort", ["given", "designed", "tutorial"]),
+    ],
+)
+def test_only_gains_in_the_units_of_the_given_params_are_offered(panda, units, names):
+    sets = offered_gains(panda, "pid", panda.params(kp=50.0, gain_units=units))
+    assert list(sets) == names
+    assert {params.options()["gain_units"] for params in sets.values()} == {units}
+
+
+def test_params_of_several_rows_are_refused(panda):
+    with pytest.raises(InvalidArgumentError, match="params"):
+        offered_gains(panda, "pid", panda.params(kp=np.ones((2, panda.dof))))
+
+
+def test_a_set_replaces_the_gains_and_keeps_the_other_options(panda):
+    tuned, designed = panda.tuned().replace(deadband=1e-3), panda.designed()
+    gains = GroupGains(panda, {"given": tuned, "designed": designed})
+    assert gains.set_names == ("given", "designed")
+    np.testing.assert_array_equal(gains.params.kp, tuned.kp)
+    gains.apply_set("designed")
+    for name in ("kp", "ki", "kd", "derivative_filter_time", "setpoint_weight"):
+        np.testing.assert_array_equal(getattr(gains.params, name), getattr(designed, name))
+    np.testing.assert_array_equal(gains.params.deadband, tuned.deadband)
+    assert gains.params.weight_origin == designed.weight_origin
+    with pytest.raises(InvalidArgumentError, match="name"):
+        gains.apply_set("tutorial")
+
+
+def test_a_gain_is_set_on_one_joint(panda):
+    gains = GroupGains(panda, {"tutorial": panda.params()})
+    gains.set("kp", 0, 77.0)
+    gains.set("effort_limit", 1, 5.0)
+    assert gains.params.kp[0, :2].tolist() == [77.0, panda.settings.kp[1]]
+    assert gains.params.effort_min[0, :2].tolist() == [-87.0, -5.0]
+    assert gains.params.effort_max[0, :2].tolist() == [87.0, 5.0]
+    with pytest.raises(InvalidArgumentError, match="gain"):
+        gains.set("deadband", 0, 0.1)
+    gains.apply_set("tutorial")
+    np.testing.assert_array_equal(gains.params.kp[0], panda.settings.kp)
+
+
+def test_limits_that_differ_up_and_down_are_kept(panda):
+    gains = GroupGains(panda, {"given": panda.params(effort_min=-3.0, effort_max=7.0)})
+    gains.set("kp", 0, 77.0)
+    shifted = gains.params_under(np.full((2, panda.dof), 0.5))
+    assert np.unique(shifted.effort_min).tolist() == [-2.5]
+    assert np.unique(shifted.effort_max).tolist() == [7.5]
+
+
+def test_a_filter_or_weight_switched_off_stays_part_of_the_law(panda):
+    gains = GroupGains(panda, {"tutorial": panda.params()})
+    for joint in range(panda.dof):
+        gains.set("derivative_filter_time", joint, 0.0)
+        gains.set("setpoint_weight", joint, 1.0)
+    assert gains.params.derivative_filter_time is not None
+    assert gains.params.setpoint_weight is not None
+
+
+def test_sliders_reach_beyond_every_set(panda):
+    gains = GroupGains(panda, {"tutorial": panda.params()})
+    value, end = gains.slider_range("kp", 0)
+    assert (value, end) == (panda.settings.kp[0], 4 * panda.settings.kp[0])
+    assert gains.slider_range("effort_limit", 0) == (87.0, 87.0)
+    assert gains.slider_range("setpoint_weight", 0)[1] == 1.0
+    assert gains.slider_range("derivative_filter_time", 0)[1] == 0.02

@@ -1,0 +1,65 @@
+"""Playback of recorded runs."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim import Runner
+from sim.view import Playback
+from sim.view.film import film_rows
+
+
+@pytest.fixture(scope="module")
+def rollout(panda):
+    with Runner(panda, 2, workers=0) as runner:
+        return runner.rollout(np.broadcast_to(panda.settings.target, (30, panda.dof)))
+
+
+def test_a_rollout_plays_from_the_first_row_to_the_last_and_starts_over(panda, rollout):
+    playback = Playback(rollout)
+    frames = [playback.frame()]
+    while frames[-1].time[0] < playback.duration - 1e-9:
+        playback.advance()
+        frames.append(playback.frame())
+    np.testing.assert_array_equal(frames[0].qpos[0], rollout.qpos[0])
+    np.testing.assert_array_equal(frames[-1].qpos[0], rollout.qpos[-1])
+    assert len(frames) == pytest.approx(playback.duration / playback.period, abs=2)
+    assert len(playback.history().time) == 30
+    playback.advance()
+    assert playback.frame().time[0] == 0.0
+
+
+def test_a_playback_seeks(rollout):
+    playback = Playback(rollout)
+    playback.seek(0.15)
+    assert playback.frame().time[0] == pytest.approx(0.15)
+    assert len(playback.history().time) == 16
+    playback.seek(99.0)
+    assert playback.frame().time[0] == playback.duration
+    playback.reset()
+    assert playback.frame().time[0] == 0.0
+
+
+def test_non_finite_numbers_are_shown_as_zero(rollout):
+    bad = copy.deepcopy(rollout.for_ticks(slice(0, 2)))
+    bad.observation.qpos[1, 0] = np.nan
+    bad.observation.effort[1, 0] = np.inf
+    bad.observation.ok[1, 0] = False
+    playback = Playback(bad)
+    playback.seek(1.0)
+    frame = playback.frame()
+    assert not frame.qpos[0, 0].any()
+    assert not frame.effort[0, 0].any()
+    assert frame.ok[0].tolist() == [False, True]
+
+
+def test_a_rollout_of_another_robot_is_refused(jaco2, rollout):
+    with pytest.raises(InvalidArgumentError, match="joints"):
+        Playback(rollout, jaco2)
+
+
+def test_frames_of_a_film_follow_the_recorded_time(rollout):
+    assert film_rows(rollout.for_ticks(slice(0, 20)), 50.0).tolist() == list(range(0, 20, 2))
+    assert film_rows(rollout, 200.0)[:5].tolist() == [0, 1, 1, 2, 2]

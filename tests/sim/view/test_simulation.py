@@ -1,0 +1,168 @@
+"""LiveSimulation: commands, disturbances and frames, without a browser."""
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim import FaultWarning, Runner
+from sim.view import LiveSimulation
+
+STIFF = {"kp": 600.0, "ki": 900.0, "kd": 50.0, "derivative_filter_time": 2e-3}
+"""Gains per effort that hold a panda under a payload."""
+
+
+@pytest.fixture
+def live(panda):
+    live = LiveSimulation(panda, 3, workers=0, spread=0.05, physics="fast", params=panda.params(**STIFF))
+    yield live
+    live.close()
+
+
+def run(live, seconds):
+    """Advance, and return qpos and effort (robots, dof) at the end."""
+    for _ in range(round(seconds / live.period)):
+        live.advance()
+    return live.frame().qpos[0], live.frame().effort[0]
+
+
+def test_frames_equal_those_of_a_runner_before_and_after_a_gain_changes(live):
+    substeps = round(live.period * 2000)
+    with Runner(live.robot, 3, workers=0, physics="fast", params=live.gains["pid"].params) as runner:
+        runner.reset(live.start)
+        for kp in (600.0, 300.0):
+            live.gains["pid"].set("kp", 0, kp)
+            runner.params = live.gains["pid"].params
+            for _ in range(3):
+                live.advance()
+                observation = runner.step(live.setpoint, substeps=substeps)
+    assert observation.effort.any()
+    for shown, expected in zip(live.frame().observation, observation, strict=True):
+        np.testing.assert_array_equal(shown[0], expected)
+    assert live.time == live.frame().time[0] == pytest.approx(6 * live.period)
+    history = live.history()
+    assert history.time.shape == (7,)
+    np.testing.assert_array_equal(history.qpos[-1], observation.qpos)
+
+
+@pytest.mark.parametrize("params", [None, "tuned"])
+def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, params):
+    given = None if params is None else panda.tuned()
+    live = LiveSimulation(panda, 2, workers=0, physics="fast", params=given)
+    live.set_setpoints(panda.settings.target)
+    with Runner(panda, 2, workers=0, physics="fast", params=panda.tuned()) as runner:
+        runner.reset(live.start)
+        for _ in range(3):
+            live.advance()
+            observation = runner.step(live.setpoint, substeps=round(live.period * 2000))
+    np.testing.assert_array_equal(live.frame().qpos[0], observation.qpos)
+    live.payload = 0.5
+    qpos, _ = run(live, 2.0)
+    assert np.abs(qpos - panda.settings.target)[:, :7].max() < 0.05
+    live.close()
+
+
+def test_the_motors_hold_a_payload(live):
+    live.set_setpoints(live.robot.settings.target)
+    free_qpos, free_effort = run(live, 4.0)
+    live.payload = 1.5
+    qpos, effort = run(live, 4.0)
+    assert np.abs(qpos - free_qpos)[:, :7].max() < 5e-3  # the integral has taken it up
+    poses = live.kinematics.poses(qpos)
+    weight = live.kinematics.efforts_of_force(poses, live.load_link, [0, 0, -9.81 * 1.5])
+    assert np.abs(weight).max() > 3
+    np.testing.assert_allclose((effort - free_effort)[:, :7], -weight[:, :7], atol=0.15)
+    live.payload = 0.0
+    assert np.abs(run(live, 4.0)[1] - free_effort)[:, :7].max() < 0.15
+
+
+def test_effort_limits_bound_the_motors_and_not_the_payload(live):
+    live.set_setpoints(live.robot.settings.target)
+    before, _ = run(live, 3.0)
+    for joint in range(7):
+        live.gains["pid"].set("effort_limit", joint, 40.0)
+    assert live.effort_limits(0, 3) == (-40.0, 40.0)
+    live.payload = 30.0
+    qpos, effort = run(live, 1.0)
+    assert (np.abs(effort[:, :7]) <= 40.0 + 1e-4).all()
+    assert np.abs(qpos - before)[:, :7].max() > 0.3
+    assert live.frame().saturated[0].any(1).all()
+
+
+def test_a_push_moves_the_robots_and_ends(live):
+    rest, _ = run(live, 1.0)
+    live.push((0.0, 80.0, 0.0))
+    moved, _ = run(live, 0.2)
+    assert np.abs(moved - rest).max() > 0.01
+    back, _ = run(live, 3.0)
+    assert np.abs(back - rest).max() < 5e-3
+
+
+def test_setpoints_are_set_for_one_robot_or_for_all(live):
+    live.set_setpoint(2, 0.5)
+    live.set_setpoint(2, 0.7, env=1)
+    assert live.frame().setpoint[0, :, 2].tolist() == [0.5, 0.7, 0.5]
+    live.randomize_setpoints()
+    assert (live.setpoint >= live.robot.lower).all()
+    assert (live.setpoint <= live.robot.upper).all()
+    assert np.ptp(live.setpoint, axis=0).max() > 0.1
+    run(live, 0.2)
+    live.reset()
+    assert live.time == 0.0
+    assert len(live.history().time) == 1
+    np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
+
+
+def test_pid_and_drive_run_in_two_groups_under_the_same_setpoints(jaco2):
+    live = LiveSimulation(jaco2, 2, controls=("pid", "drive"), workers=0, physics="fast")
+    live.set_setpoints(jaco2.settings.target)
+    qpos, _ = run(live, 0.5)
+    frame = live.frame()
+    assert qpos.shape == (4, 13)
+    np.testing.assert_array_equal(frame.setpoint[0, 0], frame.setpoint[0, 2])
+    assert np.abs(qpos[:2] - qpos[2:]).max() > 0.05
+    live.gains["drive"].set("kp", 0, 60.0)
+    live.push((5.0, 0.0, 0.0))
+    run(live, 0.1)
+    live.close()
+
+
+def test_a_diverged_robot_stays_finite_until_a_reset(live):
+    for joint in range(9):
+        live.gains["pid"].set("kd", joint, 5000.0)
+        live.gains["pid"].set("derivative_filter_time", joint, 0.0)
+        live.gains["pid"].set("effort_limit", joint, np.inf)
+    live.set_setpoints(live.robot.settings.target)
+    with pytest.warns(FaultWarning):
+        qpos, effort = run(live, 1.0)
+    assert not live.frame().ok.all()
+    assert np.isfinite(qpos).all()
+    assert np.isfinite(effort).all()
+    live.gains["pid"].apply_set("given")
+    live.reset()
+    run(live, 0.1)
+    assert live.frame().ok.all()
+
+
+@pytest.mark.parametrize("fixed_base", [True, False])
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_a_robot_without_settings_gets_gains_that_hold_it(tmp_path, panda, control, fixed_base):
+    path = tmp_path / "copy.urdf"
+    path.write_text(panda.path.read_text())
+    robot = type(panda).load(path, fixed_base=fixed_base)
+    live = LiveSimulation(robot, 1, controls=(control,), workers=0)
+    live.set_setpoints(robot.start)
+    qpos, _ = run(live, 1.0)
+    assert np.abs(qpos - robot.start)[:, :7].max() < (0.1 if fixed_base else 0.5)
+    live.close()
+
+
+def test_bad_arguments_are_named(panda):
+    for options, named in (
+        ({"num_envs": 65}, "num_envs"),
+        ({"num_envs": 40, "controls": ("pid", "drive")}, "num_envs"),
+        ({"num_envs": 2, "controls": ("effort",)}, "controls"),
+        ({"num_envs": 2, "controls": ()}, "controls"),
+        ({"num_envs": 2, "period": 0.0}, "period"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=named):
+            LiveSimulation(panda, workers=0, **options)
