@@ -67,13 +67,14 @@ class Compare:
         evaluations = [
             evaluate_gains(
                 robot,
+                each.params,
+                moves,
                 name=each.name,
-                moves=moves,
+                control=each.control,
                 seconds=self.seconds,
                 workers=self.workers,
                 physics=self.physics,
                 variation=drawn,
-                **each.options,
             )
             for each in bar("comparing", unit="set")(sets)
         ]

@@ -43,7 +43,7 @@ class Demo:
         from sim import Robot, Runner, plots
         from sim.cli import report
         from sim.cli.follow import duration, follow, start_poses
-        from sim.tuning.evaluation import judge
+        from sim.tuning.evaluation import step_response_metrics
 
         out = plots.check_path(self.out)
         if self.viewer:
@@ -77,7 +77,7 @@ class Demo:
                 flush=True,
             )
             run = follow(runner, settings.target, start, seconds, "simulating")
-        metrics = judge(robot, run.rollout, run.start)
+        metrics = step_response_metrics(robot, run.rollout, run.start)
         print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall) + "\n")
         print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):

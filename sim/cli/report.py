@@ -123,7 +123,7 @@ def evaluation_table(robot: Robot, evaluations: list[Evaluation]) -> str:
     for evaluation in evaluations:
         m = evaluation.metrics
         settled = np.isfinite(m.settling_time[:, arm]).all(axis=1)
-        in_time = (np.where(arm, m.settling_time, 0).max(1) <= evaluation.allowed).sum()
+        in_time = (np.where(arm, m.settling_time, 0).max(1) <= evaluation.settling_limit).sum()
         columns = [
             _both(m.settling_time[:, arm], "{:.2f} s"),
             _both(m.overshoot[:, arm], "{:.1%}"),

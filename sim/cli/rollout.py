@@ -66,7 +66,7 @@ class Rollout:
         from sim import Robot, Runner, plots
         from sim.cli import report
         from sim.cli.follow import duration, follow, start_poses
-        from sim.tuning.evaluation import judge
+        from sim.tuning.evaluation import step_response_metrics
         from sim.tuning.gain_sets import gain_set
 
         if self.out is not None:
@@ -84,7 +84,8 @@ class Rollout:
         options: dict[str, Any] = {"control": self.control}
         named = self.params or (None if settings is not None else "designed")
         if named is not None:
-            options |= gain_set(robot, named).options
+            gains = gain_set(robot, named)
+            options |= {"params": gains.params, "control": gains.control}
         with (
             Runner(
                 robot,
@@ -99,7 +100,7 @@ class Rollout:
             _recording(self.out, runner, self.seed),
         ):
             run = follow(runner, setpoint, start, seconds, "simulating")
-        metrics = judge(robot, run.rollout, run.start)
+        metrics = step_response_metrics(robot, run.rollout, run.start)
         print(report.speed(self.num_envs, run.steps, self.timestep, run.wall) + "\n")
         print(report.joint_table(robot, metrics) + "\n")
         for verdict in report.verdicts(robot, run.rollout, metrics):

@@ -69,8 +69,8 @@ class View:
             data = _recorded(self.play, self.robot, 1 / self.fps)
         else:
             robot = Robot.load(self.robot or "panda")
-            gains = {} if self.params is None else gain_set(robot, self.params).options
-            if "control" in gains:
+            gains = None if self.params is None else gain_set(robot, self.params)
+            if gains is not None and gains.control != "pid":
                 raise InvalidArgumentError(
                     "params", "are the PID's", value=self.params, remedy="use --control drive for a drive"
                 )
@@ -82,7 +82,7 @@ class View:
                 compensate=self.compensate,
                 physics=self.physics,
                 workers=self.workers,
-                **gains,
+                params=None if gains is None else gains.params,
             )
             if robot.settings is not None:
                 live.set_setpoints(robot.settings.target)

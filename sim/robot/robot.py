@@ -161,6 +161,11 @@ class Robot(RobotDescription):
             self, DESIGN_HZ, 0.82, integral_time=integral_time, gain_units=gain_units, measurement_rate="measured"
         )
 
+    @property
+    def has_tuned(self) -> bool:
+        """Whether tuned params ship with the robot: :meth:`tuned`."""
+        return self.settings is not None and self._tuned_path.is_file()
+
     def tuned(self) -> bp.PIDParams:
         """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
 
@@ -169,14 +174,17 @@ class Robot(RobotDescription):
         InvalidArgumentError
             The robot is not bundled.
         """
-        path = self.path.with_name(f"{self.path.stem}.tuned.yaml")
-        if self.settings is None or not path.is_file():
+        if not self.has_tuned:
             raise InvalidArgumentError(
                 "robot",
                 f"{self.name!r} carries no tuned gains",
                 remedy="use batchpid.design_gains(robot), or make some with: batchpid tune",
             )
-        return bp.load_params(path, self.joint_names)[0]
+        return bp.load_params(self._tuned_path, self.joint_names)[0]
+
+    @property
+    def _tuned_path(self) -> Path:
+        return self.path.with_name(f"{self.path.stem}.tuned.yaml")
 
 
 def _find(name_or_path: str | Path) -> Path:

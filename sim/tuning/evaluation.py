@@ -1,8 +1,9 @@
-"""Gains on evaluation: a set of moves, run at once, each in an env of its own, and judged."""
+"""Evaluation of gains: a set of moves, run at once, each in an env of its own, with metrics of every joint."""
 
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from sim.observation import Rollout
 from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.moves import OVERSHOOT, Moves, fastest, smooth_effort
+from sim.tuning.moves import MAX_OVERSHOOT, Moves, shortest_durations, smooth_variation
 
 Float64 = NDArray[np.float64]
 SUBSTEPS = 5
@@ -23,10 +24,12 @@ REVOLUTE_BAND, PRISMATIC_BAND = 1e-3, 1e-4
 """Least half width of the settling band [rad], [m]."""
 SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
 """A move should settle within a second, or within this multiple of the shortest that its effort limits allow."""
+MAX_ERROR, MAX_CHATTER = 1e-3, 2.0
+"""Demands on the steady-state error [rad or m] and on the chatter."""
 
 
 class Evaluation(NamedTuple):
-    """How a set of gains did on a set of moves; arrays are (moves, dof) unless said otherwise."""
+    """Performance of a set of gains on a set of moves; arrays are (moves, dof) unless said otherwise."""
 
     name: str
     moves: Moves
@@ -34,74 +37,66 @@ class Evaluation(NamedTuple):
     metrics: StepMetrics
     chatter: Float64
     """Total variation of the effort, over that of the smooth (minimum-jerk) motion of the same move and duration."""
-    allowed: Float64
-    """(moves,): the settling time asked for [s]."""
+    settling_limit: Float64
+    """Settling time asked for (moves,) [s]."""
 
-    def shortfalls(self, arm: NDArray[np.bool_]) -> list[str]:
-        """What the arm's joints miss of the usual demands, worst first; empty if nothing.
+    def shortfalls(self, joints: NDArray[np.bool_]) -> list[str]:
+        """Return the demands that ``joints`` (dof,) miss, worst first.
 
-        Settling within ``allowed``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <= 2.
+        Settling within ``settling_limit``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <= 2.
         """
         demands = (
-            ("settling time", self.metrics.settling_time / self.allowed[:, None], 1.0),
-            ("overshoot", self.metrics.overshoot, OVERSHOOT),
-            ("steady-state error", self.metrics.steady_state_error, 1e-3),
-            ("chatter", self.chatter, 2.0),
+            ("settling time", self.metrics.settling_time / self.settling_limit[:, None], 1.0),
+            ("overshoot", self.metrics.overshoot, MAX_OVERSHOOT),
+            ("steady-state error", self.metrics.steady_state_error, MAX_ERROR),
+            ("chatter", self.chatter, MAX_CHATTER),
         )
         found = []
-        for what, figure, limit in demands:
-            excess = np.where(arm, np.nan_to_num(figure, nan=0.0, posinf=np.inf), 0.0) / limit
+        for demand, figure, limit in demands:
+            excess = np.where(joints, np.nan_to_num(figure, nan=0.0, posinf=np.inf), 0.0) / limit
             for move, joint in np.argwhere(excess > 1):
-                text = f"{what} of move {self.moves.names[move]!r}, joint {joint}: {excess[move, joint]:.2f} x limit"
+                text = f"{demand} of move {self.moves.names[move]!r}, joint {joint}: {excess[move, joint]:.2f} x limit"
                 found.append((float(excess[move, joint]), text))
         return [text for _, text in sorted(found, reverse=True)]
 
 
 def absolute_band(robot: Robot) -> Float64:
-    """Least half width of the settling band, per joint (dof,) [rad or m]."""
-    return np.array([PRISMATIC_BAND if j.type == "prismatic" else REVOLUTE_BAND for j in robot.joints])
+    """Return the least half width of the settling band, per joint (dof,) [rad or m]."""
+    return np.array([PRISMATIC_BAND if joint.type == "prismatic" else REVOLUTE_BAND for joint in robot.joints])
 
 
-def judge(robot: Robot, rollout: Rollout, start: NDArray[Any], *, efforts: bool = True) -> StepMetrics:
-    """Figures of merit of a ``rollout`` from rest at ``start`` (envs, dof); what diverged has inf.
+def step_response_metrics(
+    robot: Robot, rollout: Rollout, start: NDArray[Any], *, with_effort: bool = True
+) -> StepMetrics:
+    """Return the metrics of a rollout from rest at ``start`` (envs, dof); those of envs that diverged are inf.
 
-    Without ``efforts`` those of the efforts are undefined: PhysX keeps its drive's to itself.
+    Without ``with_effort`` those of the efforts are undefined (NaN), as under control "drive".
     """
-    tick = rollout.time[1] - rollout.time[0]
     return step_metrics(
-        tick * np.arange(1, len(rollout.time) + 1),
+        rollout.tick * np.arange(1, len(rollout.time) + 1),  # the rollout's own time, however long the runner has run
         rollout.setpoint,
         np.where(rollout.ok[..., None], rollout.qpos, np.nan),
         start=start,
-        effort=rollout.effort if efforts else None,
-        saturated=rollout.saturated if efforts else None,
+        effort=rollout.effort if with_effort else None,
+        saturated=rollout.saturated if with_effort else None,
         absolute_band=absolute_band(robot),
         continuous=robot.continuous,
     )
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
-    """Which joints belong to the arm: on the way to the deepest branching, so not the fingers of a hand (dof,)."""
-    parent = {joint.child_link: joint for joint in robot.all_joints}
+    """Return which joints belong to the arm (dof,): those that carry more than one leaf link, so no fingers.
 
-    def chain(link: str) -> list[str]:
-        names = []
-        while link in parent:
-            names.append(parent[link].name)
-            link = parent[link].parent_link
-        return names
-
-    leaves = {j.child_link for j in robot.all_joints} - {j.parent_link for j in robot.all_joints}
-    counts: dict[str, int] = {}
-    for leaf in leaves:
-        for name in chain(leaf):
-            counts[name] = counts.get(name, 0) + 1
-    moving = {joint.name for joint in robot.joints}
-    shared = {name for name, count in counts.items() if count > 1 and name in moving}
-    # A robot without a common trunk of any length (legs, a bare chain) is all arm.
-    if len(shared) < 3:
-        return np.ones(robot.dof, bool)
-    return np.array([name in shared for name in robot.joint_names])
+    A robot with fewer than three such joints (legs, a bare chain) is all arm.
+    """
+    above = {joint.child_link: joint for joint in robot.all_joints}
+    leaves = Counter[str]()
+    for link in set(above) - {joint.parent_link for joint in robot.all_joints}:
+        while link in above:
+            leaves[above[link].name] += 1
+            link = above[link].parent_link
+    shared = np.array([leaves[name] > 1 for name in robot.joint_names])
+    return shared if shared.sum() >= 3 else np.ones(robot.dof, bool)
 
 
 def evaluate_gains(
@@ -113,12 +108,19 @@ def evaluate_gains(
     seconds: float = 2.0,
     control: str = "pid",
     workers: int | None = None,
-    judge_chatter: bool = True,
+    with_chatter: bool = True,
     **runner_options: Any,
 ) -> Evaluation:
-    """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and judge every joint of every move.
+    """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
 
-    ``params`` of one row are used for all moves. ``runner_options`` go to :class:`sim.Runner`.
+    Parameters
+    ----------
+    params
+        One row for all moves, or one row per move.
+    with_chatter
+        False saves the time of computing the chatter, which is then NaN.
+    runner_options
+        More options of :class:`sim.Runner`.
     """
     options = {"substeps": SUBSTEPS, **runner_options}
     with (
@@ -129,28 +131,19 @@ def evaluate_gains(
         runner.reset(moves.start)
         ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
         rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)))
-    metrics = judge(robot, rollout, moves.start, efforts=control != "drive")
-    shortest = fastest(robot, moves)
+    metrics = step_response_metrics(robot, rollout, moves.start, with_effort=control != "drive")
+    shortest = shortest_durations(robot, moves)
+    chatter = np.full(moves.start.shape, np.nan)
+    if with_chatter:
+        # The smooth motion takes as long as the slowest arm joint took to settle.
+        settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
+        durations = np.maximum(np.maximum(settled, np.where(np.isfinite(shortest), shortest, 0.0)), 0.1)
+        chatter = metrics.effort_variation / smooth_variation(robot, moves, durations)
     return Evaluation(
         name=name,
         moves=moves,
         rollout=rollout,
         metrics=metrics,
-        chatter=_chatter(robot, moves, metrics, shortest) if judge_chatter else np.full(moves.start.shape, np.nan),
-        allowed=np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest),
+        chatter=chatter,
+        settling_limit=np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest),
     )
-
-
-def _chatter(robot: Robot, moves: Moves, metrics: StepMetrics, shortest: Float64) -> Float64:
-    """Total variation over that of the smooth motion that takes as long as the slowest arm joint took to settle.
-
-    A smooth effort of less than a thousandth of the joint's limit counts as that.
-    """
-    settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
-    floor = 1e-3 * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 1.0)
-    result = np.empty_like(moves.start)
-    for row, (start, target) in enumerate(zip(moves.start, moves.target, strict=True)):
-        duration = max(settled[row], shortest[row] if np.isfinite(shortest[row]) else 0.0, 0.1)
-        smooth = np.abs(np.diff(smooth_effort(robot, start, target, duration), axis=0)).sum(0)
-        result[row] = metrics.effort_variation[row] / np.maximum(smooth, floor)
-    return result

@@ -1,54 +1,57 @@
-"""Sets of gains by name: what ``compare`` tries, and ``tune`` tries before and after."""
+"""Gain sets by name, as the command line takes them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from sim import Robot
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim.robot.robot import Robot
 
-NAMES = ("tutorial", "tuned", "designed", "drive")
+NAMES = ("tuned", "designed", "tutorial", "drive")
+"""Names of gain sets; "drive" is "drive:20,5"."""
 
 
 class GainSet(NamedTuple):
-    """A name, and the options of :func:`sim.tuning.evaluation.evaluate_gains` that stand for it."""
+    """Params with a name, and the control of :class:`sim.Runner` that they are for."""
 
     name: str
-    options: dict[str, Any]
+    params: bp.PIDParams
+    control: str = "pid"
 
 
-def gain_set(robot: Robot, name: str) -> GainSet:
-    """Gains by name: "tutorial", "tuned", "designed", "drive", "drive:STIFFNESS,DAMPING", or a params file.
+def gain_set(robot: Robot, name: str | None = None) -> GainSet:
+    """Return the gains of ``robot`` by name.
+
+    Parameters
+    ----------
+    name
+        "tuned": those that ship with the robot; "designed": :meth:`sim.Robot.designed`; "tutorial": those of SAPIEN's
+        tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING": PhysX's internal drive; or a params file.
+        Default: "tuned" where the robot has them, else "designed".
 
     Raises
     ------
     InvalidArgumentError
         No such name or file, or the robot carries no gains of that name.
     """
-    from batchpid import load_params
-    from batchpid.errors import InvalidArgumentError
-    from sim.tuning.search import start_gains
-
-    if name == "tutorial":
-        return GainSet(name, {"params": robot.params()})
-    if name == "tuned":
-        return GainSet(name, {"params": robot.tuned()})
-    if name == "designed":
-        return GainSet(name, {"params": start_gains(robot)})
+    name = name or ("tuned" if robot.has_tuned else "designed")
+    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}
+    if name in named:
+        return GainSet(name, named[name]())
     if name.partition(":")[0] == "drive":
         try:
-            stiffness, damping = (float(part) for part in (name.partition(":")[2] or "20,5").split(","))
+            stiffness, damping = map(float, (name.partition(":")[2] or "20,5").split(","))
         except ValueError:
             raise InvalidArgumentError(
                 "gains", "is no drive", value=name, remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
             ) from None
         params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
-        return GainSet(f"drive ({stiffness:g}, {damping:g})", {"params": params, "control": "drive"})
+        return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=f"use a file or {', '.join(NAMES)}"
         )
-    params, _ = load_params(path, robot.joint_names)
-    return GainSet(path.name, {"params": params})
+    return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])

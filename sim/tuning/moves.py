@@ -1,14 +1,14 @@
-r"""Moves to judge gains by: seeded, free of contact, with the fastest that the effort limits allow.
+r"""Moves to evaluate gains on: seeded, free of contact, with the shortest duration that the effort limits allow.
 
 A move is a step of the setpoint from rest at ``start`` to ``target``. The straight line between them, which good gains
-follow, is tested for contact, and so is what lies beyond it by as much as a good move may overshoot. On that line
-q(z) = start + z (target - start) all joints move in step, so that the effort of a motion z(t) in time T is
+follow, is tested for contact, and so is its continuation by as much as a good move may overshoot. On that line
+q(z) = start + z (target - start) all joints move in proportion, so that the effort of a motion z(t) in time T is
 gravity(q) + h / T^2, with h from the inverse dynamics of the same motion in unit time. The shortest bang-bang motion,
 accelerating up to half the way and braking from there, has in closed form::
 
     T^2 = max over joints and line of |h_j| / (limit_j -+ gravity_j)
 
-It is a motion that exists, hence no faster than the fastest of all.
+Such a motion exists, so the shortest of all motions takes no longer.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from sim.robot.robot import Robot
 Float64 = NDArray[np.float64]
 KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
-OVERSHOOT = 0.05
-"""Overshoot of a good move at most, as a fraction of it."""
+MAX_OVERSHOOT = 0.05
+"""Overshoot that a good move may have, as a fraction of it."""
 _LINE = 24
+"""Points of a move's line."""
 _EDGE = 0.02
 _NEARBY = 0.3
 
 
 class Moves(NamedTuple):
-    """Steps from rest: start and target (moves, dof) [rad or m], and what each is."""
+    """Steps from rest: start and target (moves, dof) [rad or m], and a name for each."""
 
     start: Float64
     target: Float64
@@ -50,44 +51,42 @@ class Moves(NamedTuple):
         )
 
     def take(self, rows: Iterable[int]) -> Moves:
-        """Those of ``rows``."""
+        """Return the moves ``rows``."""
         rows = list(rows)
         return Moves(self.start[rows], self.target[rows], tuple(self.names[row] for row in rows))
 
 
-def tutorial_move(robot: Robot, nearby: int = 0, seed: int = 0) -> Moves:
-    """The move of a bundled robot's settings; none for other robots.
-
-    And ``nearby`` more, the hardest for its effort limits of 64 seeded ones that start within 0.3 rad [or m].
-    """
+def tutorial_move(robot: Robot) -> Moves:
+    """Return the move of a bundled robot's settings; none for other robots."""
     if robot.settings is None:
         return Moves(np.empty((0, robot.dof)), np.empty((0, robot.dof)), ())
-    start, target = robot.settings.start, robot.settings.target
-    spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
-    move = Moves(start[None], target[None], ("tutorial",))
-    if nearby == 0:
-        return move
-    shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
-    starts = np.clip(start + shift, robot.lower, robot.upper)
-    others = Moves(starts, np.tile(target, (64, 1)), ("near the tutorial's",) * 64)
-    return move + others.take(np.argsort(fastest(robot, others))[::-1][:nearby])
+    return Moves(robot.settings.start[None], robot.settings.target[None], ("tutorial",))
 
 
 def search_moves(robot: Robot, seed: int = 0) -> Moves:
-    """The moves that gains are searched on.
+    """Return the moves that gains are searched on.
 
-    The tutorial's, where there is one, with one that starts near it, a random move of each kind, and the one of 28 more
-    that needs most time under the effort limits: the fastest gains are those that just do not saturate on the hardest.
+    The tutorial's, where there is one, with the hardest of 64 that start within 0.3 rad [or m] of it; a random move of
+    each kind; and the hardest of 28 more. The hardest needs most time under the effort limits: the fastest gains just
+    do not saturate on it.
     """
-    drawn = random_moves(robot, 32, seed)
-    easy, others = drawn.take(range(len(KINDS))), drawn.take(range(len(KINDS), 32))
-    duration = fastest(robot, others)
-    hardest = int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))
-    return tutorial_move(robot, 1, seed) + easy + others.take([hardest])
+    moves, drawn = tutorial_move(robot), random_moves(robot, 32, seed)
+    if robot.settings is not None:
+        spread = np.minimum(_NEARBY, (robot.upper - robot.lower) / 4)
+        shift = np.random.default_rng(seed).uniform(-spread, spread, (64, robot.dof))
+        starts = np.clip(robot.settings.start + shift, robot.lower, robot.upper)
+        near = Moves(starts, np.tile(robot.settings.target, (64, 1)), ("near the tutorial's",) * 64)
+        moves += _hardest(robot, near)
+    return moves + drawn.take(range(len(KINDS))) + _hardest(robot, drawn.take(range(len(KINDS), 32)))
+
+
+def _hardest(robot: Robot, moves: Moves) -> Moves:
+    duration = shortest_durations(robot, moves)
+    return moves.take([int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))])
 
 
 def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:
-    """``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
+    """Return ``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
     whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0.
@@ -98,18 +97,16 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         ``count`` or ``size`` out of range, or the robot touches itself in nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
-    probe, rng = robot.dynamics(ground), np.random.default_rng(seed)
+    dynamics, rng = robot.dynamics(ground), np.random.default_rng(seed)
     reach = np.ptp(robot.sample(1000, seed=0), axis=0)
-    low = np.maximum(robot.lower + _EDGE * reach, -np.inf)
-    high = np.minimum(robot.upper - _EDGE * reach, np.inf)
-    starts: list[Float64] = []
-    targets: list[Float64] = []
+    low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
+    line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
+    starts, targets = np.empty((2, count, robot.dof))
     names: list[str] = []
-    line = np.linspace(0, 1 + OVERSHOOT, _LINE)[:, None]
     for _ in range(200 * count + 200):
-        if len(starts) == count:
+        if len(names) == count:
             break
-        kind = KINDS[len(starts) % len(KINDS)]
+        kind = KINDS[len(names) % len(KINDS)]
         start = np.clip(robot.sample(1, seed=int(rng.integers(2**31)))[0], low, high)
         joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
@@ -119,32 +116,40 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
         start, target = _with_mimics(robot, start), _with_mimics(robot, target)
-        if not probe.touches(start + line * (target - start)).any():
-            starts.append(start)
-            targets.append(target)
+        if not dynamics.touches(start + line * (target - start)).any():
+            starts[len(names)], targets[len(names)] = start, target
             names.append(kind if kind != "one joint" else f"{robot.joint_names[joint]} alone")
-    if len(starts) < count:
+    if len(names) < count:
         raise InvalidArgumentError(
             "robot",
-            f"{robot.name!r} touches itself or the ground on nearly every move: {len(starts)} of {count} were free",
+            f"{robot.name!r} touches itself or the ground on nearly every move: {len(names)} of {count} were free",
             remedy="give the moves yourself, or correct the collision shapes (batchpid inspect shows them)",
         )
-    return Moves(np.array(starts).reshape(-1, robot.dof), np.array(targets).reshape(-1, robot.dof), tuple(names))
+    return Moves(starts, targets, tuple(names))
 
 
-def fastest(robot: Robot, moves: Moves) -> Float64:
-    """Duration of the shortest bang-bang motion on each move's straight line (moves,) [s]; inf if none can be held."""
-    t = (np.arange(2 * _LINE) + 0.5) / (2 * _LINE)
+def shortest_durations(robot: Robot, moves: Moves) -> Float64:
+    """Return the time of the shortest bang-bang motion along each move (moves,) [s]; inf if gravity forbids it."""
+    dynamics, limit = robot.dynamics(), robot.effort_limit
+    t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
     early = t < 0.5
     z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
     rate, acceleration = np.where(early, 4 * t, 4 * (1 - t)), np.where(early, 4.0, -4.0)
-    return np.array(
-        [_duration(robot, *move, z, rate, acceleration) for move in zip(moves.start, moves.target, strict=True)]
-    )
+    durations = np.full(len(moves.start), np.inf)
+    for row, (start, target) in enumerate(zip(moves.start, moves.target, strict=True)):
+        step = target - start
+        qpos = start + z * step
+        still = np.zeros_like(qpos)
+        gravity = dynamics.inverse_dynamics(qpos, still, still)
+        moving = dynamics.inverse_dynamics(qpos, rate * step, acceleration * step) - gravity
+        room = np.where(moving > 0, limit - gravity, limit + gravity)
+        if (room > 0).all():
+            durations[row] = np.sqrt((np.abs(moving) / room).max())
+    return durations
 
 
 def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200) -> Float64:
-    """Efforts (samples, dof) of the minimum-jerk motion from ``start`` to ``target`` (dof,) in ``duration`` [s].
+    """Return the efforts (samples, dof) of the minimum-jerk motion from ``start`` to ``target`` in ``duration`` [s].
 
     T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
     """
@@ -156,23 +161,21 @@ def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float
     return robot.dynamics().inverse_dynamics(qpos, qvel, qacc)
 
 
+def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> Float64:
+    """Return the total variation of :func:`smooth_effort` on each move (moves, dof) [N m or N].
+
+    ``durations`` [s] are (moves,) or one for all. Less than a thousandth of the joint's effort limit counts as that.
+    """
+    rows = zip(moves.start, moves.target, np.broadcast_to(durations, len(moves.start)), strict=True)
+    variation = [np.abs(np.diff(smooth_effort(robot, *row), axis=0)).sum(0) for row in rows]
+    return np.maximum(variation, 1e-3 * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 1.0))
+
+
 def _with_mimics(robot: Robot, qpos: Float64) -> Float64:
-    """Return ``qpos`` (dof,) with the joints that mimic others where those put them."""
+    """Return ``qpos`` (dof,) with mimic joints at the positions that their leaders give them."""
     coupled = qpos.copy()
     for index, joint in enumerate(robot.joints):
         if joint.mimic is not None and joint.mimic.joint in robot.joint_names:
-            source = qpos[robot.joint_names.index(joint.mimic.joint)]
-            coupled[index] = joint.mimic.multiplier * source + joint.mimic.offset
+            leader = qpos[robot.joint_names.index(joint.mimic.joint)]
+            coupled[index] = joint.mimic.multiplier * leader + joint.mimic.offset
     return coupled
-
-
-def _duration(robot: Robot, start: Float64, target: Float64, z: Float64, rate: Float64, acceleration: Float64) -> float:
-    probe, step = robot.dynamics(), target - start
-    qpos = start + z[:, None] * step
-    still = np.zeros_like(qpos)
-    gravity = probe.inverse_dynamics(qpos, still, still)
-    moving = probe.inverse_dynamics(qpos, rate[:, None] * step, acceleration[:, None] * step) - gravity
-    room = np.where(moving > 0, robot.effort_limit - gravity, robot.effort_limit + gravity)
-    if (room <= 0).any():
-        return float("inf")
-    return float(np.sqrt((np.abs(moving) / room).max()))

@@ -1,24 +1,22 @@
-"""Variations drawn at random, env by env: payloads that the robot can carry, and joint friction."""
+"""Random variations of the robots, env by env: payloads that the robot can carry, and joint friction."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.errors import InvalidArgumentError
+from batchpid.validate import integer, number
 from sim.engine.variation import Variation
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 GRAVITY = 9.81
-SPARE = 0.5
-"""Share of what the effort limits leave beside the robot's own weight that a payload may take."""
+PAYLOAD_SHARE = 0.5
+"""Share that a payload may take of the effort that the robot's own weight leaves."""
 
 
 def draw_variation(
     robot: Robot,
-    envs: int,
+    num_envs: int,
     seed: int = 0,
     *,
     payload: float = 2.0,
@@ -26,33 +24,40 @@ def draw_variation(
     resolution: float = 2 * np.pi / 2**18,
     late: bool = True,
 ) -> Variation:
-    """Draw payloads from 0 to ``payload`` [kg], or to what the robot carries, and friction from 0 to ``friction``.
+    """Return a variation for ``num_envs`` envs, with payload and friction drawn uniformly from 0.
+
+    Parameters
+    ----------
+    payload
+        Largest payload [kg], or what the robot can carry (:func:`payload_capacity`) if that is less.
+    friction
+        Largest joint friction (PhysX's coefficient).
+    resolution, late
+        As in :class:`sim.engine.variation.Variation`.
 
     Raises
     ------
     InvalidArgumentError
-        A negative number.
+        A number is out of range.
     """
-    for name, value in (("payload", payload), ("friction", friction), ("resolution", resolution)):
-        if not 0 <= value < np.inf:
-            raise InvalidArgumentError(name, "must be finite and >= 0", value=value, remedy="use 0 for none")
-    rng = np.random.default_rng(seed)
-    kinematics = Kinematics(robot)
+    num_envs, seed = integer("num_envs", num_envs, 1, 1_000_000), integer("seed", seed, 0, 2**63 - 1)
+    payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "1")
+    rng, kinematics = np.random.default_rng(seed), Kinematics(robot)
     return Variation(
-        payload=rng.uniform(0, min(payload, capacity(robot)), envs),
-        friction=rng.uniform(0, friction, envs),
+        payload=rng.uniform(0, min(payload, payload_capacity(robot)), num_envs),
+        friction=rng.uniform(0, friction, num_envs),
         link=kinematics.links[kinematics.tool],
-        resolution=resolution,
+        resolution=number("resolution", resolution, 0, np.inf, "rad or m"),
         late=late,
     )
 
 
-def capacity(robot: Robot) -> float:
-    """Payload [kg] that the robot holds in 95 % of seeded poses with half of the effort its own weight leaves."""
+def payload_capacity(robot: Robot) -> float:
+    """Return the payload [kg] that the robot holds in 95 % of seeded poses with half of the effort it has left."""
     kinematics, qpos = Kinematics(robot), robot.sample(200, seed=0)
     still = np.zeros_like(qpos)
     own = np.abs(robot.dynamics().inverse_dynamics(qpos, still, still))
     per_kg = np.abs(kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        carried = np.where(per_kg > 1e-9, SPARE * (robot.effort_limit - own) / per_kg, np.inf)
+        carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.effort_limit - own) / per_kg, np.inf)
     return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))

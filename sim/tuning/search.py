@@ -1,8 +1,8 @@
-r"""Black-box tuning on the real scenes: CMA-ES from the designed gains, in log space, many candidates at once.
+r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
 
 Every candidate runs every move in an env of its own, so a generation is one rollout, with a share of the effort limits
-kept back for moves that are harder than those searched. Its cost is the mean over joints, taken as the mean over moves
-plus the worst move, of::
+reserved for moves that are harder than those searched. The cost of a candidate is the mean over joints, taken as the
+mean over moves plus the worst move, of::
 
     w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
         + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
@@ -12,15 +12,14 @@ at the end; TV the total variation of the effort and TV_smooth that of the smoot
 share of time in saturation. N. Hansen, "The CMA evolution strategy: a tutorial" (arXiv:1604.00772); the search itself
 is the package ``cmaes``.
 
-A search is a function of its seed: the number of workers does not enter, and its history replays it. To resume, the
-costs in the history are told to a fresh search of the same seed, which then goes on as if it had never stopped.
+A search is a function of its seed and does not depend on the number of workers. To resume, a fresh search of the same
+seed is given the costs in the history, and continues as if it had never stopped.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -40,33 +39,36 @@ from batchpid.versions import package_versions
 from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.evaluation import SUBSTEPS, absolute_band, judge
-from sim.tuning.moves import Moves, search_moves, smooth_effort
+from sim.tuning.evaluation import SUBSTEPS, absolute_band, step_response_metrics
+from sim.tuning.moves import Moves, search_moves, smooth_variation
 from sim.tuning.randomization import draw_variation
 
 Float64 = NDArray[np.float64]
-SHARED = ("bandwidth", "stiffness", "damping", "setpoint_weight", "derivative_filter_time")
-"""Factors that the search finds for all joints together; with ``per_joint`` one for each joint's inertia as well.
+FACTORS = {
+    # factor: its standard deviation at first, in units of INITIAL_SPREAD; the last two matter less
+    "bandwidth": 1.0,
+    "stiffness": 1.0,
+    "damping": 1.0,
+    "setpoint_weight": 2.0,
+    "derivative_filter_time": 2.0,
+}
+"""Factors that are searched for all joints together; with ``per_joint`` one for each joint's inertia as well.
 
-By a bandwidth c the poles move out alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
+A bandwidth factor c moves all poles alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
 """
-REACH = np.array([1.0, 1.0, 1.0, 2.0, 2.0])
-"""How far each is varied, in units of SPREAD: the last two matter less."""
-START_HZ = 1.7
-"""Bandwidth of the designed gains that a search begins with."""
-HEADROOM = 0.9
-"""Share of the effort limits that candidates may use: what the searched moves leave is for harder ones."""
-SPREAD = 0.12
+INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
-SAFE_RATIO = 0.8
-"""Share of the stability range beyond which a candidate pays."""
-FAILED = 1e3
-"""Cost of a candidate that diverges; smaller the longer it lasts."""
+HEADROOM = 0.9
+"""Share of the effort limits that candidates may use."""
+PENALTY_RATIO = 0.8
+"""Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
+DIVERGED_COST = 1e3
+"""Cost of a candidate that diverges; up to twice that, the sooner it does."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What the cost is made of."""
+    """Weights of the terms of the cost."""
 
     itae: float = 1.0
     """Of the normalised ITAE."""
@@ -82,34 +84,18 @@ class Weights:
     """Of the share of time in saturation."""
 
 
-def start_gains(robot: Robot, gain_units: str = "mass_matrix") -> bp.PIDParams:
-    """The designed gains that a search begins with.
-
-    With the mass matrix the poles lie between those of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E. Thomson,
-    "Delay networks having maximally flat frequency characteristics", Proc. IEE 96, 1949), zeta = sqrt(0.6) and
-    Ti = sqrt(15) / w, and three equal ones: a step settles in 0.91 s with 0.1 % overshoot, and takes two thirds of the
-    effort of three equal poles that are as fast. With other units joints disturb each other, which those bear better.
-    """
-    if gain_units != "mass_matrix":
-        return bp.design_gains(robot, 2.25, gain_units=gain_units, measurement_rate="measured")
-    integral_time = 4.5 / (2 * math.pi * START_HZ)
-    return bp.design_gains(
-        robot, START_HZ, 0.82, integral_time=integral_time, gain_units=gain_units, measurement_rate="measured"
-    )
-
-
 class Tuning(NamedTuple):
-    """What a search found."""
+    """Result of a search."""
 
     params: bp.PIDParams
     cost: float
     start_params: bp.PIDParams
-    """The designed gains that it began with."""
+    """Designed gains that the search began with."""
     start_cost: float
     history: tuple[tuple[float, ...], ...]
-    """Costs of every candidate of every generation: with the seed, all it takes to resume."""
+    """Costs of every candidate of every generation."""
     settings: dict[str, Any]
-    """Seed, moves and versions, for the record."""
+    """Seed, moves, options and versions, for the record."""
 
 
 def tune(
@@ -137,26 +123,26 @@ def tune(
     seed
         Of the search, the moves and the variation.
     generations, population
-        How often a population of so many candidates is tried.
+        Number of generations, and of candidates in each.
     seconds
         Simulated time of each move [s].
     gain_units
         "effort", "inertia" or "mass_matrix": :mod:`batchpid.computed_torque`.
     per_joint
-        Search for a factor of each joint's gains too; more generations are needed.
+        Search for a factor of each joint's gains too, which needs more generations.
     weights
-        Of the cost.
+        Of the terms of the cost.
     moves
         Default: those of :func:`sim.tuning.moves.search_moves`.
     variation
-        Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: each move gets a robot of its
-        own payload and friction, the same for all candidates. None: the robot as it is.
+        Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: the robot of each move has its
+        own payload and friction, the same for all candidates. None: no variation.
     workers
-        Processes; the result does not depend on it.
+        Number of processes; the result does not depend on it.
     time_limit
         Stop after the generation in which this many seconds have passed; None: run all generations.
     history
-        A JSON file that is written after each generation. If it exists the search resumes from it.
+        JSON file, written after each generation. If it exists the search resumes from it.
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
@@ -174,16 +160,13 @@ def tune(
     except ImportError:
         raise MissingDependencyError("cmaes", "tuning", "tune") from None
     seed = integer("seed", seed, 0, 2**31 - 1)
-    generations, population = (
-        integer("generations", generations, 1, 100_000),
-        integer("population", population, 4, 1000),
-    )
-    number("seconds", seconds, 0.05, 600.0, "seconds")
+    generations = integer("generations", generations, 1, 100_000)
+    population = integer("population", population, 4, 1000)
+    seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
-    if moves is None:
-        moves = search_moves(robot, seed)
-    search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
-    settings = {
+    moves = search_moves(robot, seed) if moves is None else moves
+    count = len(moves.start)
+    settings: dict[str, Any] = {
         "robot": robot.name,
         "seed": seed,
         "population": population,
@@ -197,82 +180,70 @@ def tune(
         **{name: str(value) for name, value in runner_options.items()},
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
-    cma = CMA(mean=np.zeros(search.dimension), sigma=SPREAD, seed=seed, population_size=population)
     known = _read_history(history, settings)
-    options: dict[str, Any] = {
-        "substeps": SUBSTEPS,
-        "workers": workers,
-        **runner_options,
-    }
     if variation is not None:
-        drawn = draw_variation(robot, len(moves.start), seed, **variation)
-        options["variation"] = drawn.for_envs(np.tile(np.arange(len(moves.start)), population))
-    began, costs_of, best = time.monotonic(), [], (math.inf, np.zeros(search.dimension))
-    start_cost = math.nan
-    with warnings.catch_warnings():
+        drawn = draw_variation(robot, count, seed, **variation)
+        runner_options["variation"] = drawn.for_envs(np.tile(np.arange(count), population))
+    search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
+    optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+    start = search.params(np.zeros((1, search.dimension)))
+    options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
+    tried: list[tuple[float, Float64]] = []
+    costs: list[tuple[float, ...]] = []
+    began = time.monotonic()
+    with Runner(robot, population * count, **options) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
-        runner = Runner(
-            robot,
-            population * len(moves.start),
-            params=search.params(np.zeros((1, search.dimension))),
-            **options,
-        )
-        with runner:
-            bar = (progress or (lambda items: items))(range(generations))
-            for generation in bar:
-                points = [cma.ask() for _ in range(population)]
-                if generation == 0:
-                    points[0] = np.zeros(search.dimension)  # the designed gains are a candidate too
-                replayed = generation < len(known)
-                costs = known[generation] if replayed else search.costs(runner, np.array(points))
-                cma.tell([(point, cost) for point, cost in zip(points, costs, strict=True)])
-                costs_of.append(tuple(costs))
-                if generation == 0:
-                    start_cost = costs[0]
-                lowest = int(np.argmin(costs))
-                if costs[lowest] < best[0]:
-                    best = (costs[lowest], points[lowest])
-                if hasattr(bar, "set_postfix"):
-                    bar.set_postfix(cost=f"{best[0]:.4f}", designed=f"{start_cost:.4f}")
-                if not replayed:
-                    _write_history(history, settings, costs_of)
-                if time_limit is not None and time.monotonic() - began > time_limit:
-                    break
+        bar = (progress or (lambda items: items))(range(generations))
+        for generation in bar:
+            points = np.array([optimizer.ask() for _ in range(population)])
+            if generation == 0:
+                points[0] = 0.0  # the designed gains are a candidate too
+            replayed = generation < len(known)
+            costs.append(known[generation] if replayed else search.costs(runner, points))
+            optimizer.tell(list(zip(points, costs[-1], strict=True)))
+            tried += zip(costs[-1], points, strict=True)
+            if history is not None and not replayed:
+                write_atomically(history, json.dumps({"settings": settings, "costs": costs}))
+            if hasattr(bar, "set_postfix"):
+                bar.set_postfix(cost=f"{min(map(min, costs)):.4f}", designed=f"{costs[0][0]:.4f}")
+            if time_limit is not None and time.monotonic() - began > time_limit:
+                break
+    cost, best = min(tried, key=lambda candidate: candidate[0])
     return Tuning(
-        params=search.params(best[1][None]),
-        cost=float(best[0]),
-        start_params=search.params(np.zeros((1, search.dimension))),
-        start_cost=float(start_cost),
-        history=tuple(costs_of),
-        settings={**settings, "generations": len(costs_of)},
+        params=search.params(best[None]),
+        cost=cost,
+        start_params=start,
+        start_cost=costs[0][0],
+        history=tuple(costs),
+        settings={**settings, "generations": len(costs)},
     )
 
 
 class _Search:
-    """From a point of the search space to params, and from a rollout of candidates to their costs."""
+    """Search space and cost: from points to params, and to the costs of their rollouts."""
 
     def __init__(
         self, robot: Robot, gain_units: str, per_joint: bool, moves: Moves, seconds: float, weights: Weights
     ) -> None:
         self.robot, self.moves, self.seconds, self.weights = robot, moves, seconds, weights
-        self.designed = start_gains(robot, gain_units)
-        self.dimension = len(SHARED) + (robot.dof if per_joint else 0)
+        self.designed = robot.designed(gain_units)
+        self.dimension = len(FACTORS) + (robot.dof if per_joint else 0)
         self._band = absolute_band(robot)
-        smooth = [
-            np.abs(np.diff(smooth_effort(robot, s, t, 1.0), axis=0)).sum(0)
-            for s, t in zip(moves.start, moves.target, strict=True)
-        ]
-        floor = 1e-3 * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 1.0)
-        self._smooth = np.maximum(smooth, floor)
+        self._smooth = smooth_variation(robot, moves, 1.0)
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
-        self._mass = None if gain_units == "mass_matrix" else robot.mass_matrix(robot.sample(50, seed=0))
-        self._diagonal = gain_units == "inertia"
+        # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
+        if gain_units == "mass_matrix":
+            self._mass, self._damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
+        else:
+            self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
+        inertia = gain_units == "inertia"
+        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(robot.dof)
 
     def params(self, points: Float64) -> bp.PIDParams:
-        """Params with one row for each of ``points`` (n, dimension)."""
-        shared = np.exp(REACH * points[:, : len(SHARED)])
+        """Return params with one row for each of ``points`` (n, dimension)."""
+        shared = np.exp(np.array(list(FACTORS.values())) * points[:, : len(FACTORS)])
         bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
-        joints = np.exp(points[:, len(SHARED) :]) if self.dimension > len(SHARED) else 1.0
+        joints = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
         d = self.designed
         return d.replace(
             kp=d.kp * bandwidth**2 * stiffness * joints,
@@ -282,64 +253,52 @@ class _Search:
             derivative_filter_time=d.derivative_filter_time * filter_time,
         )
 
-    def costs(self, runner: Runner, points: Float64) -> list[float]:
-        """Cost of each of ``points``, tried on ``runner``, whose envs are candidates x moves."""
-        count, moves = len(points), self.moves
-        table = self.params(points)
-        runner.params = _with_headroom(table).for_envs(np.repeat(np.arange(count), len(moves.start)))
+    def costs(self, runner: Runner, points: Float64) -> tuple[float, ...]:
+        """Return the cost of each of ``points``, run on ``runner``, whose envs are candidates x moves."""
+        count, moves, params = len(points), self.moves, self.params(points)
+        limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
+        limited = params.replace(**{name: HEADROOM * limit for name, limit in limits.items() if limit is not None})
+        runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
         start, target = np.tile(moves.start, (count, 1)), np.tile(moves.target, (count, 1))
         runner.reset(start)
         ticks = max(10, round(self.seconds / (runner.timestep * runner.substeps)))
         rollout = runner.rollout(np.broadcast_to(target, (ticks, *target.shape)))
-        m = judge(self.robot, rollout, start)
-        shape = (count, *moves.start.shape)
-        w, horizon = self.weights, self.seconds
+        m, w = step_response_metrics(self.robot, rollout, start), self.weights
 
-        def part(figure: Float64) -> Float64:
-            return np.minimum(figure.reshape(shape), 1e6)
+        def bounded(figure: Float64) -> Float64:
+            return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)
 
         cost = (
-            w.itae * part(m.itae) / self._size
-            + w.settling * np.minimum(part(m.settling_time), 1.5 * horizon)
-            + w.overshoot * np.log1p(part(m.peak_deviation) / self._size / 0.05)
-            + w.final * np.log1p(part(m.steady_state_error) / self._band)
-            + w.chatter * np.maximum(part(m.effort_variation) / self._smooth - 1, 0)
-            + w.saturation * part(m.saturation_share)
+            w.itae * bounded(m.itae) / self._size
+            + w.settling * np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
+            + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
+            + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
+            + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
+            + w.saturation * bounded(m.saturation_share)
         ).mean(2)
-        total = cost.mean(1) + cost.max(1)
         lasted = rollout.ok.mean(0).reshape(count, -1)
-        total = np.where(lasted.min(1) < 1, FAILED * (2 - lasted.mean(1)), np.minimum(total, FAILED))
-        return [float(c) for c in total + self._nearness(table, runner.timestep)]
+        total = np.minimum(cost.mean(1) + cost.max(1), DIVERGED_COST)
+        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
+        return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
 
-    def _nearness(self, table: bp.PIDParams, dt: float) -> Float64:
-        """What candidates near to the stability limit pay (count,), whether or not these moves show it."""
-        joints = self.robot.dof
-        mass, scale, damping = self._mass, np.ones(joints), self.robot.damping
-        if mass is None:  # u = M a: unit inertias
-            mass, damping = np.eye(joints)[None], np.zeros(joints)
-        elif self._diagonal:
-            scale = np.diagonal(mass, axis1=1, axis2=2)
+    def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
+        """Return the penalty (count,) of candidates near the stability bound, which these moves may not show."""
         ratios = [
-            stability_bound(mass, kp * scale, kd * scale, dt, filter_time=tau, damping=damping).ratio.max()
-            for kp, kd, tau in zip(table.kp, table.kd, table.derivative_filter_time, strict=True)
+            stability_bound(
+                self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
+            ).ratio.max()
+            for kp, kd, tau in zip(params.kp, params.kd, params.derivative_filter_time, strict=True)
         ]
-        return 10 * np.maximum(np.array(ratios) - SAFE_RATIO, 0)
+        return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)
 
 
-def _with_headroom(params: bp.PIDParams) -> bp.PIDParams:
-    low, high = params.effort_min, params.effort_max
-    return params.replace(
-        effort_min=None if low is None else HEADROOM * low,
-        effort_max=None if high is None else HEADROOM * high,
-    )
-
-
-def _read_history(path: Path | str | None, settings: dict[str, Any]) -> Sequence[Sequence[float]]:
+def _read_history(path: Path | str | None, settings: Mapping[str, Any]) -> Sequence[tuple[float, ...]]:
+    """Return the costs in the history of the same search; none without a file."""
     if path is None or not Path(path).exists():
         return []
     try:
         document = json.loads(Path(path).read_text())
-        told = [[float(c) for c in row] for row in document["costs"]]
+        costs = [tuple(map(float, row)) for row in document["costs"]]
         theirs = document["settings"]
     except (ValueError, KeyError, TypeError) as error:
         raise InvalidArgumentError(
@@ -350,16 +309,11 @@ def _read_history(path: Path | str | None, settings: dict[str, Any]) -> Sequence
         ) from None
     ours = json.loads(json.dumps(settings))
     different = sorted(key for key in {*ours, *theirs} if ours.get(key) != theirs.get(key))
-    if different or any(len(row) != settings["population"] for row in told):
+    if different or any(len(row) != settings["population"] for row in costs):
         raise InvalidArgumentError(
             "history",
             f"is of another search ({', '.join(different)} differ)",
             value=str(path),
             remedy="use the same options, remove it, or name another file",
         )
-    return told
-
-
-def _write_history(path: Path | str | None, settings: dict[str, Any], costs: Sequence[Sequence[float]]) -> None:
-    if path is not None:
-        write_atomically(path, json.dumps({"settings": settings, "costs": [list(row) for row in costs]}))
+    return costs

@@ -6,7 +6,7 @@ import numpy as np
 
 from sim import Observation, Rollout
 from sim.cli import report
-from sim.tuning.evaluation import judge
+from sim.tuning.evaluation import step_response_metrics
 
 TICKS, ENVS = 200, 5
 
@@ -42,7 +42,7 @@ def rows(panda, metrics):
 
 def test_a_run_that_settles(panda):
     rollout, start = follow(panda, panda.settings.target)
-    metrics = judge(panda, rollout, start)
+    metrics = step_response_metrics(panda, rollout, start)
     # exp(-t / 0.05) falls below 2 % after 0.196 s.
     np.testing.assert_allclose(metrics.settling_time, 0.05 * np.log(50), atol=2e-3)
     table = rows(panda, metrics)
@@ -58,7 +58,7 @@ def test_one_joint_that_rings_and_one_that_overshoots(panda):
     rollout, start = follow(panda, panda.settings.target)
     rollout.qpos[:, 2, 0] = 1 + 0.3 * np.sin(40 * rollout.time)
     rollout.qpos[50:, :, 5] += 0.5 * np.exp(-np.arange(150) / 10)[:, None]
-    metrics = judge(panda, rollout, start)
+    metrics = step_response_metrics(panda, rollout, start)
     table = rows(panda, metrics)
     assert "never" in table["panda_joint1"]
     assert "4 of 5" in table["panda_joint1"]
@@ -73,7 +73,7 @@ def test_envs_that_diverged_are_named(panda):
     rollout, start = follow(panda, panda.settings.target)
     rollout.qpos[100:, 3] = np.nan
     rollout.ok[100:, 3] = False
-    metrics = judge(panda, rollout, start)
+    metrics = step_response_metrics(panda, rollout, start)
     table = rows(panda, metrics)
     assert all("diverged" in row and "4 of 5" in row for row in table.values())
     said = list(report.verdicts(panda, rollout, metrics))
@@ -84,7 +84,7 @@ def test_envs_that_diverged_are_named(panda):
 def test_envs_held_at_a_finite_pose_after_diverging_count_as_diverged(panda):
     rollout, start = follow(panda, panda.settings.target)
     rollout.ok[100:] = False
-    metrics = judge(panda, rollout, start)
+    metrics = step_response_metrics(panda, rollout, start)
     assert np.isinf(metrics.settling_time).all()
     assert "DIVERGED: 5 of 5" in next(report.verdicts(panda, rollout, metrics))
 

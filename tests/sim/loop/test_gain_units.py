@@ -9,7 +9,6 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import step_metrics
 from sim import Robot, Runner
-from sim.tuning.search import start_gains
 
 OMEGA = 9.0
 
@@ -95,7 +94,7 @@ def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps
     robot = Robot.load("jaco2")
     start = robot.settings.start + np.array([0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25])
     move = robot.settings.target - start
-    with Runner(robot, 1, params=start_gains(robot), workers=0, substeps=substeps) as runner:
+    with Runner(robot, 1, params=robot.designed(), workers=0, substeps=substeps) as runner:
         runner.reset(start)
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (1200 // substeps, robot.dof)))
     gone = rollout.qpos[:, 0] - start

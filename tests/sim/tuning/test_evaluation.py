@@ -1,0 +1,96 @@
+"""Metrics of step responses, evaluations of gains, and the tuned gains that ship."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim import Runner
+from sim.tuning.evaluation import arm_joints, evaluate_gains, step_response_metrics
+from sim.tuning.moves import Moves, random_moves, tutorial_move
+from sim.tuning.randomization import Variation, draw_variation, payload_capacity
+
+
+def hold(pose, name="hold"):
+    return Moves(np.array([pose]), np.array([pose]), (name,))
+
+
+def test_metrics_do_not_depend_on_how_long_the_runner_has_run(panda):
+    setpoints, metrics, ends = np.broadcast_to(panda.settings.target, (30, panda.dof)), [], []
+    with Runner(panda, 2, params=panda.tuned(), workers=0, substeps=5) as runner:
+        for _ in range(4):
+            runner.reset()
+            rollout = runner.rollout(setpoints)
+            metrics.append(step_response_metrics(panda, rollout, np.tile(panda.start, (2, 1))))
+            ends.append(rollout.time[-1])
+            runner.rollout(setpoints[:7])
+    assert ends[0] < ends[1] < ends[2] < ends[3]
+    for later in metrics[1:]:
+        for name, first, figure in zip(later._fields, metrics[0], later, strict=True):
+            assert figure.tobytes() == first.tobytes(), name
+
+
+def test_arm_joints_leave_out_fingers(panda, jaco2):
+    assert arm_joints(panda).sum() == 7
+    assert arm_joints(jaco2).sum() == 7
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(name, request):
+    robot = request.getfixturevalue(name)
+    moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)
+    evaluation = evaluate_gains(robot, robot.tuned(), moves, workers=0)
+    assert evaluation.rollout.ok.all()
+    assert not evaluation.shortfalls(arm_joints(robot))
+
+
+def test_shortfalls_of_the_tutorials_gains_are_listed(panda):
+    evaluation = evaluate_gains(panda, panda.params(), tutorial_move(panda), workers=0)
+    shortfalls = evaluation.shortfalls(arm_joints(panda))
+    assert shortfalls
+    assert "settling time of move 'tutorial'" in "".join(shortfalls)
+
+
+def test_variation_changes_the_motion_alike_for_any_number_of_workers(panda):
+    moves = random_moves(panda, 3, 2)
+    drawn = draw_variation(panda, 3, 1)
+    assert (drawn.payload <= min(2.0, payload_capacity(panda))).all()
+    assert (drawn.friction <= 0.1).all()
+    plain, *varied = (
+        evaluate_gains(panda, panda.designed(), moves, seconds=0.3, variation=v, workers=w)
+        for v, w in ((None, 0), (drawn, 0), (drawn, 2))
+    )
+    assert varied[0].rollout.qpos.tobytes() == varied[1].rollout.qpos.tobytes()
+    assert np.abs(varied[0].rollout.qpos - plain.rollout.qpos).max() > 1e-3
+
+
+def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it(panda):
+    pose = panda.start.copy()
+    pose[[1, 3]] = 0.8, -1.0
+    loaded = Variation(np.array([2.0]), np.zeros(1), "panda_hand")
+    gains = bp.design_gains(panda, gain_units="mass_matrix", measurement_rate="measured")
+    evaluation = evaluate_gains(panda, gains, hold(pose), seconds=3.0, variation=loaded, workers=0)
+    assert evaluation.metrics.peak_deviation[0, 1] > 3e-3
+    assert evaluation.metrics.steady_state_error[0, :7].max() < 1e-3
+
+
+def test_coarse_sensors_round_the_measured_positions(panda):
+    step = 0.01 * np.array([1, 1, 1, -1, 1, 1, 1, 0, 0])
+    small = Moves(panda.start[None], panda.start[None] + step, ("small",))
+    coarse = Variation(np.zeros(1), np.zeros(1), "panda_hand", resolution=1e-3, late=True)
+    evaluation = evaluate_gains(panda, panda.designed(), small, seconds=0.2, variation=coarse, workers=0)
+    steps = evaluation.rollout.qpos / 1e-3
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-2)
+
+
+def test_variation_must_fit_the_envs(panda):
+    with pytest.raises(InvalidArgumentError, match="variation"):
+        evaluate_gains(panda, panda.params(), random_moves(panda, 2), variation=draw_variation(panda, 3), workers=0)
+
+
+@pytest.mark.parametrize("argument", ["payload", "friction", "resolution"])
+def test_variation_out_of_range_is_refused(panda, argument):
+    with pytest.raises(InvalidArgumentError, match=argument):
+        draw_variation(panda, 3, **{argument: -1.0})

@@ -1,0 +1,57 @@
+"""Gain sets by name, and from files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim.tuning.gain_sets import gain_set
+
+
+def same(one, other):
+    return one.options().keys() == other.options().keys() and all(
+        np.array_equal(value, other.options()[name]) for name, value in one.options().items()
+    )
+
+
+def test_names_stand_for_the_robots_own_gains(panda):
+    for name, params in (("tuned", panda.tuned()), ("designed", panda.designed()), ("tutorial", panda.params())):
+        gains = gain_set(panda, name)
+        assert (gains.name, gains.control) == (name, "pid")
+        assert same(gains.params, params)
+
+
+def test_default_is_tuned_where_shipped_and_designed_otherwise(panda):
+    assert gain_set(panda).name == "tuned"
+    assert gain_set(dataclasses.replace(panda, settings=None)).name == "designed"
+
+
+def test_drive_has_a_control_stiffness_and_damping(panda):
+    gains = gain_set(panda, "drive:30,4")
+    assert (gains.name, gains.control) == ("drive (30, 4)", "drive")
+    assert (gains.params.kp == 30).all()
+    assert (gains.params.kd == 4).all()
+    assert gain_set(panda, "drive").name == "drive (20, 5)"
+
+
+def test_params_file_is_named_after_the_file(panda, tmp_path):
+    path = tmp_path / "mine.yaml"
+    bp.save_params(path, panda.designed(), panda.joint_names)
+    gains = gain_set(panda, str(path))
+    assert (gains.name, gains.control) == ("mine.yaml", "pid")
+    assert same(gains.params, panda.designed())
+
+
+@pytest.mark.parametrize("name", ["nonsense", "drive:1", "drive:a,b", "missing.yaml"])
+def test_unknown_names_are_refused(panda, name):
+    with pytest.raises(InvalidArgumentError, match="gains"):
+        gain_set(panda, name)
+
+
+def test_tuned_gains_of_a_robot_without_are_refused(panda):
+    with pytest.raises(InvalidArgumentError, match="tuned"):
+        gain_set(dataclasses.replace(panda, settings=None), "tuned")

@@ -1,0 +1,73 @@
+"""Moves to evaluate gains on, their shortest durations and their smooth efforts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.tuning.moves import (
+    Moves,
+    random_moves,
+    search_moves,
+    shortest_durations,
+    smooth_effort,
+    smooth_variation,
+    tutorial_move,
+)
+
+
+def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
+    moves, again, other = random_moves(panda, 8, 3), random_moves(panda, 8, 3), random_moves(panda, 8, 4)
+    np.testing.assert_array_equal(moves.start, again.start)
+    np.testing.assert_array_equal(moves.target, again.target)
+    assert (moves.start != other.start).any()
+    for poses in (moves.start, moves.target):
+        assert ((poses >= panda.lower) & (poses <= panda.upper)).all()
+    for start, target in zip(moves.start, moves.target, strict=True):
+        line = start + np.linspace(0, 1.05, 50)[:, None] * (target - start)
+        assert not panda.dynamics().touches(line).any()
+    assert sum("alone" in name for name in moves.names) == 2
+    np.testing.assert_array_equal(random_moves(panda, 3, 3).start, moves.start[:3])
+
+
+def test_search_moves_are_the_tutorials_one_of_each_kind_and_the_hardest_of_more(panda):
+    moves, drawn = search_moves(panda, 4), random_moves(panda, 32, 4)
+    durations = shortest_durations(panda, moves)
+    assert moves.names[:2] == ("tutorial", "near the tutorial's")
+    np.testing.assert_array_equal(moves.start[2:6], drawn.start[:4])
+    assert durations[-1] == shortest_durations(panda, drawn.take(range(4, 32))).max()
+    assert durations[1] > durations[0]
+
+
+def test_shortest_duration_is_the_double_integrators_bang_bang_for_a_lone_joint(panda):
+    """T = 2 sqrt(A I / limit) where gravity and coupling play no part: the last joint of the arm, alone."""
+    start = panda.start
+    target = start.copy()
+    target[6] += 1.0
+    inertia = panda.mass_matrix(start)[0, 6, 6]
+    gravity = panda.dynamics().inverse_dynamics(start[None], 0 * start[None], 0 * start[None])[0]
+    limit = 12.0 - abs(gravity[6])
+    expected = 2 * np.sqrt(inertia / limit)
+    # the others must hold against it, with room to spare
+    assert shortest_durations(panda, Moves(start[None], target[None], ("",)))[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_smooth_effort_is_gravity_at_both_ends(panda):
+    move = tutorial_move(panda)
+    efforts = smooth_effort(panda, move.start[0], move.target[0], 1.0)
+    for row, pose in ((0, move.start), (-1, move.target)):
+        np.testing.assert_allclose(
+            efforts[row], panda.dynamics().inverse_dynamics(pose, 0 * pose, 0 * pose)[0], atol=1e-9
+        )
+
+
+def test_smooth_variation_of_a_joint_at_rest_is_a_thousandth_of_its_limit(panda):
+    rest = np.array([panda.start])
+    variation = smooth_variation(panda, Moves(rest, rest, ("rest",)), 1.0)
+    np.testing.assert_array_equal(variation, 1e-3 * panda.effort_limit[None])
+
+
+def test_poses_in_contact_are_recognised(panda):
+    folded = panda.start.copy()
+    folded[[1, 3]] = 1.7, -2.9
+    assert panda.dynamics().touches(np.array([folded, panda.start])).tolist() == [True, False]

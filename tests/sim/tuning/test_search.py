@@ -1,0 +1,73 @@
+"""The search for gains: its seed, its history, its units."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from batchpid.errors import InvalidArgumentError
+from sim.tuning.moves import random_moves
+from sim.tuning.search import tune
+
+pytest.importorskip("cmaes")
+
+SMALL = {"generations": 2, "population": 4, "seconds": 0.2}
+
+
+def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda):
+    moves = random_moves(panda, 2, 0)
+    found = [tune(panda, moves=moves, workers=workers, seed=5, **SMALL) for workers in (0, 1, 2)]
+    for other in found[1:]:
+        assert other.history == found[0].history
+        for name in ("kp", "ki", "kd", "setpoint_weight", "derivative_filter_time"):
+            assert getattr(other.params, name).tobytes() == getattr(found[0].params, name).tobytes()
+    assert len({cost for row in found[0].history for cost in row}) > 3
+    assert tune(panda, moves=moves, workers=0, seed=6, **SMALL).history != found[0].history
+    assert found[0].cost <= found[0].start_cost
+
+
+def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
+    moves = random_moves(panda, 1, 0)
+    options = {"population": 4, "seconds": 0.2, "moves": moves, "workers": 0}
+    whole = tune(panda, generations=3, **options)
+    history = tmp_path / "search.json"
+    tune(panda, generations=2, history=history, **options)
+    assert len(json.loads(history.read_text())["costs"]) == 2
+    resumed = tune(panda, generations=3, history=history, **options)
+    assert resumed.history == whole.history
+    assert resumed.params.kp.tobytes() == whole.params.kp.tobytes()
+    with pytest.raises(InvalidArgumentError, match="another search"):
+        tune(panda, generations=3, history=history, seed=9, **options)
+    history.write_text("{}")
+    with pytest.raises(InvalidArgumentError, match="no history"):
+        tune(panda, generations=3, history=history, **options)
+
+
+def test_search_starts_from_the_designed_gains(panda):
+    found = tune(panda, moves=random_moves(panda, 1, 0), workers=0, **SMALL)
+    for name in ("kp", "ki", "kd"):
+        np.testing.assert_array_equal(getattr(found.start_params, name), getattr(panda.designed(), name))
+
+
+@pytest.mark.parametrize("units", ["effort", "inertia"])
+def test_other_units_and_single_joints_can_be_searched_too(panda, units):
+    found = tune(panda, moves=random_moves(panda, 1, 0), gain_units=units, per_joint=True, workers=0, **SMALL)
+    assert np.isfinite(found.cost)
+    ratio = found.params.kp / found.start_params.kp
+    assert found.cost == found.start_cost or np.ptp(ratio) > 0
+
+
+def test_variation_makes_another_search(panda):
+    moves = random_moves(panda, 1, 0)
+    plain, varied = (
+        tune(panda, moves=moves, variation=v, workers=0, **SMALL) for v in (None, {"payload": 1.0, "friction": 0.01})
+    )
+    assert plain.history != varied.history
+    assert varied.settings["variation"] == {"payload": 1.0, "friction": 0.01}
+
+
+def test_time_limit_ends_the_search_after_a_generation(panda):
+    found = tune(panda, moves=random_moves(panda, 1, 0), workers=0, time_limit=0.0, **SMALL)
+    assert len(found.history) == found.settings["generations"] == 1
