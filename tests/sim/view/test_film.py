@@ -17,13 +17,13 @@ def rollout(panda):
         return runner.rollout(np.broadcast_to(panda.settings.target, (20, panda.dof)))
 
 
-def test_without_a_device_the_error_gives_the_remedy(panda, rollout, tmp_path, monkeypatch):
+def test_without_a_device_the_error_gives_the_remedy(rollout, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(film, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
     with pytest.raises(
         film.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers.*batchpid view"
     ):
-        film.write_film(rollout, panda, tmp_path / "film.mp4")
+        film.write_film(rollout, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
 
 
@@ -40,10 +40,10 @@ def test_a_crash_of_the_test_program_does_not_end_this_process(program, problem)
     assert found is None if problem is None else problem in found
 
 
-def test_bad_arguments_are_named(panda, rollout, tmp_path):
+def test_bad_arguments_are_named(rollout, tmp_path):
     for options, named in (({"out": "film.avi"}, "out"), ({"fps": 0.0}, "fps"), ({"width": 3}, "width")):
         with pytest.raises(InvalidArgumentError, match=named):
-            film.write_film(rollout, panda, **({"out": tmp_path / "film.mp4"} | options))
+            film.write_film(rollout, **({"out": tmp_path / "film.mp4"} | options))
 
 
 def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
@@ -61,10 +61,10 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     assert np.abs(frames[-1].astype(int) - frames[0]).max() > 40  # the robots move
 
 
-def test_the_window_plays_for_the_given_time(panda, rollout):
+def test_the_window_plays_for_the_given_time(rollout):
     if not os.environ.get("DISPLAY") or film.render_problem() is not None:
         pytest.skip("needs a display and a Vulkan device")
-    film.show_window(rollout, panda, seconds=1.0)
+    film.show_window(rollout, seconds=1.0)
 
 
 def test_the_demo_with_a_window_fails_before_it_runs_where_nothing_renders(monkeypatch, capsys):

@@ -19,6 +19,7 @@ def rollout(panda):
 
 def test_a_rollout_plays_from_the_first_row_to_the_last_and_starts_over(panda, rollout):
     playback = Playback(rollout)
+    assert playback.robot.name == panda.name
     frames = [playback.frame()]
     while frames[-1].time[0] < playback.duration - 1e-9:
         playback.advance()
