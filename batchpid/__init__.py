@@ -9,7 +9,7 @@ from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.law import advance, init, reset, step
 from batchpid.params import PIDParams, make_params
-from batchpid.serialization import load_about, load_params, save_params
+from batchpid.serialization import dumps_params, load_about, load_params, loads_params, save_params
 from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
 
@@ -26,9 +26,11 @@ __all__ = [
     "design_gains",
     "discretise",
     "drive_target",
+    "dumps_params",
     "init",
     "load_about",
     "load_params",
+    "loads_params",
     "make_params",
     "presets",
     "reset",

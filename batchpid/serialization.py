@@ -1,6 +1,6 @@
-"""Params to and from YAML or JSON files that people read and edit: one entry per joint, by name.
+"""Params to and from YAML or JSON that people read and edit: one entry per joint, by name.
 
-A file says::
+A file has this form::
 
     format: batchpid-params-1
     dtype: float64
@@ -20,15 +20,15 @@ import math
 import os
 import reprlib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
+from batchpid.files import write_atomically
 from batchpid.params import PIDParams, make_params
+from batchpid.validate import choice, file_path, names
 
 FORMAT = "batchpid-params-1"
 OFF = {
@@ -48,8 +48,51 @@ OFF = {
     "anti_windup": "none",
     "continuous": False,
 }
-"""The options of a joint, and the value that is off."""
+"""Options of a joint, with the value that is off."""
 HEAD = ("format", "about", "dtype", *CHOICES, "joints")
+"""Keys of a document."""
+SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
+
+
+def dumps_params(
+    params: PIDParams, joint_names: Sequence[str], about: Mapping[str, Any] | None = None, format: str = "yaml"
+) -> str:
+    """Return ``params`` as text.
+
+    Parameters
+    ----------
+    joint_names
+        One name per joint.
+    about
+        Kept with the params for :func:`load_about`, e.g. where they come from: plain numbers, strings, lists, mappings.
+    format
+        "yaml" or "json".
+
+    Raises
+    ------
+    InvalidArgumentError
+        Names that do not fit the params, or an unknown format.
+    """
+    joints = names("joint_names", joint_names, params.num_joints)
+    options = params.options()
+    document: dict[str, Any] = {"format": FORMAT}
+    if about:
+        document["about"] = json.loads(json.dumps(dict(about)))
+    document["dtype"] = str(options.pop("dtype"))
+    document |= {name: options.pop(name) for name in CHOICES}
+    document["joints"] = {
+        joint: {name: _plain(column[:, index]) for name, column in options.items()}
+        for index, joint in enumerate(joints)
+    }
+    if choice("format", format, ("yaml", "json")) == "json":
+        return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
+    return _dump_yaml(document)
+
+
+def loads_params(text: str, joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
+    """Return the params in a text, JSON if it begins with a brace and else YAML; otherwise as :func:`load_params`."""
+    format = "json" if text.lstrip().startswith("{") else "yaml"
+    return _build("text", _parse("text", text, format), joint_names)
 
 
 def save_params(
@@ -58,128 +101,139 @@ def save_params(
     joint_names: Sequence[str],
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``params`` to ``path`` (.yaml, .yml or .json); an existing file is replaced as a whole or not at all.
+    """Write ``params`` to ``path`` (.yaml, .yml or .json), as :func:`dumps_params`.
 
-    ``about`` is kept beside them for :func:`load_about`: plain numbers, strings, lists and mappings, e.g. where the
-    params come from.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the names do not fit the params, or the suffix is another.
+    An existing file is replaced as a whole or not at all.
     """
-    path, names = Path(path), [str(name) for name in joint_names]
-    if len(names) != params.num_joints or len(set(names)) != len(names):
-        raise InvalidArgumentError(
-            "joint_names",
-            f"are not {params.num_joints} different names",
-            value=names,
-            remedy="name every joint of the params once",
-        )
-    options = params.options()
-    document: dict[str, Any] = {"format": FORMAT}
-    if about:
-        document["about"] = json.loads(json.dumps(dict(about)))
-    document["dtype"] = str(options.pop("dtype"))
-    document |= {name: options.pop(name) for name in CHOICES}
-    document["joints"] = {
-        name: {key: _plain(column[:, joint]) for key, column in options.items()} for joint, name in enumerate(names)
-    }
-    if _is_yaml(path):
-        text = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=10_000)
-    else:
-        text = json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    path = file_path("path", path, SUFFIXES)
+    write_atomically(path, dumps_params(params, joint_names, about, SUFFIXES[path.suffix.lower()]))
 
 
 def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
-    """Return the params in a file and their joints' names, in the order of ``joint_names`` where given.
+    """Return the params in a file and their joints' names, in the order of ``joint_names`` if given.
 
-    Nothing in the file is executed, and every value passes :func:`batchpid.make_params`: a file from a stranger is
-    at worst refused.
+    Nothing in the file is executed, and every value is checked as in :func:`batchpid.make_params`.
 
     Raises
     ------
     InvalidArgumentError
         Naming the file, joint and key.
     FileNotFoundError
-        If there is no such file.
+        The file does not exist.
     """
-    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
-        raise InvalidArgumentError("path", "is no path", value=path, remedy="give the file's name")
-    path = Path(path)
-    document = _parsed(path)
-    joints = _checked(path, document)
-    names = list(joints)
-    if joint_names is not None:
-        if isinstance(joint_names, str) or not isinstance(joint_names, Sequence):
-            raise InvalidArgumentError(
-                "joint_names",
-                "is no list of names",
-                value=joint_names,
-                remedy="name the joints in the order wanted",
-            )
-        names = [str(name) for name in joint_names]
-        if sorted(names) != sorted(joints):
-            missing, unknown = sorted(set(names) - set(joints)), sorted(set(joints) - set(names))
-            raise InvalidArgumentError(
-                str(path),
-                f"does not hold these joints: missing {missing}, unknown {unknown}",
-                remedy=f"the file's joints are {', '.join(joints)}",
-            )
-    head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
-    options = _columns(path, {name: joints[name] for name in names})
-    try:
-        return make_params(len(names), **options, **head, joint_names=names), names
-    except InvalidArgumentError as error:
-        raise InvalidArgumentError(
-            f"{path}: {error.argument}",
-            error.problem,
-            remedy=error.remedy,
-            joint=error.joint,
-            env=error.env,
-            value=error.value,
-        ) from None
+    return _build(str(path), _read(path), joint_names)
 
 
 def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return what :func:`save_params` kept beside the params in a file; empty if nothing.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As :func:`load_params`.
-    """
-    path = Path(path)
-    document = _parsed(path)
-    _checked(path, document)
+    """Return the ``about`` that :func:`save_params` wrote; empty if there is none. Raises as :func:`load_params`."""
+    document = _read(path)
+    _check(str(path), document)
     return dict(document.get("about", {}))
 
 
-def _parsed(path: Path) -> Any:
-    parse = _parse_yaml if _is_yaml(path) else _parse_json
+def _read(path: str | os.PathLike[str]) -> Any:
+    path = file_path("path", path, SUFFIXES)
+    return _parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
+
+
+def _parse(source: str, text: str | bytes, format: str) -> Any:
     try:
-        return parse(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        text = text.decode() if isinstance(text, bytes) else text
+        return _parse_json(text) if format == "json" else _parse_yaml(text)
+    except (ValueError, RecursionError) as error:
         said = " ".join(str(error).split())[:300] or type(error).__name__
-        raise InvalidArgumentError(str(path), f"cannot be read: {said}", remedy="correct the file") from None
+        raise InvalidArgumentError(source, f"cannot be read: {said}", remedy="correct the file") from None
+
+
+def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tuple[PIDParams, list[str]]:
+    """Return the params of a document and the names of their joints."""
+    joints = _check(source, document)
+    order = list(joints) if joint_names is None else names("joint_names", joint_names)
+    if set(order) != set(joints):
+        missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
+        raise InvalidArgumentError(
+            source,
+            f"does not hold these joints: missing {missing}, unknown {unknown}",
+            remedy=f"the file's joints are {', '.join(joints)}",
+        )
+    head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
+    options = _columns(source, {joint: joints[joint] for joint in order})
+    try:
+        return make_params(len(order), **options, **head, joint_names=order), order
+    except InvalidArgumentError as error:
+        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
+        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None
+
+
+def _check(source: str, document: Any) -> dict[str, dict[str, Any]]:
+    """Return the joints of a document of the right form."""
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InvalidArgumentError(source, "holds no params", remedy=f"it must contain 'format: {FORMAT}'")
+    for key in document:
+        choice(f"{source}: key", key, HEAD)
+    if not isinstance(document.get("about", {}), dict):
+        raise InvalidArgumentError(f"{source}: about", "must be a mapping", remedy="use 'key: value', or leave it out")
+    choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
+    joints = document.get("joints")
+    if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
+        raise InvalidArgumentError(f"{source}: joints", "must map names to options", remedy="name the joints")
+    for name, options in joints.items():
+        if not isinstance(options, dict) or "kp" not in options:
+            raise InvalidArgumentError(f"{source}: joints", "has no kp", joint=name, remedy="give 'kp: <number>'")
+        for key, value in options.items():
+            if key not in OFF:
+                raise InvalidArgumentError(
+                    f"{source}: {key}", "unknown option", joint=name, remedy=f"use one of {', '.join(OFF)}"
+                )
+            for entry in value if isinstance(value, list) and value else [value]:
+                _check_entry(source, name, key, entry)
+    return joints
+
+
+def _check_entry(source: str, joint: str, key: str, entry: Any) -> None:
+    wanted: type = type(OFF[key])
+    if wanted is float:
+        whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
+        good = whole or isinstance(entry, float) or entry in ("inf", "-inf")
+    else:
+        good = isinstance(entry, wanted)
+    if not good:
+        raise InvalidArgumentError(
+            f"{source}: {key}",
+            f"is {reprlib.repr(entry)}, which is no {wanted.__name__}",
+            joint=joint,
+            remedy=f"give one, as in '{key}: {OFF[key]}', or a list of one per env",
+        )
+
+
+def _columns(source: str, joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return each option that some joint has, as an array (1 or envs, joints)."""
+    columns: dict[str, Any] = {}
+    for key, off in OFF.items():
+        if not any(key in options for options in joints.values()):
+            continue
+        values = {name: options.get(key, off) for name, options in joints.items()}
+        lists = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
+        envs = max(map(len, lists.values()))
+        for name, value in lists.items():
+            if len(value) not in (1, envs):
+                problem = f"has {len(value)} values, others {envs}"
+                raise InvalidArgumentError(f"{source}: {key}", problem, joint=name, remedy="give one per env")
+            back = "back_calculation" in str(joints[name].get("anti_windup"))
+            if key == "tracking_time" and back and key not in joints[name]:
+                problem = "is missing, while other joints have it"
+                raise InvalidArgumentError(f"{source}: {key}", problem, joint=name, remedy="give it too")
+        dtype: Any = {float: float, bool: bool, str: object}[type(off)]
+        columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
+    return columns
 
 
 def _plain(column: Any) -> Any:
     """Return a joint's option as one plain value, or a list of one per env."""
-    values = [_plain_scalar(value) for value in column]
+    # The shortest digits that read back as the same number of its dtype: str(float32) has fewer than its float.
+    values = [float(str(value)) if isinstance(value, np.floating) else value for value in column]
+    values = [bool(value) if isinstance(value, np.bool_) else value for value in values]
     return values[0] if len(values) == 1 else values
-
-
-def _plain_scalar(value: Any) -> Any:
-    if isinstance(value, np.floating):
-        return float(str(value))  # the shortest digits that read back as the same number of this dtype
-    return bool(value) if isinstance(value, np.bool_) else value
 
 
 def _without_infinities(value: Any) -> Any:
@@ -191,116 +245,6 @@ def _without_infinities(value: Any) -> Any:
     return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
-def _is_yaml(path: Path) -> bool:
-    if path.suffix not in (".yaml", ".yml", ".json"):
-        raise InvalidArgumentError(
-            "path", "ends in no known format", value=str(path), remedy="use .yaml, .yml or .json"
-        )
-    return path.suffix != ".json"
-
-
-def _checked(path: Path, document: Any) -> dict[str, dict[str, Any]]:
-    """Return the joints of a document of the right form."""
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InvalidArgumentError(str(path), "holds no params", remedy=f"it must say 'format: {FORMAT}'")
-    for key in document:
-        if key not in HEAD:
-            raise InvalidArgumentError(f"{path}: {key}", "is no known key", remedy=f"choose from {', '.join(HEAD)}")
-    if not isinstance(document.get("about", {}), dict):
-        raise InvalidArgumentError(f"{path}: about", "is no mapping", remedy="name what is told, or leave it out")
-    if document.get("dtype", "float64") not in ("float32", "float64"):
-        raise InvalidArgumentError(f"{path}: dtype", "is unknown", remedy="choose from float32, float64")
-    joints = document.get("joints")
-    if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
-        raise InvalidArgumentError(f"{path}: joints", "is no mapping from names to options", remedy="name the joints")
-    for name, options in joints.items():
-        if not isinstance(options, dict) or "kp" not in options:
-            raise InvalidArgumentError(f"{path}: joints", "has no kp", joint=name, remedy="give 'kp: <number>'")
-        for key, value in options.items():
-            if key not in OFF:
-                raise InvalidArgumentError(
-                    f"{path}: {key}", "is no known option", joint=name, remedy=f"choose from {', '.join(OFF)}"
-                )
-            for entry in value if isinstance(value, list) and value else [value]:
-                _check_entry(path, name, key, entry)
-    return joints
-
-
-def _check_entry(path: Path, joint: str, key: str, entry: Any) -> None:
-    wanted: type = type(OFF[key])
-    if wanted is float:
-        whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
-        good = whole or isinstance(entry, float) or entry in ("inf", "-inf")
-    else:
-        good = isinstance(entry, wanted)
-    if not good:
-        raise InvalidArgumentError(
-            f"{path}: {key}",
-            f"is {reprlib.repr(entry)}, which is no {wanted.__name__}",
-            joint=joint,
-            remedy=f"give one, as in '{key}: {OFF[key]}', or a list of one per env",
-        )
-
-
-def _columns(path: Path, joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return each option that some joint has, as an array (1 or envs, joints)."""
-    columns: dict[str, Any] = {}
-    for key, off in OFF.items():
-        if not any(key in options for options in joints.values()):
-            continue
-        values = {name: options.get(key, off) for name, options in joints.items()}
-        rows = max(len(value) if isinstance(value, list) else 1 for value in values.values())
-        for name, value in values.items():
-            if isinstance(value, list) and len(value) not in (1, rows):
-                raise InvalidArgumentError(
-                    f"{path}: {key}",
-                    f"has {len(value)} values, others {rows}",
-                    joint=name,
-                    remedy="give one per env",
-                )
-        spread = [
-            value * (rows // len(value)) if isinstance(value, list) else [value] * rows for value in values.values()
-        ]
-        dtype: Any = {float: float, bool: bool, str: object}[type(off)]
-        columns[key] = np.array(spread, dtype=dtype).T
-        if key == "tracking_time":
-            for name, options in joints.items():
-                if "back_calculation" in str(options.get("anti_windup")) and key not in options:
-                    raise InvalidArgumentError(
-                        f"{path}: {key}",
-                        "is missing, while other joints have it",
-                        joint=name,
-                        remedy="give it too",
-                    )
-    return columns
-
-
-class _Loader(yaml.SafeLoader):
-    """SafeLoader without aliases, which can make a short file explode, and without keys given twice."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError(f"aliases are not allowed, {self.peek_event().start_mark}")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        mapping = super().construct_mapping(node, deep=True)
-        if len(mapping) < len(node.value):
-            raise yaml.YAMLError(f"a key is given twice{node.start_mark}")
-        return mapping
-
-
-class _Dumper(yaml.SafeDumper):
-    """SafeDumper without aliases."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _parse_yaml(text: str) -> Any:
-    return yaml.load(text, Loader=_Loader)  # a SafeLoader: plain data only
-
-
 def _parse_json(text: str) -> Any:
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
@@ -308,3 +252,38 @@ def _parse_json(text: str) -> Any:
         return dict(pairs)
 
     return json.loads(text, object_pairs_hook=unique)
+
+
+def _parse_yaml(text: str) -> Any:
+    import yaml  # here, since params in memory need NumPy alone
+
+    class Loader(yaml.SafeLoader):
+        """SafeLoader without aliases, which can make a short file explode, and without keys given twice."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError(f"aliases are not allowed, {self.peek_event().start_mark}")
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            mapping = super().construct_mapping(node, deep=True)
+            if len(mapping) < len(node.value):
+                raise ValueError(f"a key is given twice{node.start_mark}")
+            return mapping
+
+    try:
+        return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+def _dump_yaml(document: dict[str, Any]) -> str:
+    import yaml
+
+    class Dumper(yaml.SafeDumper):
+        """SafeDumper without aliases."""
+
+        def ignore_aliases(self, data: Any) -> bool:
+            return True
+
+    return yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=10_000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,10 +43,7 @@ class Recording:
     @property
     def params(self) -> bp.PIDParams:
         """The params at the start of the recording."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "params.json"
-            path.write_text(str(self.attributes["params"]))
-            return bp.load_params(path, self.joint_names)[0]
+        return bp.loads_params(str(self.attributes["params"]), self.joint_names)[0]
 
 
 def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Recording:

@@ -12,13 +12,10 @@ Datasets, ticks first: ``time`` [s], ``setpoint``, ``qpos``, ``qvel``, ``effort`
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import math
 import os
-import platform
 import re
-import tempfile
 import threading
 import time
 from pathlib import Path
@@ -30,6 +27,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError, MissingDependencyError
+from batchpid.versions import package_versions
 
 if TYPE_CHECKING:
     import h5py
@@ -338,14 +336,6 @@ def _units(runner: Runner) -> dict[str, list[str]]:
 
 def _attributes(runner: Runner, seed: int | None) -> dict[str, Any]:
     robot = runner.robot
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "params.json"
-        bp.save_params(path, runner.params, robot.joint_names)
-        params = path.read_text()
-    versions = {"python": platform.python_version()}
-    for package in ("batchpid", "sapien", "numpy", "h5py"):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
     return {
         "format": FORMAT,
         "complete": False,
@@ -363,8 +353,8 @@ def _attributes(runner: Runner, seed: int | None) -> dict[str, Any]:
         "control": runner.control,
         "compensate": runner.compensate,
         "dissipation": robot.dissipation,
-        "params": params,
+        "params": bp.dumps_params(runner.params, robot.joint_names, format="json"),
         "seed": "none" if seed is None else seed,
-        "versions": json.dumps(versions),
+        "versions": json.dumps(package_versions(("batchpid", "sapien", "numpy", "h5py"))),
         "begun": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }

@@ -79,12 +79,12 @@ BAD = {
     "no format": ('{"joints": {}}', "holds no params.*format: batchpid-params-1"),
     "list": ("[1, 2]", "holds no params"),
     "cut off": ('{"format": "batchpid', "cannot be read"),
-    "unknown key": ('{"format": "batchpid-params-1", "joint": {}}', "joint: is no known key.*joints"),
-    "no joints": ('{"format": "batchpid-params-1", "joints": {}}', "no mapping"),
+    "unknown key": ('{"format": "batchpid-params-1", "joint": {}}', "unknown option .got .joint...*joints"),
+    "no joints": ('{"format": "batchpid-params-1", "joints": {}}', "must map names"),
     "no kp": (JOINT % '"kd": 1.0', "'elbow'.*no kp"),
     "unknown option": (
         JOINT % '"kp": 1.0, "kq": 2.0',
-        "kq, joint 'elbow': is no known option.*choose from kp, ki",
+        "kq, joint 'elbow': unknown option.*use one of kp, ki",
     ),
     "negative": (JOINT % '"kp": -1.0', "kp, joint 'elbow'.*-1.0"),
     "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
@@ -159,3 +159,46 @@ def test_json_is_json(tmp_path):
         raise AssertionError(constant)
 
     assert json.loads(path.read_text(), parse_constant=refuse)["joints"]["elbow"]["kp"] == 20.0
+
+
+@pytest.mark.parametrize("format", ["yaml", "json"])
+def test_params_survive_a_text_as_they_survive_a_file(options, format, tmp_path):
+    params = bp.make_params(JOINTS, **options)
+    text = bp.dumps_params(params, NAMES, {"seed": 3}, format)
+    loaded, names = bp.loads_params(text)
+    assert same(loaded, params)
+    assert names == NAMES
+    assert bp.loads_params(text, NAMES[::-1])[1] == NAMES[::-1]
+    path = tmp_path / f"params.{format}"
+    bp.save_params(path, params, NAMES, {"seed": 3})
+    assert path.read_text() == text
+
+
+def test_bad_texts_are_refused():
+    with pytest.raises(bp.InvalidArgumentError, match="text: holds no params"):
+        bp.loads_params("joints: {}")
+    with pytest.raises(bp.InvalidArgumentError, match="text: cannot be read"):
+        bp.loads_params("{")
+    with pytest.raises(bp.InvalidArgumentError, match="format: unknown option"):
+        bp.dumps_params(bp.make_params(JOINTS, 1.0), NAMES, format="toml")
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+def test_about_comes_back_and_does_not_touch_the_params(tmp_path, suffix):
+    params = bp.make_params(2, [1.0, 2.0], 0.5, gain_units="mass_matrix")
+    about = {"seed": 3, "versions": {"numpy": "2"}, "moves": ["a", "b"], "measurement_rate": True}
+    with_about, without = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    bp.save_params(with_about, params, ["x", "y"], about)
+    bp.save_params(without, params, ["x", "y"])
+    assert bp.load_about(with_about) == about
+    assert bp.load_about(without) == {}
+    loaded = [bp.load_params(path)[0] for path in (with_about, without)]
+    assert loaded[0].gain_units == loaded[1].gain_units == params.gain_units
+    assert (loaded[0].kp == params.kp).all()
+
+
+def test_about_must_be_a_mapping(tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text("format: batchpid-params-1\nabout: 3\njoints: {x: {kp: 1.0}}\n")
+    with pytest.raises(bp.InvalidArgumentError, match="about"):
+        bp.load_params(path)

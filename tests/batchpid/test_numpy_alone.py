@@ -1,0 +1,50 @@
+"""The controller needs NumPy and the standard library, nothing else."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+README = Path(__file__).parents[2] / "README.md"
+REFUSE = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        package = name.partition(".")[0]
+        if package not in {"numpy", "batchpid", *sys.stdlib_module_names}:
+            raise ImportError(f"{name} is neither NumPy nor of the standard library")
+
+sys.meta_path.insert(0, Refuse())
+"""
+
+
+def run(program):
+    done = subprocess.run([sys.executable, "-c", REFUSE + program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_example_of_the_readme_needs_numpy_alone():
+    (program,) = (
+        code for code in re.findall(r"```python\n(.*?)```", README.read_text(), re.S) if "bp.BatchPID" in code
+    )
+    assert "jax" not in program.replace('backend="jax"', "")
+    run(program + "assert effort.shape == (64, 9)")
+
+
+def test_every_module_but_the_backends_of_jax_can_be_imported_with_numpy_alone():
+    run(
+        "import importlib, pkgutil, batchpid\n"
+        "for module in pkgutil.iter_modules(batchpid.__path__):\n"
+        "    if module.name not in ('__main__', 'blocks'):\n"
+        "        importlib.import_module(f'batchpid.{module.name}')\n"
+    )
+
+
+def test_params_go_to_json_and_back_with_numpy_alone():
+    run(
+        "import batchpid as bp\n"
+        "text = bp.dumps_params(bp.make_params(2, 1.0), ['a', 'b'], format='json')\n"
+        "assert bp.loads_params(text)[1] == ['a', 'b']\n"
+    )
