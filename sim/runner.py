@@ -29,7 +29,7 @@ from sim.loop.faults import ACTIONS, Fault, FaultLog
 from sim.loop.loop import COMPENSATE, LoopSpec
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
-from sim.robot.limits import LimitWatch
+from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
 from sim.workers.pool import WorkerPool, packing
 from sim.workers.requests import Call, Run, Worker
@@ -147,7 +147,7 @@ class Runner:
                 remedy="load one with Robot.load('panda') or a URDF path",
             )
         self.robot = robot
-        self._limits = LimitWatch(robot)
+        self._limits = SetpointCheck(robot)
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         count = len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024)
         self.timestep = number("timestep", timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +15,78 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim.observation import RunInfo
-from sim.robot.urdf import Joint, Link
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+"""URDF joint types that SAPIEN turns into degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """Coupling of a joint's position to another's: ``q = multiplier * q_of_joint + offset``."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint of a URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
+
+    Limits that the URDF leaves out are infinite. ``origin`` [m] and ``rpy`` [rad] place the joint in its parent link;
+    ``axis`` is a direction in the joint's frame, not normalised.
+    """
+
+    name: str
+    type: str
+    parent_link: str
+    child_link: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort_limit: float = math.inf
+    velocity_limit: float = math.inf
+    damping: float = 0.0
+    friction: float = 0.0
+    mimic: Mimic | None = None
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+
+    @property
+    def moves(self) -> bool:
+        """True if the joint is a degree of freedom."""
+        return self.type in MOVING_TYPES
+
+    @property
+    def continuous(self) -> bool:
+        """True if positions wrap at a full turn (URDF type ``continuous``)."""
+        return self.type == "continuous"
+
+    @property
+    def unit(self) -> str:
+        """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
+        return "m" if self.type == "prismatic" else "rad"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
+        return "N" if self.type == "prismatic" else "N m"
+
+
+@dataclass(frozen=True)
+class Link:
+    """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
+
+    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF: both are given, and not zero.
+    """
+
+    name: str
+    mass: float | None
+    collisions: int
+    inertial: bool
 
 
 class Dynamics(Protocol):
@@ -39,17 +109,17 @@ _make_dynamics: list[Callable[[RobotDescription, bool], Dynamics]] = []
 
 
 def register_dynamics(make: Callable[[RobotDescription, bool], Dynamics]) -> None:
-    """Set what :meth:`RobotDescription.dynamics` calls: the engine lies a floor above, so :mod:`sim` connects them."""
+    """Set what :meth:`RobotDescription.dynamics` calls: the engine is a floor above, so :mod:`sim` connects the two."""
     _make_dynamics[:] = [make]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a bundled robot carries: its tutorial's poses and gains, in joint order.
+    """Tutorial's poses and gains of a bundled robot, in joint order.
 
     ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID; ``drive_stiffness`` and
-    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate; ``notes``: where they
-    differ from the tutorial's, in words.
+    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate; ``notes``: differences from
+    the tutorial, in words.
     """
 
     start: Float64
@@ -63,12 +133,12 @@ class Settings:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RobotDescription:
-    """A robot as its URDF describes it; every array is in the order of ``joint_names``.
+    """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom in SAPIEN's order; ``all_joints`` includes the fixed ones.
-    ``settings`` is None unless the robot is bundled.
+    ``urdf`` and ``srdf`` are the XML that the simulator parses. ``joints`` are the degrees of freedom in SAPIEN's
+    order; ``all_joints`` includes the fixed ones. ``settings`` is None unless the robot is bundled.
     """
 
     name: str
@@ -83,6 +153,12 @@ class RobotDescription:
     fixed_base: bool
     settings: Settings | None
 
+    def __repr__(self) -> str:
+        mass = sum(link.mass or 0.0 for link in self.links)
+        head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass:.4g} kg, path={str(self.path)!r},"
+        joints = textwrap.shorten(f"joints: {', '.join(self.joint_names)}", 200, placeholder=" ...")
+        return "\n".join([head, *textwrap.wrap(joints + ")", 100, initial_indent="  ", subsequent_indent="    ")])
+
     @property
     def dof(self) -> int:
         """Number of degrees of freedom."""
@@ -95,7 +171,7 @@ class RobotDescription:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the positions, "rad" or "m", in the order of :attr:`joint_names`."""
+        """Units of the positions, "rad" or "m"."""
         return tuple(joint.unit for joint in self.joints)
 
     @property
@@ -119,8 +195,8 @@ class RobotDescription:
         return np.array([joint.velocity_limit for joint in self.joints])
 
     @property
-    def continuous(self) -> NDArray[np.bool_]:
-        """Which joints wrap at a full turn (dof,)."""
+    def continuous(self) -> Bool:
+        """Mask (dof,) of the joints whose position wraps at a full turn."""
         return np.array([joint.continuous for joint in self.joints])
 
     @property
@@ -130,13 +206,13 @@ class RobotDescription:
 
     @property
     def start(self) -> Float64:
-        """Start pose (dof,): the bundled settings', else zero moved inside the joint limits."""
+        """Start pose (dof,) [rad or m]: the bundled settings', else zero, clipped to the joint limits."""
         if self.settings is not None:
             return self.settings.start.copy()
         return np.clip(np.zeros(self.dof), self.lower, self.upper)
 
     def params(self, **options: Any) -> bp.PIDParams:
-        """PID parameters for this robot: :func:`batchpid.make_params` with the robot's figures filled in.
+        """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
 
         Effort limits and continuous joints come from the URDF and, for a bundled robot, kp, ki and kd from its
         settings; anti-windup is "conditional". ``options`` override these and add others.
@@ -144,24 +220,20 @@ class RobotDescription:
         Raises
         ------
         InvalidArgumentError
-            The robot carries no gains and ``options`` has no ``kp``.
+            The robot has no gains and ``options`` has no ``kp``.
         """
-        known: dict[str, Any] = {
-            "joint_names": self.joint_names,
-            "effort_limit": self.effort_limit,
-            "anti_windup": "conditional",
-        }
+        known: dict[str, Any] = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
             known["continuous"] = self.continuous
-        if "effort_min" in options or "effort_max" in options:
-            del known["effort_limit"]
+        if not {"effort_min", "effort_max"} & set(options):
+            known["effort_limit"] = self.effort_limit
         if self.settings is not None:
             known |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
         elif "kp" not in options:
             raise InvalidArgumentError(
                 "kp",
-                f"robot {self.name!r} carries no gains",
-                remedy="pass kp=, ki=, kd= (scalar or per joint)",
+                f"robot {self.name!r} has no gains",
+                remedy="pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()",
             )
         return bp.make_params(joints=self.dof, **(known | options))
 
@@ -180,12 +252,12 @@ class RobotDescription:
         )
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """``count`` seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""
+        """Return seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""
         low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
         return np.random.default_rng(seed).uniform(low, high, (count, self.dof))
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof) or (dof,), on a fixed base."""
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def dynamics(self, ground: bool = True) -> Dynamics:
@@ -193,7 +265,7 @@ class RobotDescription:
         return _make_dynamics[0](self, ground)
 
     def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
-        """Entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""
+        """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""
         rows = np.atleast_2d(np.asarray(qpos, np.float64))
         outside = (rows < self.lower - tolerance) | (rows > self.upper + tolerance)
         return [(int(env), int(joint), float(rows[env, joint])) for env, joint in np.argwhere(outside)]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Dissipation:
-    """Friction and damping of every joint and link; None leaves the URDF's figure in force.
+    """Friction of every joint and damping of every link.
 
-    ``joint_friction`` is PhysX's dimensionless joint friction coefficient; ``link_damping`` the linear and
-    angular velocity damping of every link [1/s].
+    ``joint_friction`` is PhysX's dimensionless joint friction coefficient, None for the URDF's value;
+    ``link_damping`` the linear and angular velocity damping of every link [1/s].
     """
 
     joint_friction: float | None
@@ -19,6 +19,6 @@ class Dissipation:
 
 DISSIPATION = {
     "urdf": Dissipation(joint_friction=None, link_damping=0.0),
-    # What SAPIEN 3 gives every joint and link unasked, whatever the URDF says.
-    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),  # SAPIEN 3's defaults, which ignore the URDF
 }
+"""Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""

@@ -1,8 +1,8 @@
-"""Where a robot's links are, from its joint positions: batched forward kinematics and the transposed Jacobian.
+"""Batched forward kinematics and the transposed Jacobian, in NumPy.
 
 A joint's frame is its parent link's frame moved by the joint's origin; its link's frame is that, turned about the axis
 by q (revolute, continuous) or shifted along it by q (prismatic). See B. Siciliano et al., Robotics (2009), sections 2.8
-and 3.1. Pure NumPy, so that a view or a recording needs no simulator.
+and 3.1.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError
@@ -28,7 +27,7 @@ class Poses(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """One joint on the way down the tree."""
+    """Joint of the tree, with the index of its parent link."""
 
     parent: int
     xyz: Float64
@@ -39,38 +38,44 @@ class _Step(NamedTuple):
 
 
 class Kinematics:
-    """The tree of ``robot``, its root link at the origin. ``links`` names the links in the order of every pose."""
+    """Kinematics of ``robot``, its root link at the origin. ``links`` names the links in the order of the poses."""
 
     def __init__(self, robot: RobotDescription) -> None:
-        root = etree.fromstring(robot.urdf.encode())
-        elements = {element.get("name"): element for element in root.findall("joint")}
         dofs = {name: index for index, name in enumerate(robot.joint_names)}
         children = {joint.child_link for joint in robot.all_joints}
         links = [link.name for link in robot.links if link.name not in children]
-        places = {links[0]: 0}
         self._steps: list[_Step] = []
-        pending = list(robot.all_joints)
-        while pending:  # parents first, whatever the order of the file
-            ready = [joint for joint in pending if joint.parent_link in places]
-            pending = [joint for joint in pending if joint.parent_link not in places]
-            for joint in ready:
-                xyz, wxyz, axis = _frame(elements[joint.name])
-                parent, dof = places[joint.parent_link], dofs.get(joint.name)
-                self._steps.append(_Step(parent, xyz, wxyz, axis, dof, joint.type == "prismatic"))
-                places[joint.child_link] = len(links)
-                links.append(joint.child_link)
+        for joint in robot.all_joints:  # parents first
+            axis = np.array(joint.axis)
+            self._steps.append(
+                _Step(
+                    parent=links.index(joint.parent_link),
+                    xyz=np.array(joint.origin),
+                    wxyz=from_rpy(joint.rpy),
+                    axis=axis / max(float(np.linalg.norm(axis)), 1e-12),
+                    dof=dofs.get(joint.name),
+                    slides=joint.type == "prismatic",
+                )
+            )
+            links.append(joint.child_link)
         self.links = tuple(links)
         self.dof = robot.dof
 
     def index(self, link: str) -> int:
-        """Return the place of a link in every pose."""
+        """Return the index of a link in the poses.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot has no link of that name.
+        """
         if link not in self.links:
             raise InvalidArgumentError("link", "is unknown", value=link, remedy=f"use one of {', '.join(self.links)}")
         return self.links.index(link)
 
     @property
     def tool(self) -> int:
-        """The link at the end of the longest chain of joints, or the hand where that chain ends in fingers."""
+        """Index of the link at the end of the longest chain of joints, or of the hand if that chain ends in fingers."""
         depth, branches = [0] * len(self.links), [0] * len(self.links)
         for child, step in enumerate(self._steps, start=1):
             depth[child] = depth[step.parent] + (step.dof is not None)
@@ -105,8 +110,8 @@ class Kinematics:
     def efforts_of_force(self, poses: Poses, link: int, force: ArrayLike) -> Float64:
         """Return the joint efforts (..., dof) of a ``force`` (..., 3) [N] on the origin of a link: tau = J^T F.
 
-        Every joint between the root and the link counts: a turning one with axis . ((p - o) x F), where p is the
-        point and o the joint's origin, a sliding one with axis . F.
+        A revolute joint between the root and the link contributes axis . ((p - o) x F), with p the point and o the
+        joint's origin, a prismatic one axis . F.
         """
         f = np.broadcast_to(np.asarray(force, np.float64), (*poses.position.shape[:-2], 3))
         point = poses.position[..., link, :]
@@ -119,20 +124,3 @@ class Kinematics:
                 efforts[..., step.dof] = (axis * (f if step.slides else arm)).sum(-1)
             link = step.parent
         return efforts
-
-
-def _frame(element: etree._Element) -> tuple[Float64, Float64, Float64]:
-    """Return origin and rotation of a joint's frame, and its unit axis there; a URDF's defaults where left out."""
-    origin, axis = element.find("origin"), element.find("axis")
-    xyz = numbers(origin, "xyz", "0 0 0")
-    direction = numbers(axis, "xyz", "1 0 0")
-    return (
-        xyz,
-        from_rpy(numbers(origin, "rpy", "0 0 0")),
-        direction / max(float(np.linalg.norm(direction)), 1e-12),
-    )
-
-
-def numbers(element: etree._Element | None, key: str, default: str) -> Float64:
-    """Return an attribute's numbers, separated by spaces."""
-    return np.array([float(word) for word in (default if element is None else element.get(key, default)).split()])

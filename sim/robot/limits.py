@@ -1,4 +1,4 @@
-"""Positions outside a joint's limits: the joint cannot get there, which is worth one warning each."""
+"""Warnings of setpoints and start poses outside the joint limits."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class SetpointWarning(UserWarning):
     """A setpoint or start pose lies outside a joint's limits."""
 
 
-class LimitWatch:
-    """Warns once for each argument and joint whose positions leave the limits of ``robot``."""
+class SetpointCheck:
+    """Check of positions against the limits of ``robot``, which warns once for each argument and joint."""
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
@@ -26,10 +26,7 @@ class LimitWatch:
         self._warned: set[tuple[str, int]] = set()
 
     def check(self, argument: str, positions: NDArray[Any], stacklevel: int = 3) -> None:
-        """Warn of ``positions`` (..., dof) [rad or m]; the warning points ``stacklevel`` frames up.
-
-        What is not finite is a fault, which is told of elsewhere.
-        """
+        """Warn of finite ``positions`` (..., dof) [rad or m] outside the limits, ``stacklevel`` frames up."""
         outside = (positions < self._low) | (positions > self._high)
         if not outside.any():
             return

@@ -1,7 +1,8 @@
-"""Robot: a URDF, parsed once, checked, headless."""
+"""Robot: a URDF, parsed once and checked, for headless simulation."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,27 +10,26 @@ from pathlib import Path
 import numpy as np
 import yaml
 from lxml import etree
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import assets
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
-from batchpid.validate import choice, flag
-from sim.robot.description import RobotDescription, Settings
+from batchpid.validate import choice, file_path, flag
+from sim.robot.description import Joint, RobotDescription, Settings
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.preflight import Finding, check
-from sim.robot.urdf import Joint, read_urdf
+from sim.robot.urdf import read_urdf
 from sim.robot.xml import parse_xml
 
-Float64 = NDArray[np.float64]
 _ASSETS = Path(assets.__file__).parent
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Robot(RobotDescription):
-    """A robot description. Load one with :meth:`load`."""
+    """Robot description, with its checks and gains. Load one with :meth:`load`."""
 
     @classmethod
     def load(
@@ -48,42 +48,35 @@ class Robot(RobotDescription):
         package_dirs
             Folders in which ``package://`` mesh paths are looked up first.
         missing_meshes
-            ``"error"``, or ``"skip"`` to go on without collision shapes whose mesh is missing.
+            ``"error"``, or ``"skip"`` to leave out collision shapes whose mesh is missing.
         dissipation
-            ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: what SAPIEN
-            gives unasked, joint friction 0.05 and link damping 0.05, for comparing with its tutorial.
+            ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: SAPIEN's defaults,
+            joint friction 0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
-            Whether the root link is fixed to the world.
+            True to fix the root link to the world.
 
         Raises
         ------
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is no usable URDF; the message names the element and the remedy.
+            The file is not a usable URDF; the message names the element and the remedy.
         InvalidArgumentError
             An option is not one of those above.
         """
-        for argument, value, known in (
-            ("missing_meshes", missing_meshes, ("error", "skip")),
-            ("dissipation", dissipation, tuple(DISSIPATION)),
-        ):
-            choice(argument, value, known)
-        if not isinstance(package_dirs, list | tuple) or not all(
-            isinstance(folder, str | Path) for folder in package_dirs
-        ):
-            raise InvalidArgumentError(
-                "package_dirs",
-                "must be folders",
-                value=package_dirs,
-                remedy="pass a list of paths",
-            )
+        choice("missing_meshes", missing_meshes, ("error", "skip"))
+        choice("dissipation", dissipation, DISSIPATION)
         fixed_base = flag("fixed_base", fixed_base)
+        if not isinstance(package_dirs, list | tuple):
+            raise InvalidArgumentError(
+                "package_dirs", "must be a list of folders", value=package_dirs, remedy="pass a list of paths"
+            )
+        folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         path = _find(name_or_path)
-        urdf = read_urdf(path, package_dirs=tuple(map(Path, package_dirs)), missing_meshes=missing_meshes)
+        urdf = read_urdf(path, package_dirs=folders, missing_meshes=missing_meshes)
         joints = tuple(joint for joint in urdf.joints if joint.moves)
         if not joints:
-            raise RobotError(f"{path}: a robot without moving joints has nothing to control; check the joint types")
+            raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         srdf = path.with_suffix(".srdf")
         bundled = path.parent == _ASSETS
         return cls(
@@ -102,7 +95,7 @@ class Robot(RobotDescription):
 
     @staticmethod
     def bundled() -> tuple[str, ...]:
-        """Names of the robots that ship with batchpid."""
+        """Return the names of the robots that ship with batchpid."""
         return tuple(sorted(path.stem for path in _ASSETS.glob("*.urdf")))
 
     def check(
@@ -114,29 +107,34 @@ class Robot(RobotDescription):
         timestep: float = 1 / 2000,
         control: str = "pid",
     ) -> list[Finding]:
-        """Preflight: what is odd about this robot, and about running it this way.
+        """Return the findings of the preflight: oddities of this robot, and of running it this way.
 
         Parameters
         ----------
         params
-            The PID's, to check them too; default those of :meth:`params` where the robot carries gains.
+            PID parameters to check too; default those of :meth:`params` where the robot has gains.
         qpos, setpoint
             Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or m].
         timestep
-            Of control and simulation [s].
+            Time step of control and simulation [s].
         control
-            As :class:`sim.Runner` takes it.
+            ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`sim.Runner`.
 
         Returns
         -------
-        Findings, most severe first; empty where nothing is odd.
+        Findings, most severe first.
+
+        Raises
+        ------
+        InvalidArgumentError
+            An argument has a wrong shape, type or range.
         """
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
 
     def designed(self, gain_units: str = "mass_matrix") -> bp.PIDParams:
-        """Return the params that follow from the robot's inertia alone; a search for gains starts from them.
+        """Return params designed from the robot's inertia alone; a search for gains starts from them.
 
         With the mass matrix the poles lie between those of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E. Thomson,
         "Delay networks having maximally flat frequency characteristics", Proc. IEE 96, 1949), with zeta = sqrt(0.6) and
@@ -177,8 +175,8 @@ class Robot(RobotDescription):
         if not self.has_tuned:
             raise InvalidArgumentError(
                 "robot",
-                f"{self.name!r} carries no tuned gains",
-                remedy="use batchpid.design_gains(robot), or make some with: batchpid tune",
+                f"{self.name!r} has no tuned gains",
+                remedy="use robot.designed(), or search for gains with: batchpid tune",
             )
         return bp.load_params(self._tuned_path, self.joint_names)[0]
 
@@ -188,18 +186,10 @@ class Robot(RobotDescription):
 
 
 def _find(name_or_path: str | Path) -> Path:
-    if not isinstance(name_or_path, str | Path):
-        raise InvalidArgumentError(
-            "name_or_path",
-            "must be a string or Path",
-            value=name_or_path,
-            remedy="pass a robot's name or a URDF path",
-        )
-    bundled = _ASSETS / f"{name_or_path}.urdf"
+    path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
     if str(name_or_path) in Robot.bundled():
-        return bundled
-    path = Path(name_or_path).expanduser()
-    if "\0" not in str(path) and path.is_file():
+        return _ASSETS / f"{name_or_path}.urdf"
+    if os.path.isfile(path):  # pathlib's methods raise other errors for names that are too long or start with ~
         return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
@@ -209,16 +199,10 @@ def _find(name_or_path: str | Path) -> Path:
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
     data = yaml.safe_load(path.read_text())
-
-    def column(key: str) -> Float64:
-        return np.array([float(data["joints"][joint.name][key]) for joint in joints])
-
+    rows = [data["joints"][joint.name] for joint in joints]
+    columns = {key: np.array([row[key] for row in rows], float) for key in ("start", "target", "kp", "ki", "kd")}
     return Settings(
-        start=column("start"),
-        target=column("target"),
-        kp=column("kp"),
-        ki=column("ki"),
-        kd=column("kd"),
+        **columns,
         drive_stiffness=float(data["drive"]["stiffness"]),
         drive_damping=float(data["drive"]["damping"]),
         rate_hz=float(data["rate_hz"]),

@@ -24,7 +24,7 @@ def multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
 
 
 def rotate(q: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:
-    """Return vectors v (..., 3) turned by q (..., 4): v + 2 w (u x v) + 2 u x (u x v), with u the vector part."""
+    """Return vectors v (..., 3) rotated by q (..., 4): v + 2 w (u x v) + 2 u x (u x v), with u the vector part."""
     w, u = q[..., :1], q[..., 1:]
     t = 2 * np.cross(u, v)
     return v + w * t + np.cross(u, t)

@@ -1,12 +1,12 @@
-r"""The stability advisor: which gains cannot work at this time step, before a run goes to NaN.
+r"""Stability of a robot's sampled PID loop: gains that cannot work at this time step, found before the run diverges.
 
-The effort is held over a step dt, so gains have a bound that continuous time does not know. With I the inertia that a
-joint shows with all others free, 1 / (M^-1)_jj, and tau the derivative's filter time, a joint alone needs::
+The effort is held over a step dt, which bounds the gains, unlike in continuous time. With I the inertia that a joint
+shows while all others are free, 1 / (M^-1)_jj, and tau the derivative's filter time, a single joint needs::
 
     ratio = 1/2 (kd dt/I dt/(dt + 2 tau) + 1/2 kp dt^2/I) < 1          (for tau = 0: kd dt/I + kp dt^2/(2 I) < 2)
 
-and the robot as a whole :func:`batchpid.stability_bound` < 1, which is never below the largest of these: joints with
-axes nearly in line turn against each other with less inertia than either has.
+and the whole robot :func:`batchpid.stability_bound` < 1, which is never below the largest of these: joints with axes
+nearly in line turn against each other with less inertia than either has.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from sim.robot.description import RobotDescription
 Float64 = NDArray[np.float64]
 
 
-class Stability(NamedTuple):
-    """How much of the stability range the gains use at one pose; arrays are (dof,)."""
+class StabilityReport(NamedTuple):
+    """Share of the stability range that the gains use at one pose; arrays are (dof,)."""
 
     inertia: Float64
-    """I, of each joint with the others free [kg m^2 or kg]."""
+    """I of each joint, with the others free [kg m^2 or kg]."""
     kd_dt: Float64
     """kd dt / I, as the filter passes it."""
     kp_dt2: Float64
     """kp dt^2 / I."""
-    ratio: Float64
-    """Of each joint alone: 1 is the bound."""
-    robot: float
-    """Of the robot as a whole: 1 is the boundary."""
+    joint_ratio: Float64
+    """Ratio of each joint alone: 1 is the bound."""
+    robot_ratio: float
+    """Ratio of the whole robot: 1 is the bound."""
     participation: Float64
-    """The share of each joint in the mode that goes first."""
+    """Share of each joint in the mode that is the first to become unstable."""
 
 
-def stability(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float) -> Stability:
-    """How much of the stability range ``params`` (their least stable env) use at ``qpos`` (dof,)."""
+def stability_report(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float) -> StabilityReport:
+    """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,)."""
     matrix = robot.mass_matrix(qpos)
-    dt, damping = timestep, np.array([joint.damping for joint in robot.joints])
+    dt, damping = timestep, robot.damping
     kp, kd, tau = (
         np.zeros((1, robot.dof)) if leaf is None else np.asarray(leaf, np.float64)
         for leaf in (params.kp, params.kd, params.derivative_filter_time)
@@ -53,23 +53,17 @@ def stability(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, time
         kp, kd = kp * diagonal, kd * diagonal
     if isinstance(params.gain_units, PerMassMatrix):
         matrix, damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
-    bound = bp.stability_bound(
-        np.broadcast_to(matrix, (params.num_envs, *matrix.shape[1:])),
-        kp,
-        kd,
-        dt,
-        filter_time=tau,
-        damping=damping,
-    )
+    matrices = np.broadcast_to(matrix, (params.num_envs, *matrix.shape[1:]))
+    bound = bp.stability_bound(matrices, kp, kd, dt, filter_time=tau, damping=damping)
     worst = int(np.argmax(bound.ratio))
     inertia = 1 / np.diagonal(np.linalg.inv(matrix[0] + 0.5 * dt * np.diag(damping)))
     kp, kd, tau = (np.broadcast_to(leaf, (params.num_envs, robot.dof))[worst] for leaf in (kp, kd, tau))
     kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
-    return Stability(
+    return StabilityReport(
         inertia=inertia,
         kd_dt=kd_dt,
         kp_dt2=kp_dt2,
-        ratio=0.5 * (kd_dt + 0.5 * kp_dt2),
-        robot=float(bound.ratio[worst]),
+        joint_ratio=0.5 * (kd_dt + 0.5 * kp_dt2),
+        robot_ratio=float(bound.ratio[worst]),
         participation=bound.participation[worst],
     )

@@ -1,104 +1,40 @@
-"""Reading a URDF for headless simulation: parsed safely, visuals dropped, meshes found, joints listed.
+"""URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the joints.
 
-SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render
-device, and goes on silently when a collision mesh is missing. Here the text is sanitised once; what the
-simulator is given holds no visual, no mimic that it would get wrong without a word, and absolute mesh paths.
+SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
+and silently skips a collision mesh that is missing. The text made here has no visuals, absolute mesh paths, and no
+mimic joint that SAPIEN would silently mis-simulate.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lxml import etree
 
 from batchpid.errors import RobotError
+from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic
 from sim.robot.xml import number, numbers, parse_xml
 
-_SIZES = {
-    "box": {"size": 3},
-    "sphere": {"radius": 1},
-    "cylinder": {"radius": 1, "length": 1},
-    "capsule": {"radius": 1, "length": 1},
+_SIZES = {  # of the shapes that SAPIEN knows: their attributes, each with as many numbers as it has
+    "box": {"size": "0 0 0"},
+    "sphere": {"radius": "0"},
+    "cylinder": {"radius": "0", "length": "0"},
+    "capsule": {"radius": "0", "length": "0"},
 }
-# Attributes of the collision shapes that SAPIEN knows, and how many numbers each has.
-
-MOVING_TYPES = ("revolute", "continuous", "prismatic")
-"""URDF joint types that SAPIEN turns into degrees of freedom."""
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """``q = multiplier * q_of_joint + offset``, as the URDF says it."""
-
-    joint: str
-    multiplier: float
-    offset: float
-
-
-@dataclass(frozen=True)
-class Joint:
-    """One joint of the URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
-
-    Limits that the URDF leaves out are infinite.
-    """
-
-    name: str
-    type: str
-    parent_link: str
-    child_link: str
-    lower: float = -math.inf
-    upper: float = math.inf
-    effort_limit: float = math.inf
-    velocity_limit: float = math.inf
-    damping: float = 0.0
-    friction: float = 0.0
-    mimic: Mimic | None = None
-
-    @property
-    def moves(self) -> bool:
-        """Whether the joint is a degree of freedom."""
-        return self.type in MOVING_TYPES
-
-    @property
-    def continuous(self) -> bool:
-        """Whether positions wrap at a full turn (URDF type ``continuous``)."""
-        return self.type == "continuous"
-
-    @property
-    def unit(self) -> str:
-        """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
-        return "m" if self.type == "prismatic" else "rad"
-
-    @property
-    def effort_unit(self) -> str:
-        """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
-        return "N" if self.type == "prismatic" else "N m"
-
-
-@dataclass(frozen=True)
-class Link:
-    """One link: its mass [kg] (None without ``<inertial>``) and how many collision shapes it has.
-
-    ``inertial`` is whether SAPIEN takes mass and inertia from the URDF: both are there, and not zero.
-    """
-
-    name: str
-    mass: float | None
-    collisions: int
-    inertial: bool
 
 
 @dataclass(frozen=True)
 class Urdf:
-    """A URDF, ready for the headless simulator.
+    """URDF prepared for the headless simulator.
 
-    ``joints`` are in the order in which SAPIEN numbers them: breadth first from the root, fixed joints counted,
-    joints of one parent in the order of the file. ``text`` is what the simulator parses; ``missing_meshes``
-    names the collision meshes that it lacks.
+    ``joints`` are in SAPIEN's order: breadth first from the root, fixed joints counted, joints of one parent in the
+    order of the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that were
+    not found.
     """
 
     name: str
@@ -114,16 +50,14 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
     Parameters
     ----------
     package_dirs
-        Where ``package://NAME/...`` is looked up, before the folders above the file.
+        Folders searched for ``package://NAME/...`` before the folders above the file.
     missing_meshes
-        ``"error"``, or ``"skip"`` to simulate without the shapes whose mesh file cannot be found.
+        ``"error"``, or ``"skip"`` to leave out the shapes whose mesh file is not found.
 
     Raises
     ------
-    RobotNotFoundError
-        There is no such file.
     RobotError
-        Malformed XML, an entity or DTD, a structure that SAPIEN cannot build, a missing mesh.
+        Unreadable file, malformed XML, an entity or DTD, a structure that SAPIEN cannot build, a missing mesh.
     """
     root = parse_xml(path)
     if root.tag != "robot":
@@ -139,16 +73,11 @@ def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes
         )
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
-    _keep_working_mimics(root, joints, path)
-    _spell_out(root, joints)
-    ordered = tuple(_breadth_first(links, joints, path))
-    return Urdf(
-        name=root.get("name", path.stem),
-        text=etree.tostring(root, encoding="unicode"),
-        joints=ordered,
-        links=tuple(links),
-        missing_meshes=tuple(missing),
-    )
+    ordered = _breadth_first(links, joints, path)
+    for element, joint in zip(root.findall("joint"), joints, strict=True):
+        _repair(element, joint, joints, path)
+    text = etree.tostring(root, encoding="unicode")
+    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing))
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
@@ -169,11 +98,10 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
 
 
 def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    """The mesh file that the URDF at ``path`` calls ``name``, if it exists."""
+    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist."""
     relative = name.removeprefix("package://").removeprefix("file://")
-    folders = [path.parent, *package_dirs]
-    if name.startswith("package://"):
-        folders = [*package_dirs, *path.absolute().parents]
+    own = path.absolute().parents
+    folders = [*package_dirs, *own] if name.startswith("package://") else [own[0], *package_dirs]
     for folder in folders:
         candidate = (folder / relative).absolute()
         if relative and candidate.is_file():
@@ -182,32 +110,31 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
 
 
 def _read_joint(element: etree._Element, path: Path) -> Joint:
-    name = element.get("name", "")
+    name, kind = element.get("name", ""), element.get("type", "")
     where = f"{path}: joint {name!r}"
-    kind = element.get("type", "")
     if kind not in (*MOVING_TYPES, "fixed"):
         raise RobotError(
             f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; "
             "use revolute, continuous, prismatic or fixed"
         )
-    parent, child = element.find("parent"), element.find("child")
-    if parent is None or child is None or not parent.get("link") or not child.get("link"):
+    parent, child = (None if end is None else end.get("link") for end in map(element.find, ("parent", "child")))
+    if not parent or not child:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
-    _check_origin(element, where)
+    fields: dict[str, Any] = _origin(element, where)
     axis = element.find("axis")
-    if kind != "fixed" and axis is not None and math.hypot(*numbers(axis, "xyz", 3, where)) < 1e-3:
-        raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
+    if kind != "fixed" and axis is not None:
+        fields["axis"] = tuple(numbers(axis, "xyz", "1 0 0", where).tolist())
+        if math.hypot(*fields["axis"]) < 1e-3:
+            raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
     limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
     limits: dict[str, float] = {}
     if limit is not None:
-        limits["effort_limit"] = number(limit, "effort", math.inf, where)
-        limits["velocity_limit"] = number(limit, "velocity", math.inf, where)
+        limits = {f"{key}_limit": number(limit, key, math.inf, where) for key in ("effort", "velocity")}
         if kind in ("revolute", "prismatic"):
-            limits["lower"] = number(limit, "lower", 0.0, where)
-            limits["upper"] = number(limit, "upper", 0.0, where)
+            limits |= {key: number(limit, key, 0.0, where) for key in ("lower", "upper")}
     elif kind in ("revolute", "prismatic"):
         raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
-    if any(math.isnan(value) for value in limits.values()):
+    if any(map(math.isnan, limits.values())):
         raise RobotError(f"{where}: a limit is NaN ({limits}); give numbers")
     if limits.get("lower", -math.inf) > limits.get("upper", math.inf):
         raise RobotError(
@@ -215,33 +142,22 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         )
     if limits.get("effort_limit", 0.0) < 0 or limits.get("velocity_limit", 0.0) < 0:
         raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
-    passive: dict[str, float] = {}
     if dynamics is not None:
         passive = {key: number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
         if any(not 0 <= value < math.inf for value in passive.values()):
             raise RobotError(f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF")
-    return Joint(
-        name=name,
-        type=kind,
-        parent_link=parent.get("link"),
-        child_link=child.get("link"),
-        mimic=None
-        if mimic is None
-        else Mimic(
-            mimic.get("joint", ""),
-            number(mimic, "multiplier", 1.0, where),
-            number(mimic, "offset", 0.0, where),
-        ),
-        **limits,
-        **passive,
-    )
+        fields |= passive
+    if mimic is not None:
+        multiplier, offset = number(mimic, "multiplier", 1.0, where), number(mimic, "offset", 0.0, where)
+        fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
+    return Joint(name, kind, parent, child, **(limits | fields))
 
 
 def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
-    """Whether SAPIEN realises the mimic of ``joint``, which it does by a tendon.
+    """Return whether SAPIEN simulates the mimic of ``joint`` correctly, which it does by a stiff tendon.
 
-    It has to be ``q = +-q_other``; the other joint a sibling, or the one above with a link above it. Anything
-    else SAPIEN gets wrong, or drops, without a word.
+    It does for ``q = +-q_other`` where the other joint moves a sibling of this joint's link, or its parent. Any other
+    mimic SAPIEN silently drops or mis-simulates.
     """
     mimic = joint.mimic
     if mimic is None or abs(mimic.multiplier) != 1 or mimic.offset != 0:
@@ -252,70 +168,70 @@ def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
     return joint.parent_link in (other.child_link, other.parent_link)
 
 
-def _keep_working_mimics(root: etree._Element, joints: Sequence[Joint], path: Path) -> None:
-    """Remove the mimics that the simulator would get wrong: those joints move by themselves, and a check says so."""
-    for element, joint in zip(root.findall("joint"), joints, strict=True):
-        if joint.mimic is None:
-            continue
-        if joint.mimic.joint not in {other.name for other in joints}:
-            raise RobotError(
-                f"{path}: joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}; correct the name"
-            )
-        if not mimic_works(joint, joints):
-            element.remove(element.find("mimic"))
+def _repair(element: etree._Element, joint: Joint, joints: Sequence[Joint], path: Path) -> None:
+    """Write out default values, and remove a mimic that SAPIEN would mis-simulate (the preflight reports it).
 
-
-def _spell_out(root: etree._Element, joints: Sequence[Joint]) -> None:
-    """Write out what joints leave to the defaults: SAPIEN takes a missing limit for NaN, and fails without damping."""
-    for element, joint in zip(root.findall("joint"), joints, strict=True):
-        limit, dynamics = element.find("limit"), element.find("dynamics")
-        if limit is not None and joint.moves and not joint.continuous:
-            limit.set("lower", repr(joint.lower))
-            limit.set("upper", repr(joint.upper))
-        if dynamics is not None:
-            dynamics.set("damping", repr(joint.damping))
-            dynamics.set("friction", repr(joint.friction))
+    SAPIEN reads a missing limit as NaN, and fails on ``<dynamics>`` without damping.
+    """
+    limit, dynamics = element.find("limit"), element.find("dynamics")
+    if limit is not None and joint.moves and not joint.continuous:
+        limit.set("lower", repr(joint.lower))
+        limit.set("upper", repr(joint.upper))
+    if dynamics is not None:
+        dynamics.set("damping", repr(joint.damping))
+        dynamics.set("friction", repr(joint.friction))
+    if joint.mimic is None:
+        return
+    if joint.mimic.joint not in {other.name for other in joints}:
+        raise RobotError(
+            f"{path}: joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}; correct the name"
+        )
+    if not mimic_works(joint, joints):
+        element.remove(element.find("mimic"))
 
 
 def _read_link(element: etree._Element, path: Path) -> Link:
     name = element.get("name", "")
     where = f"{path}: link {name!r}"
-    mass = element.find("inertial/mass")
+    mass, inertia = element.find("inertial/mass"), element.find("inertial/inertia")
     value = None if mass is None else number(mass, "value", 0.0, where)
     if value is not None and not 0 <= value < math.inf:
         raise RobotError(f"{where}: mass {value} must be finite and >= 0; correct the URDF")
-    inertia = element.find("inertial/inertia")
-    inertial = False
+    tensor = np.zeros((3, 3))
     if inertia is not None:
-        xx, yy, zz, xy, xz, yz = (
-            number(inertia, key, 0.0, where) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        )
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        keys = ("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz")
+        tensor = np.array([[number(inertia, key, 0.0, where) for key in row] for row in keys])
         if tensor.any() and (not np.isfinite(tensor).all() or np.linalg.eigvalsh(tensor)[0] <= 0):
             raise RobotError(
                 f"{where}: no body has the inertia {dict(inertia.attrib)}, whose principal moments are not all > 0; "
                 "correct the URDF"
             )
-        inertial = bool(value) and bool(tensor.any())
     for part in element.findall("inertial") + element.findall("collision"):
-        _check_origin(part, where)
+        _origin(part, where)
     for shape in element.iterfind("collision/geometry/*"):
-        for key, count in _SIZES.get(shape.tag, {}).items():
-            if min(numbers(shape, key, count, where)) <= 0:
+        for key, default in _SIZES.get(shape.tag, {}).items():
+            if numbers(shape, key, default, where).min() <= 0:
                 raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF")
-    return Link(name, value, len(element.findall("collision")), inertial)
+    return Link(name, value, len(element.findall("collision")), bool(value) and bool(tensor.any()))
 
 
-def _check_origin(element: etree._Element, where: str) -> None:
+def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
+    """Return the position [m] and the roll, pitch and yaw [rad] of an element's ``<origin>``."""
     origin = element.find("origin")
-    if origin is not None:
-        for key in ("xyz", "rpy"):
-            if origin.get(key) is not None:
-                numbers(origin, key, 3, where)
+    return {
+        field: tuple(numbers(origin, key, "0 0 0", where).tolist())
+        for field, key in (("origin", "xyz"), ("rpy", "rpy"))
+    }
 
 
-def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterator[Joint]:
-    """Joints level by level from the root, siblings in file order; raises unless they form one tree."""
+def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
+    """Return the joints level by level from the root, siblings in file order.
+
+    Raises
+    ------
+    RobotError
+        They do not form one tree.
+    """
     for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
@@ -331,12 +247,12 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> Iterat
     roots = [link.name for link in links if link.name not in set(children)]
     if len(roots) != 1:
         raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
-    seen = 0
-    level = [roots[0]]
+    ordered: list[Joint] = []
+    level = roots
     while level:
         found = [joint for link in level for joint in joints if joint.parent_link == link]
-        seen += len(found)
-        yield from found
+        ordered += found
         level = [joint.child_link for joint in found]
-    if seen != len(joints):
+    if len(ordered) != len(joints):
         raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")
+    return ordered

@@ -1,7 +1,7 @@
 """Designed gains, untuned, on robots of many makers: stable, and settled within two seconds.
 
-The robots are those of the package ``example-robot-data`` (extra "robots"), where it is installed, and the bundled
-ones. Joint friction is 0: PhysX's coefficient is no friction torque, which is what these files give.
+The robots are the bundled ones and, where it is installed, those of the package ``example-robot-data`` (extra
+"robots"). Joint friction is set to 0: these files give a torque, PhysX takes a dimensionless coefficient.
 """
 
 from __future__ import annotations
@@ -48,12 +48,7 @@ def load(name):
     return dataclasses.replace(robot, joints=joints)
 
 
-MISSES = {
-    (
-        "g1_description/urdf/g1_29dof_rev_1_0.urdf",
-        "effort",
-    ): "an ankle's gains are too weak to leave its limit"
-}
+MISSES = {("g1_description/urdf/g1_29dof_rev_1_0.urdf", "effort"): "an ankle's gains are too weak to leave its limit"}
 
 
 @pytest.mark.slow

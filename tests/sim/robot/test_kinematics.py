@@ -1,14 +1,17 @@
 """Forward kinematics against SAPIEN's link poses, and J^T F against the work that a force does."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import load_bundled
+from tiny_urdf import link, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.engine.building import SceneSpec, parse
-from sim.engine.pack import Pack
+from sim.engine.building import SceneSpec, bare_scene, build_robot, parse
 from sim.engine.physics import PHYSICS
 from sim.robot.kinematics import Kinematics
 from sim.robot.rotations import about, from_rpy, multiply, rotate
@@ -24,21 +27,16 @@ ODD = """<robot name="odd">
   <joint name="aside" type="revolute"><parent link="mid"/><child link="side"/><origin xyz="0 0 -0.4"/>
     <axis xyz="-1 1 0.5"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
 </robot>"""
-INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
 def odd_robot(folder):
-    path = folder / "odd.urdf"
-    text = ODD
-    for link in ("tip", "base", "mid", "side", "bracket"):
-        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{INERTIAL}</link>')
-    path.write_text(text)
-    return Robot.load(path)
+    """A tree listed out of order, with every type of joint."""
+    return Robot.load(write(folder, re.sub(r'<link name="(\w+)"/>', lambda found: link(found[1]), ODD)))
 
 
 @pytest.fixture(scope="module", params=["panda", "jaco2", "odd"])
 def robot(request, tmp_path_factory):
-    return odd_robot(tmp_path_factory.mktemp("odd")) if request.param == "odd" else Robot.load(request.param)
+    return odd_robot(tmp_path_factory.mktemp("odd")) if request.param == "odd" else load_bundled(request.param)
 
 
 def random_qpos(robot, count):
@@ -46,25 +44,23 @@ def random_qpos(robot, count):
     return np.random.default_rng(0).uniform(low, high, (count, robot.dof))
 
 
-def test_link_poses_are_sapiens(robot):
-    count = 40
+def test_link_poses_are_those_of_sapien(robot):
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
-    pack = Pack(parse(spec), spec, 1)
+    scene = bare_scene()
+    reference = build_robot(parse(spec), scene, spec)
     kinematics = Kinematics(robot)
-    qpos = random_qpos(robot, count)
+    qpos = random_qpos(robot, 40)
     ours = kinematics.poses(qpos)
-    assert ours.position.shape == (count, len(kinematics.links), 3)
+    assert ours.position.shape == (40, len(kinematics.links), 3)
     for k, row in enumerate(qpos):
-        pack.write_state([0], row[None], np.zeros((1, robot.dof)))
-        for link in pack._robots[0].links:
-            pose, index = link.entity_pose, kinematics.index(link.name)
+        reference.set_qpos(row.astype(np.float32))
+        for body in reference.links:
+            pose, index = body.entity_pose, kinematics.index(body.name)
             np.testing.assert_allclose(ours.position[k, index], pose.p, atol=2e-6)
-            same = np.abs(ours.wxyz[k, index] @ pose.q)
-            assert same == pytest.approx(1, abs=2e-6)
-    pack.close()
+            assert np.abs(ours.wxyz[k, index] @ pose.q) == pytest.approx(1, abs=2e-6)
 
 
-def test_any_batch_shape(robot):
+def test_poses_of_any_batch_shape_are_those_of_single_rows(robot):
     kinematics = Kinematics(robot)
     qpos = random_qpos(robot, 6)
     flat = kinematics.poses(qpos)
@@ -78,20 +74,16 @@ def test_efforts_of_a_force_are_the_gradient_of_its_work(robot):
     qpos = random_qpos(robot, 5)
     poses = kinematics.poses(qpos)
     force, step = np.array([3.0, -2.0, 5.0]), 1e-6
-    for link in range(len(kinematics.links)):
-        efforts = kinematics.efforts_of_force(poses, link, force)
+    for index in range(len(kinematics.links)):
+        efforts = kinematics.efforts_of_force(poses, index, force)
         for joint in range(robot.dof):
             nudge = step * np.eye(robot.dof)[joint]
-            ahead, behind = (kinematics.poses(qpos + sign * nudge).position[:, link] for sign in (1, -1))
+            ahead, behind = (kinematics.poses(qpos + sign * nudge).position[:, index] for sign in (1, -1))
             np.testing.assert_allclose(efforts[:, joint], (ahead - behind) @ force / (2 * step), atol=1e-7)
 
 
-def test_the_tool_is_the_hand_or_the_end_of_the_chain(tmp_path):
-    for robot, tool in (
-        (Robot.load("panda"), "panda_hand"),
-        (Robot.load("jaco2"), "j2s7s300_link_7"),
-        (odd_robot(tmp_path), "mid"),
-    ):
+def test_the_tool_is_the_hand_or_the_end_of_the_chain(panda, jaco2, tmp_path):
+    for robot, tool in ((panda, "panda_hand"), (jaco2, "j2s7s300_link_7"), (odd_robot(tmp_path), "mid")):
         kinematics = Kinematics(robot)
         assert kinematics.links[kinematics.tool] == tool
     with pytest.raises(InvalidArgumentError, match="is unknown"):

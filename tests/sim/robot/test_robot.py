@@ -1,4 +1,4 @@
-"""A robot's own gains and its description in a few words."""
+"""Designed gains of a robot, and its repr."""
 
 import numpy as np
 import pytest
@@ -24,3 +24,12 @@ def test_designed_gains_have_one_bandwidth_with_the_mass_matrix(panda):
     np.testing.assert_allclose(params.kp, (2 * np.pi * 1.7) ** 2)
     with pytest.raises(InvalidArgumentError, match=r"gain_units.*'mass'.*use one of"):
         panda.designed("mass")
+
+
+def test_the_repr_is_short_and_names_robot_joints_mass_and_file(panda, jaco2):
+    for robot, dof, mass in ((panda, 9, "17.45 kg"), (jaco2, 13, "5.557 kg")):
+        text = repr(robot)
+        assert len(text.splitlines()) <= 3
+        assert text.startswith(f"Robot({robot.name!r}, {dof} dof, {mass}, path=")
+        assert robot.joint_names[0] in text
+        assert str(robot.path) in text
