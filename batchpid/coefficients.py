@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from batchpid.display import array_summary
 from batchpid.elementwise import TURN, namespace, tiny_of
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
@@ -41,6 +42,9 @@ class Coefficients(NamedTuple):
     integration: Any
     weight_origin: Any
     non_finite: Any
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
 
 
 def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:

@@ -78,6 +78,11 @@ class BatchPID:
         self._params: PIDParams | None = None
         self.params = params
 
+    def __repr__(self) -> str:
+        started = "not started" if self._state is None else "started"
+        envs, joints = self._shape
+        return f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {self._backend!r}, {started})"
+
     @property
     def num_envs(self) -> int:
         """Number of envs."""

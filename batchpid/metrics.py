@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.display import array_summary
 from batchpid.errors import InvalidArgumentError
 
 Float64 = NDArray[np.float64]
@@ -57,6 +58,9 @@ class StepMetrics(NamedTuple):
     """Total variation of the effort [N m or N]: chatter shows here."""
     saturation_share: Float64
     """Share of samples in saturation."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
 
     def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
         """Each figure reduced over envs to (joints,): ``statistic`` is given a joint's defined figures, returns one.

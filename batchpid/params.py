@@ -2,8 +2,8 @@
 
 A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An
 option that is off is ``None``: it is no leaf, so NumPy skips it and ``jax.jit`` compiles a law without it. Choices
-that carry no number (the integration order, say) are field-less marker tuples: part of the tree's structure and so
-static under every JAX transform.
+that carry no number, such as the integration order, are tuples without fields (:mod:`batchpid.choices`): part of the
+tree's structure, and so static under every JAX transform.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.choices import CHOICES, Everywhere
+from batchpid.display import params_summary
 from batchpid.errors import InvalidArgumentError
-from batchpid.options import LeafBuilder
+from batchpid.leaves import LeafBuilder
+from batchpid.validate import entries, is_traced
 
 
 class PIDParams(NamedTuple):
     """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
 
-    Build it with :func:`make_params`, which validates. Inside a traced function use ``params._replace(kp=...)``
-    with arrays of these shapes.
+    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take traced gains.
     """
 
     kp: Any
@@ -65,9 +66,9 @@ class PIDParams(NamedTuple):
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: what is not finite propagates."""
     measurement_rate: Any = None
-    """MeasuredRate(), for who runs the law on a robot: give it the measured rate; off: differences of measurements."""
+    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
     gain_units: Any = None
-    """PerInertia() or PerMassMatrix(), for who runs the law on a robot; off: the gains give efforts."""
+    """PerInertia() or PerMassMatrix(): whoever runs the law on a robot makes efforts of it; off: efforts."""
 
     @property
     def num_joints(self) -> int:
@@ -76,39 +77,43 @@ class PIDParams(NamedTuple):
 
     @property
     def num_envs(self) -> int:
-        """Number of envs that the params tell apart: 1 when all envs share them."""
+        """Number of envs with params of their own; 1 where all envs share them."""
         return max(leaf.shape[-2] for leaf in self if _is_array(leaf))
 
     @property
     def dtype(self) -> Any:
-        """The dtype of every leaf."""
+        """Dtype of every leaf."""
         return self.kp.dtype
 
     def for_envs(self, envs: slice | Any) -> PIDParams:
         """Return the params of some envs (a slice or an index array); shared rows stay shared."""
         return PIDParams(*(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self))
 
+    def __repr__(self) -> str:
+        return params_summary(self)
+
     def options(self) -> dict[str, Any]:
         """Return the options that are on, as arguments of :func:`make_params` that build these params again.
 
-        "clamp" shows as the integral limits it stands for.
+        "clamp" shows as the integral limits it stands for. Where its leaves are traced, anti_windup is left out.
         """
         options: dict[str, Any] = {}
         for name, leaf in zip(self._fields, self, strict=True):
             if name in CHOICES:
-                (options[name],) = (n for n, marker in CHOICES[name].items() if type(marker) is type(leaf))
+                (options[name],) = (n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf))
             elif _is_array(leaf) and name != "conditional":
-                options[name] = np.array(leaf)
+                options[name] = leaf if is_traced(leaf) else np.array(leaf)
         if self.continuous is not None:
             options["continuous"] = options["continuous"] > 0
-        strategy = np.full((1, self.num_joints), "none", dtype=object)
-        if self.tracking_time is not None:
-            strategy = np.where(np.isfinite(options["tracking_time"]), "back_calculation", strategy)
-        if self.conditional is not None:
-            everywhere = isinstance(self.conditional, Everywhere)
-            chosen = np.array(True) if everywhere else np.asarray(self.conditional) > 0
-            strategy = np.where(chosen, "conditional", strategy)
-        return {**options, "anti_windup": strategy, "dtype": np.dtype(self.dtype)}
+        if not is_traced(self.tracking_time) and not is_traced(self.conditional):
+            strategy = np.full((1, self.num_joints), "none", dtype=object)
+            if self.tracking_time is not None:
+                strategy = np.where(np.isfinite(self.tracking_time), "back_calculation", strategy)
+            if self.conditional is not None:
+                everywhere = isinstance(self.conditional, Everywhere)
+                strategy = np.where(everywhere or np.asarray(self.conditional) > 0, "conditional", strategy)
+            options["anti_windup"] = strategy
+        return {**options, "dtype": np.dtype(self.dtype)}
 
     def replace(self, **options: Any) -> PIDParams:
         """Return params with some options of :func:`make_params` changed, checked as there."""
@@ -117,38 +122,40 @@ class PIDParams(NamedTuple):
             if f"{end}_limit" in options:
                 known.pop(f"{end}_min", None)
                 known.pop(f"{end}_max", None)
-        if "anti_windup" in options:
+        if any(is_traced(value) for value in options.values()):
+            del known["dtype"]
+        if "anti_windup" in options or "anti_windup" not in known:
             known.pop("tracking_time", None)
-        return make_params(self.num_joints, **{**known, **options})
+        params = make_params(self.num_joints, **{**known, **options})
+        if "anti_windup" not in options and "anti_windup" not in known:  # traced: the leaves are kept
+            kept = {"tracking_time": self.tracking_time, "conditional": self.conditional}
+            cast = {name: leaf.astype(params.dtype) if _is_array(leaf) else leaf for name, leaf in kept.items()}
+            params = params._replace(**cast)
+            params.check(params.num_envs)
+        return params
 
     def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
         """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
-        expected = f"(1, {self.num_joints}) or ({num_envs}, {self.num_joints})"
+        shapes = (1, self.num_joints), (num_envs, self.num_joints)
         for name, leaf in zip(self._fields, self, strict=True):
             if not _is_array(leaf):
                 continue
-            array = np.asarray(leaf)
-            if array.shape not in ((1, self.num_joints), (num_envs, self.num_joints)):
+            if leaf.shape not in shapes:
                 raise InvalidArgumentError(
                     f"params.{name}",
-                    f"has shape {array.shape}, not {expected}",
+                    f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
                     remedy="slice or rebuild the params",
                 )
-            if array.dtype != self.dtype:
+            if leaf.dtype != self.dtype:
                 raise InvalidArgumentError(
-                    f"params.{name}", f"is {array.dtype}, but kp is {self.dtype}", remedy="use one dtype"
+                    f"params.{name}", f"is {leaf.dtype}, but kp is {self.dtype}", remedy="use one dtype"
                 )
-            bad = np.isnan(array) if name in _SIGNED else ~(array >= 0)
-            if bad.any():
-                env, joint = (int(n) for n in np.argwhere(bad)[0])
-                raise InvalidArgumentError(
-                    f"params.{name}",
-                    "is NaN" if name in _SIGNED else "is negative or NaN",
-                    joint=joint if joint_names is None else joint_names[joint],
-                    env=env if array.shape[0] > 1 else None,
-                    value=float(array[env, joint]),
-                    remedy="correct that entry",
-                )
+            if not is_traced(leaf):
+                array = np.asarray(leaf)
+                if name in _SIGNED:
+                    entries(f"params.{name}", array, ~np.isnan(array), "is NaN", joint_names)
+                else:
+                    entries(f"params.{name}", array, array >= 0, "is negative or NaN", joint_names)
 
 
 def make_params(
@@ -178,13 +185,16 @@ def make_params(
     measurement_rate: str = "difference",
     gain_units: str = "effort",
     joint_names: Sequence[str] | None = None,
-    dtype: Any = np.float64,
+    dtype: Any = None,
 ) -> PIDParams:
     """Build validated :class:`PIDParams`; a number may be a scalar, (joints,) or (envs, joints).
 
     ``None`` is off. A value that changes nothing anywhere (an infinite limit, a filter time of 0, a deadband of 0,
     weights b = 1 and c = 0) is off too. A gain of 0 stays: it can be tuned, and an integral of gain 0 can carry
     the bias of :func:`batchpid.track`.
+
+    Numbers may be traced by jax.jit, jax.grad or jax.vmap. Their shapes are checked, their values are not, and an
+    option that is traced is on.
 
     Parameters
     ----------
@@ -203,7 +213,7 @@ def make_params(
     setpoint_weight, setpoint_weight_derivative
         b and c: the proportional term acts on b*setpoint - measurement, the derivative on c*setpoint - measurement.
     deadband
-        Half width of the zone around zero error in which P and I see no error; outside, its distance to the zone.
+        Half width of the dead zone: within it P and I act on an error of 0, outside on the distance to the zone.
     anti_windup
         "none", "clamp" (limit the integral, to the effort limits unless integral limits are given), "conditional"
         (do not integrate further into saturation) or "back_calculation"; or a nested list of these of shape
@@ -231,73 +241,43 @@ def make_params(
     joint_names
         Used in error messages.
     dtype
-        float32 or float64.
+        float32 or float64; None: float64, or that of the traced arrays.
 
     Raises
     ------
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    build = LeafBuilder(joints, joint_names, dtype)
+    build = LeafBuilder(joints, joint_names, dtype, locals().values())
     if kp is None:
         raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
-    inf = math.inf
-    p, i, d = (build.array(n, v, 0.0) for n, v in (("kp", kp), ("ki", ki), ("kd", kd)))
-    lowest, highest = build.limits("effort", effort_limit, effort_min, effort_max)
-    integral_lowest, integral_highest = build.limits("integral", integral_limit, integral_min, integral_max)
+    p, i, d = (build.array(name, gain, 0.0) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
+    integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
     clamp, conditional, back = build.strategies(anti_windup)
-    if clamp is not None and integral_lowest is None and integral_highest is None:
-        if lowest is None and highest is None:
-            raise InvalidArgumentError(
-                "anti_windup",
-                "'clamp' has no limit to clamp the integral to",
-                remedy="give integral_limit or effort_limit",
-            )
-        integral_lowest = None if lowest is None else np.where(clamp, lowest, -inf)
-        integral_highest = None if highest is None else np.where(clamp, highest, inf)
-    tracking = None
-    if back is not None:
-        tracking = build.array("tracking_time", tracking_time, 0.0, inf)
-        tracking = _rule_of_thumb(p, i, d) if tracking is None else tracking
-        tracking = np.where(back, tracking, inf)
-        tracking = None if np.isinf(tracking).all() else tracking
-    elif tracking_time is not None:
-        raise InvalidArgumentError(
-            "tracking_time",
-            "is given, but no joint has anti_windup 'back_calculation'",
-            remedy="choose that strategy or leave tracking_time out",
-        )
-    wraps = build.mask("continuous", continuous)
-    markers = {
-        name: build.choice(name, chosen)
-        for name, chosen in (
-            ("integration", integration),
-            ("first_derivative", first_derivative),
-            ("weight_origin", weight_origin),
-            ("non_finite", non_finite),
-            ("measurement_rate", measurement_rate),
-            ("gain_units", gain_units),
-        )
-    }
-    if conditional is not None:
-        conditional = Everywhere() if conditional.all() else build.freeze(conditional)
+    integral_ends = build.clamped(clamp, integral_ends, effort_ends)
     return PIDParams(
         kp=build.freeze(p),
         ki=build.freeze(i),
         kd=build.freeze(d),
-        effort_min=build.freeze(lowest),
-        effort_max=build.freeze(highest),
-        effort_rate_limit=build.option("effort_rate_limit", effort_rate_limit, neutral=inf, above=True),
-        integral_min=build.freeze(integral_lowest),
-        integral_max=build.freeze(integral_highest),
+        effort_min=build.freeze(effort_ends[0]),
+        effort_max=build.freeze(effort_ends[1]),
+        effort_rate_limit=build.option("effort_rate_limit", effort_rate_limit, neutral=math.inf, above=True),
+        integral_min=build.freeze(integral_ends[0]),
+        integral_max=build.freeze(integral_ends[1]),
         derivative_filter_time=build.option("derivative_filter_time", derivative_filter_time, neutral=0.0),
         setpoint_weight=build.option("setpoint_weight", setpoint_weight, neutral=1.0),
         setpoint_weight_derivative=build.option("setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0),
         deadband=build.option("deadband", deadband, neutral=0.0),
-        tracking_time=build.freeze(tracking),
-        conditional=conditional,
-        continuous=build.freeze(wraps),
-        **markers,
+        tracking_time=build.tracking_time(tracking_time, back, p, i, d),
+        conditional=Everywhere() if conditional is not None and conditional.all() else build.freeze(conditional),
+        continuous=build.mask("continuous", continuous),
+        integration=build.choice("integration", integration),
+        first_derivative=build.choice("first_derivative", first_derivative),
+        weight_origin=build.choice("weight_origin", weight_origin),
+        non_finite=build.choice("non_finite", non_finite),
+        measurement_rate=build.choice("measurement_rate", measurement_rate),
+        gain_units=build.choice("gain_units", gain_units),
     )
 
 
@@ -305,15 +285,5 @@ _SIGNED = ("effort_min", "effort_max", "integral_min", "integral_max")
 
 
 def _is_array(leaf: Any) -> bool:
-    """Whether this entry of a params tuple is a leaf (neither off nor a marker)."""
+    """Return whether an entry of the params is an array, neither off nor a choice."""
     return leaf is not None and not isinstance(leaf, tuple)
-
-
-def _rule_of_thumb(kp: Any, ki: Any, kd: Any) -> Any:
-    """Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf (no correction) where nothing is integrated."""
-    if ki is None:
-        return np.full_like(kp, math.inf)
-    kd = np.zeros_like(kp) if kd is None else kd
-    kp, ki, kd = np.broadcast_arrays(kp, ki, kd)
-    safe = np.where(ki > 0, ki, 1.0)
-    return np.where(ki > 0, np.where(kd > 0, np.sqrt(kd / safe), kp / safe), math.inf)

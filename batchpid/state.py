@@ -1,12 +1,14 @@
-"""What the law remembers from step to step, and what it tells about one."""
+"""State of the law between steps, and the terms of one step."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.display import array_summary
+
 
 class PIDState(NamedTuple):
-    """What the law remembers, each (envs, joints); None where no option needs it."""
+    """State of the law, arrays (envs, joints); None where no option needs it."""
 
     integral: Any = None
     """I, in effort units."""
@@ -23,13 +25,16 @@ class PIDState(NamedTuple):
     origin: Any = None
     """o: where setpoint weighting measures positions from [rad or m]."""
 
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
     def for_envs(self, envs: slice | Any) -> PIDState:
         """Return the state of some envs (a slice or an index array)."""
         return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
 
 
 class Terms(NamedTuple):
-    """What the law did in one step, each (envs, joints); 0 for a term that is off."""
+    """Terms of the law in one step, each (envs, joints); 0 for a term that is off."""
 
     p: Any
     """Proportional term [N m or N]."""
@@ -47,3 +52,6 @@ class Terms(NamedTuple):
     """Bool: a limit (of the effort or its rate) changed the effort."""
     finite: Any
     """Bool: every input of this env and joint was finite."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")

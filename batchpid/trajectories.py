@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.display import array_summary
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
 Float64 = NDArray[np.float64]
@@ -39,6 +40,9 @@ class Trajectory(NamedTuple):
     position: Float64
     velocity: Float64
     acceleration: Float64
+
+    def __repr__(self) -> str:
+        return array_summary(self, "ticks", *["envs"] * (self.position.ndim - 2), "joints")
 
     @property
     def ticks(self) -> int:

@@ -106,10 +106,13 @@ def is_traced(value: Any) -> bool:
     return jax is not None and isinstance(value, jax.core.Tracer)
 
 
-def read_array(argument: str, value: ArrayLike, kinds: str = "iuf") -> NDArray[Any]:
-    """Return ``value`` as an array, of any shape, of a dtype whose kind is one of ``kinds``."""
+def read_array(argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: bool = False) -> NDArray[Any]:
+    """Return ``value`` as an array, of any shape, of a dtype whose kind is one of ``kinds``.
+
+    With ``traced`` an array that JAX traces is returned as it came.
+    """
     try:
-        result = np.asarray(value)
+        result: Any = value if traced and is_traced(value) else np.asarray(value)
         if result.dtype.kind not in kinds:
             raise TypeError(f"its dtype is {result.dtype}")
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:

@@ -127,6 +127,83 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.parametrize("build", ["make_params", "replace"])
+@pytest.mark.parametrize(
+    "strategy",
+    [{"anti_windup": "clamp"}, {"anti_windup": "back_calculation"}, {"anti_windup": "conditional", "ki": 0.0}],
+    ids=str,
+)
+def test_gains_may_be_traced_while_the_params_are_built(build, strategy, inputs, x64):
+    """The gradient through make_params and replace is that through the leaves, eager, compiled and vectorised."""
+    options = {"ki": 5.0, "kd": [0.0, 2.0, 1.0], "effort_limit": 9.0, "derivative_filter_time": 0.01} | strategy
+    r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
+    base = bp.make_params(JOINTS, 40.0, **options)
+
+    def built(kp):
+        return bp.make_params(JOINTS, kp, **options) if build == "make_params" else base.replace(kp=kp)
+
+    def cost(kp):
+        params = built(kp)
+        assert params.dtype == np.float64
+        return jnp.mean(rollout(params, r, y) ** 2)
+
+    def cost_of_leaf(kp):
+        return jnp.mean(rollout(base._replace(kp=kp[None]), r, y) ** 2)
+
+    kp = jnp.array([40.0, 20.0, 0.5])
+    if build == "make_params":  # the rule for the tracking time depends on kp where kd is 0; replace keeps the time
+        base = base if strategy["anti_windup"] != "back_calculation" else bp.make_params(JOINTS, kp, **options)
+    slope = jax.grad(cost)(kp)
+    assert (slope != 0).all()
+    np.testing.assert_allclose(jax.jit(jax.grad(cost))(kp), slope, rtol=1e-9)
+    np.testing.assert_allclose(jax.vmap(jax.grad(cost))(jnp.stack([kp, kp]))[1], slope, rtol=1e-9)
+    assert jax.vmap(built)(jnp.stack([kp, 2 * kp])).kp.tolist() == [[kp.tolist()], [(2 * kp).tolist()]]
+    if strategy["anti_windup"] != "back_calculation" or build == "replace":
+        np.testing.assert_allclose(slope, jax.grad(cost_of_leaf)(kp), rtol=1e-9)
+    else:
+        step = 1e-5 * jnp.array([0.3, -0.7, 0.2])
+        np.testing.assert_allclose(slope @ step, (cost(kp + step) - cost(kp - step)) / 2, rtol=1e-5)
+
+
+def test_params_whose_leaves_are_all_traced_can_be_changed(options, dtype):
+    """The arguments of a compiled function: replace gives what it gives outside."""
+    params = bp.make_params(JOINTS, **options, dtype=dtype)
+    expected = params.replace(kp=2.0, effort_limit=3.0)
+    changed = jax.jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(params, jnp.asarray(2.0, dtype))
+    assert [type(leaf) for leaf in changed if isinstance(leaf, tuple)] == [
+        type(leaf) for leaf in expected if isinstance(leaf, tuple)
+    ]
+    for name, leaf in changed._asdict().items():
+        if isinstance(getattr(expected, name), np.ndarray):
+            assert leaf.dtype == dtype
+            np.testing.assert_array_equal(leaf, getattr(expected, name), err_msg=name)
+
+
+def test_traced_gains_have_their_shapes_checked_and_give_the_params_their_dtype():
+    def gains(kp, **options):
+        return jax.eval_shape(lambda kp: bp.make_params(2, kp, **options), kp)
+
+    assert gains(jnp.ones(2), ki=1.0).dtype == np.float32
+    assert gains(jnp.ones(2, int)).dtype == np.float32
+    assert gains(jnp.ones((5, 1)), deadband=0.1).kp.shape == (5, 2)
+    with pytest.raises(bp.InvalidArgumentError, match=r"kp: has shape \(3,\), not"):
+        gains(jnp.ones(3))
+    with pytest.raises(bp.InvalidArgumentError, match=r"kd: has shape \(4, 2\), not \(5, 2\)"):
+        gains(jnp.ones((5, 2)), kd=np.ones((4, 2)))
+    with pytest.raises(bp.InvalidArgumentError, match="kp: cannot be read as an array of numbers: its dtype is bool"):
+        gains(jnp.ones(2, bool))
+
+
+def test_an_option_that_is_traced_is_on():
+    def build(value):
+        params = bp.make_params(2, 1.0, deadband=value, effort_limit=value, derivative_filter_time=value, kd=1.0)
+        return [leaf is None for leaf in params]
+
+    traced = []
+    jax.jit(lambda value: traced.append(build(value)))(0.0)
+    assert traced == [build(0.5)]
+
+
 def test_numpy_params_may_meet_traced_arrays_anywhere(inputs, x64):
     """Each of params, state and inputs may be NumPy while another is traced."""
     params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="back_calculation")

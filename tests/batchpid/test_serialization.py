@@ -100,7 +100,7 @@ BAD = {
     ),
     "integration": (
         '{"format": "batchpid-params-1", "integration": [], "joints": {"elbow": {"kp": 1.0}}}',
-        "integration.*choose from",
+        "integration.*use one of 'output_first'",
     ),
     "dtype": (
         '{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}',

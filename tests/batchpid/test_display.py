@@ -1,0 +1,65 @@
+"""Representations in a notebook: one to three lines, with what is on and the ranges of the values."""
+
+import jax
+import numpy as np
+import pytest
+from law_cases import DT, ENVS, JOINTS, OPTIONS
+
+import batchpid as bp
+from batchpid.metrics import step_metrics
+from batchpid.trajectories import minimum_jerk
+
+
+def test_params_show_what_is_on():
+    params = bp.make_params(7, [40, 50, 60, 70, 80, 87, 87], 5, 2, effort_limit=87, anti_windup="conditional")
+    assert repr(params) == "PIDParams(7 joints, kp 40 to 87, ki 5, kd 2, effort within ±87, anti-windup conditional)"
+    limited = bp.make_params(
+        2, [[1.0], [2.0]], effort_max=3, integral_min=-1, integral_max=[1, 2], continuous=[True, False]
+    )
+    assert repr(limited) == (
+        "PIDParams(2 joints, 2 envs, kp 1 to 2, effort <= 3, integral from -1 up to 1 to 2, continuous 1 of 2)"
+    )
+    assert "gain units mass_matrix" in repr(bp.make_params(2, 1.0, gain_units="mass_matrix"))
+
+
+def test_every_option_fits_on_three_lines(options):
+    params = bp.make_params(JOINTS, **options)
+    pid = bp.BatchPID(params, ENVS, DT, terms=True)
+    pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
+    for shown in (params, pid.state, pid.terms, pid):
+        assert len(repr(shown).splitlines()) <= 3
+        assert "array" not in repr(shown)
+
+
+def test_a_controller_shows_its_size_and_whether_it_started():
+    pid = bp.BatchPID(bp.make_params(JOINTS, **OPTIONS["pid"]), ENVS, 1 / 2000, terms=True)
+    assert repr(pid) == "BatchPID(4 envs, 3 joints, dt 0.0005 s, backend 'numpy', not started)"
+    pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
+    assert repr(pid).endswith("started)")
+    assert "not" not in repr(pid)
+    assert repr(pid.state) == "PIDState(4 envs, 3 joints, integral 0 to 0.025, measurement 0)"
+    assert "saturated 0 of 12" in repr(pid.terms)
+
+
+def test_figures_and_trajectories_show_their_ranges():
+    move = minimum_jerk([0.0, 1.0], [1.0, 3.0], 0.01, duration=1.0)
+    assert repr(move).startswith("Trajectory(100 ticks, 2 joints, time 0.01 to 1, position")
+    metrics = step_metrics(move.time, [1.0, 3.0], move.position[:, None], start=[0.0, 1.0])
+    assert repr(metrics).startswith("StepMetrics(1 env, 2 joints, rise_time")
+    assert "effort_peak nan" in repr(metrics)
+
+
+@pytest.mark.filterwarnings("error")
+def test_trees_of_other_leaves_have_a_representation():
+    params = bp.make_params(2, 1.0, effort_limit=2.0, continuous=True)
+    for tree in (
+        jax.tree.map(lambda leaf: object(), params),
+        jax.tree.map(lambda leaf: 0, params),
+        jax.eval_shape(lambda: params),
+        bp.PIDParams(np.full((1, 2), np.nan)),
+        bp.PIDState(),
+    ):
+        assert type(tree).__name__ in repr(tree)
+    seen = []
+    jax.jit(lambda params: seen.append(repr(params)))(params)
+    assert seen == ["PIDParams(2 joints, kp traced, effort from traced up to traced, continuous traced)"]
