@@ -16,8 +16,7 @@ from batchpid.errors import RobotError
 from sim.engine.contact_prediction import Link
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, HeadlessScene
-from sim.robot.description import Joint
-from sim.robot.dissipation import DISSIPATION
+from sim.robot.description import DISSIPATION, Joint
 
 GRAVITY = (0.0, 0.0, -9.81)
 

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,7 @@ from sim.observation import RunInfo
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+LIMIT_TOLERANCE = 1e-6  # rad or m
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""
 
@@ -113,6 +114,20 @@ def register_dynamics(make: Callable[[RobotDescription, bool], Dynamics]) -> Non
     _make_dynamics[:] = [make]
 
 
+class Dissipation(NamedTuple):
+    """PhysX's dimensionless friction coefficient of every joint, None for the URDF's; damping of every link [1/s]."""
+
+    joint_friction: float | None
+    link_damping: float
+
+
+DISSIPATION = {
+    "urdf": Dissipation(joint_friction=None, link_damping=0.0),
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),  # SAPIEN 3's defaults, which ignore the URDF
+}
+"""Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """Tutorial's poses and gains of a bundled robot, in joint order.
@@ -134,30 +149,41 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RobotDescription:
-    """Robot as its URDF describes it; every array is in the order of ``joint_names``.
+class Urdf:
+    """URDF prepared for headless simulation.
 
-    ``urdf`` and ``srdf`` are the XML that the simulator parses. ``joints`` are the degrees of freedom in SAPIEN's
-    order; ``all_joints`` includes the fixed ones. ``settings`` is None unless the robot is bundled.
+    ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
+    fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
+    that were not found.
     """
 
     name: str
-    path: Path
     urdf: str
-    srdf: str | None
-    joints: tuple[Joint, ...]
     all_joints: tuple[Joint, ...]
     links: tuple[Link, ...]
     missing_meshes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RobotDescription(Urdf):
+    """Robot as its URDF describes it; every array is in the order of ``joint_names``.
+
+    ``joints`` are the degrees of freedom, those of ``all_joints`` that move. ``settings`` is None unless the robot is
+    bundled.
+    """
+
+    path: Path
+    srdf: str | None
+    joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
     settings: Settings | None
 
     def __repr__(self) -> str:
         mass = sum(link.mass or 0.0 for link in self.links)
+        joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass:.4g} kg, path={str(self.path)!r},"
-        joints = textwrap.shorten(f"joints: {', '.join(self.joint_names)}", 200, placeholder=" ...")
-        return "\n".join([head, *textwrap.wrap(joints + ")", 100, initial_indent="  ", subsequent_indent="    ")])
+        return f"{head}\n  joints={joints})"
 
     @property
     def dof(self) -> int:
@@ -264,8 +290,8 @@ class RobotDescription:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN."""
         return _make_dynamics[0](self, ground)
 
-    def limit_violations(self, qpos: ArrayLike, tolerance: float = 1e-6) -> list[tuple[int, int, float]]:
+    def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
         """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""
         rows = np.atleast_2d(np.asarray(qpos, np.float64))
-        outside = (rows < self.lower - tolerance) | (rows > self.upper + tolerance)
+        outside = (rows < self.lower - LIMIT_TOLERANCE) | (rows > self.upper + LIMIT_TOLERANCE)
         return [(int(env), int(joint), float(rows[env, joint])) for env, joint in np.argwhere(outside)]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice
 from sim.robot.description import RobotDescription
 from sim.robot.rotations import about, from_rpy, multiply, rotate
 
@@ -46,32 +46,17 @@ class Kinematics:
         links = [link.name for link in robot.links if link.name not in children]
         self._steps: list[_Step] = []
         for joint in robot.all_joints:  # parents first
-            axis = np.array(joint.axis)
-            self._steps.append(
-                _Step(
-                    parent=links.index(joint.parent_link),
-                    xyz=np.array(joint.origin),
-                    wxyz=from_rpy(joint.rpy),
-                    axis=axis / max(float(np.linalg.norm(axis)), 1e-12),
-                    dof=dofs.get(joint.name),
-                    slides=joint.type == "prismatic",
-                )
-            )
+            axis = np.array(joint.axis) / max(float(np.linalg.norm(joint.axis)), 1e-12)
+            frame = np.array(joint.origin), from_rpy(joint.rpy), axis
+            parent = links.index(joint.parent_link)
+            self._steps.append(_Step(parent, *frame, dofs.get(joint.name), joint.type == "prismatic"))
             links.append(joint.child_link)
         self.links = tuple(links)
         self.dof = robot.dof
 
     def index(self, link: str) -> int:
-        """Return the index of a link in the poses.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The robot has no link of that name.
-        """
-        if link not in self.links:
-            raise InvalidArgumentError("link", "is unknown", value=link, remedy=f"use one of {', '.join(self.links)}")
-        return self.links.index(link)
+        """Return the index of a link in the poses."""
+        return self.links.index(choice("link", link, self.links))
 
     @property
     def tool(self) -> int:

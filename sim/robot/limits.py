@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robot.description import RobotDescription
-
-_TOLERANCE = 1e-6  # rad or m
+from sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
 
 class SetpointWarning(UserWarning):
@@ -22,7 +20,7 @@ class SetpointCheck:
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
-        self._low, self._high = robot.lower - _TOLERANCE, robot.upper + _TOLERANCE
+        self._low, self._high = robot.lower - LIMIT_TOLERANCE, robot.upper + LIMIT_TOLERANCE
         self._warned: set[tuple[str, int]] = set()
 
     def check(self, argument: str, positions: NDArray[Any], stacklevel: int = 3) -> None:

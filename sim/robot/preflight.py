@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import array, choice, instance, number, within
-from sim.robot.description import Joint, RobotDescription
-from sim.robot.dissipation import DISSIPATION
+from sim.robot.description import DISSIPATION, Joint, RobotDescription
 from sim.robot.stability import stability_report
 from sim.robot.urdf import mimic_works
 
@@ -55,12 +54,11 @@ class Finding:
 
 def check(
     robot: RobotDescription,
-    *,
-    params: bp.PIDParams | None = None,
-    qpos: ArrayLike | None = None,
-    setpoint: ArrayLike | None = None,
-    timestep: float = 1 / 2000,
-    control: str = "pid",
+    params: bp.PIDParams | None,
+    qpos: ArrayLike | None,
+    setpoint: ArrayLike | None,
+    timestep: float,
+    control: str,
 ) -> list[Finding]:
     """Return the findings, most severe first; :meth:`sim.Robot.check` describes the arguments."""
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")

@@ -16,8 +16,7 @@ import assets
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
-from sim.robot.description import Joint, RobotDescription, Settings
-from sim.robot.dissipation import DISSIPATION
+from sim.robot.description import DISSIPATION, Joint, RobotDescription, Settings
 from sim.robot.preflight import Finding, check
 from sim.robot.urdf import read_urdf
 from sim.robot.xml import parse_xml
@@ -73,21 +72,17 @@ class Robot(RobotDescription):
             )
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
         path = _find(name_or_path)
-        urdf = read_urdf(path, package_dirs=folders, missing_meshes=missing_meshes)
-        joints = tuple(joint for joint in urdf.joints if joint.moves)
+        urdf = read_urdf(path, folders, missing_meshes)
+        joints = tuple(joint for joint in urdf.all_joints if joint.moves)
         if not joints:
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         srdf = path.with_suffix(".srdf")
         bundled = path.parent == _ASSETS
         return cls(
-            name=urdf.name,
+            **vars(urdf),
             path=path,
-            urdf=urdf.text,
             srdf=etree.tostring(parse_xml(srdf), encoding="unicode") if srdf.is_file() else None,
             joints=joints,
-            all_joints=urdf.joints,
-            links=urdf.links,
-            missing_meshes=urdf.missing_meshes,
             dissipation=dissipation,
             fixed_base=fixed_base,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
@@ -131,7 +126,7 @@ class Robot(RobotDescription):
         """
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
-        return check(self, params=params, qpos=qpos, setpoint=setpoint, timestep=timestep, control=control)
+        return check(self, params, qpos, setpoint, timestep, control)
 
     def designed(self, gain_units: str = "mass_matrix") -> bp.PIDParams:
         """Return params designed from the robot's inertia alone; a search for gains starts from them.

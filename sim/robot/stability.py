@@ -59,11 +59,5 @@ def stability_report(robot: RobotDescription, params: bp.PIDParams, qpos: Float6
     inertia = 1 / np.diagonal(np.linalg.inv(matrix[0] + 0.5 * dt * np.diag(damping)))
     kp, kd, tau = (np.broadcast_to(leaf, (params.num_envs, robot.dof))[worst] for leaf in (kp, kd, tau))
     kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
-    return StabilityReport(
-        inertia=inertia,
-        kd_dt=kd_dt,
-        kp_dt2=kp_dt2,
-        joint_ratio=0.5 * (kd_dt + 0.5 * kp_dt2),
-        robot_ratio=float(bound.ratio[worst]),
-        participation=bound.participation[worst],
-    )
+    joint_ratio = 0.5 * (kd_dt + 0.5 * kp_dt2)
+    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, float(bound.ratio[worst]), bound.participation[worst])

@@ -8,8 +8,8 @@ mimic joint that SAPIEN would silently mis-simulate.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from lxml import etree
 
 from batchpid.errors import RobotError
-from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic
+from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic, Urdf
 from sim.robot.xml import number, numbers, parse_xml
 
 _SIZES = {  # of the shapes that SAPIEN knows: their attributes, each with as many numbers as it has
@@ -28,23 +28,7 @@ _SIZES = {  # of the shapes that SAPIEN knows: their attributes, each with as ma
 }
 
 
-@dataclass(frozen=True)
-class Urdf:
-    """URDF prepared for the headless simulator.
-
-    ``joints`` are in SAPIEN's order: breadth first from the root, fixed joints counted, joints of one parent in the
-    order of the file. ``text`` is what the simulator parses; ``missing_meshes`` names the collision meshes that were
-    not found.
-    """
-
-    name: str
-    text: str
-    joints: tuple[Joint, ...]
-    links: tuple[Link, ...]
-    missing_meshes: tuple[str, ...] = ()
-
-
-def read_urdf(path: Path, *, package_dirs: tuple[Path, ...] = (), missing_meshes: str = "error") -> Urdf:
+def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -> Urdf:
     """Read and sanitise the URDF file at ``path``.
 
     Parameters
@@ -104,7 +88,7 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     folders = [*package_dirs, *own] if name.startswith("package://") else [own[0], *package_dirs]
     for folder in folders:
         candidate = (folder / relative).absolute()
-        if relative and candidate.is_file():
+        if relative and os.path.isfile(candidate):
             return candidate
     return None
 
@@ -225,13 +209,7 @@ def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]
 
 
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
-    """Return the joints level by level from the root, siblings in file order.
-
-    Raises
-    ------
-    RobotError
-        They do not form one tree.
-    """
+    """Return the joints level by level from the root, siblings in file order, if they form one tree."""
     for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
