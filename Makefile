@@ -56,7 +56,7 @@ bench: $(VENV)/.dev
 	@$(RUN) -m pytest bench --timeout 1200 $(ARGS)
 
 MEASURED := out/bench
-bench_case = $(RUN) -m batchpid bench --robot $(1) --physics $(2) --json $(MEASURED)/$(1)-$(2).json $(3)
+bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json $(3)
 
 figures: $(VENV)/.dev
 	$(call bench_case,panda,accurate,--peers)

@@ -3,11 +3,11 @@
     python examples/drive_robot.py --use-external-pid
     python examples/drive_robot.py --use-internal-drive --compensate none
     python examples/drive_robot.py --use-external-pid --compensate none --seconds 6
-    python examples/drive_robot.py                                          # nothing holds it: it falls
+    python examples/drive_robot.py panda                                    # undriven: it falls
 
 SAPIEN's tutorial "Drive Robot with PID Controller" has the same two switches. Without compensation a drive keeps a
-steady-state error, because only an error makes it push back against gravity; the integral of a PID removes it.
-The tutorial's own gains (--gains tutorial) ring, because the robot is as frictionless as its URDF says.
+steady-state error, because its effort against gravity is proportional to the error; the integral of a PID removes it.
+The tutorial's own gains (--gains tutorial) oscillate, because the robot is as frictionless as its URDF says.
 """
 
 from dataclasses import dataclass
@@ -21,27 +21,28 @@ from sim import Robot, Runner
 
 @dataclass(frozen=True)
 class Options:
-    """Which robot, and what drives it."""
+    """Options of the run."""
 
-    robot: Literal["jaco2", "panda"] = "jaco2"
+    robot: tyro.conf.Positional[Literal["jaco2", "panda"]] = "jaco2"
+    """Bundled robot."""
     use_internal_drive: bool = False
     """PhysX's PD drive, stiffness 20 and damping 5."""
     use_external_pid: bool = False
-    """One PID a joint, computed at every sim step."""
+    """Batch PID, computed at every sim step."""
     gains: Literal["tuned", "tutorial"] = "tuned"
-    """Of the PID: those that batchpid tune found, or the tutorial's."""
+    """Gains of the PID: those that batchpid tune found, or the tutorial's."""
     compensate: Literal["gravity+coriolis", "gravity", "none"] | None = None
-    """Passive force added to the joints; default gravity+coriolis where something drives them, else none."""
+    """Passive force added to the joints. Default: gravity+coriolis where they are driven, else none."""
     num_envs: int = 8
-    """How many robots, each from a pose a little different."""
+    """Number of robots, each from a slightly different pose."""
     seconds: float = 3.0
-    """Simulated time."""
+    """Simulated time [s]."""
 
 
 def main(options: Options) -> None:
-    """Run the robots, then print where each joint of the first one ended."""
+    """Run the robots, then print the final position of each joint of the first one."""
     if options.use_internal_drive and options.use_external_pid:
-        raise SystemExit("the internal drive and the PID would fight: choose one of the two switches")
+        raise SystemExit("the internal drive and the PID would add up: choose one of the two switches")
     driven = options.use_internal_drive or options.use_external_pid
     control = "drive" if options.use_internal_drive else "pid" if options.use_external_pid else "effort"
     compensate = options.compensate or ("gravity+coriolis" if driven else "none")
@@ -49,11 +50,13 @@ def main(options: Options) -> None:
     robot = Robot.load(options.robot)
     target = robot.settings.target
     command = target if driven else np.zeros(robot.dof)  # under "effort" it is the joint effort itself
-    gains = robot.tuned() if control == "pid" and options.gains == "tuned" else None
+    params = None  # the drive's stiffness and damping are the robot's
+    if control == "pid":
+        params = robot.tuned() if options.gains == "tuned" else robot.params()
     start = robot.start + np.random.default_rng(0).uniform(-0.1, 0.1, (options.num_envs, robot.dof))
     start = np.clip(start, robot.lower, robot.upper)
 
-    with Runner(robot, options.num_envs, control=control, compensate=compensate, params=gains) as runner:
+    with Runner(robot, options.num_envs, control=control, compensate=compensate, params=params) as runner:
         runner.reset(start)
         ticks = round(options.seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(command, (ticks, robot.dof)))

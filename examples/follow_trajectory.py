@@ -2,8 +2,8 @@
 
     python examples/follow_trajectory.py
 
-Each robot of the batch follows another profile over the same way in the same time. The PID is told the setpoint's rate,
-so it damps the error of velocity and not the velocity: what is left is how hard the profile is to follow.
+Each robot of the batch follows another profile over the same path. The PID gets the setpoint's rate, so that it damps
+the velocity error and not the velocity: the errors that remain show how hard a profile is to follow.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ KD = [50, 50, 50, 50, 30, 25, 15, 10, 10]  # N m s/rad, N s/m
 
 
 def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
-    """The same move in four ways; the first two as fast as the limits allow, or nearly so."""
+    """Return the same move as four profiles, held at the end for 1 s or longer."""
     limits = {"max_velocity": velocity, "max_acceleration": acceleration}
     moves = {"trapezoidal": trapezoidal(start, target, DT, **limits)}
     try:
@@ -34,7 +34,7 @@ def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
 
 
 def main():
-    """Run one robot per profile, then compare."""
+    """Run one robot per profile and print the errors of each."""
     robot = Robot.load("panda")
     velocity = 0.5 * robot.velocity_limit
     moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)

@@ -1,9 +1,8 @@
-"""Hello, world: in each of N scenes a ground, a robot, and a box that falls from 0.5 m above it.
+"""Hello, world: N scenes with a ground, a robot, and a box that falls from 0.5 m above the ground.
 
     python examples/hello_world.py
 
-``build(scene, env)`` is SAPIEN code as its tutorial has it. Without a screen its visuals and lights are left out;
-``batchpid demo --viewer`` shows a scene where there is one.
+``build(scene, env)`` is SAPIEN code as in its tutorial. The scenes are headless: visuals and lights are ignored.
 """
 
 import numpy as np
@@ -14,7 +13,7 @@ HALF = 0.5  # half the box's edge [m]
 
 
 def build(scene, env):
-    """Add a red box, each env's a little higher, and some light."""
+    """Add lights and a red box, 0.1 m higher than in the env before."""
     import sapien
 
     builder = scene.create_actor_builder()
@@ -24,11 +23,11 @@ def build(scene, env):
     box.set_pose(sapien.Pose(p=[1.5, 0, HALF + 0.5 + 0.1 * env]))
     scene.set_ambient_light([0.5, 0.5, 0.5])
     scene.add_directional_light([0, 1, -1], [0.5, 0.5, 0.5])
-    return box  # what is returned can be watched
+    return box  # Runner.poses() returns the poses of what is returned here
 
 
 def main(num_envs=4):
-    """Let the boxes fall while the robots hold still."""
+    """Let the boxes fall while the robots hold their start pose."""
     robot = Robot.load("panda")
     with Runner(robot, num_envs, build=build) as runner:
         print("time [s]   height of each box's lower side [m]")

@@ -1,10 +1,8 @@
-"""List the joints of a robot: the fixed ones too, then the active ones in the order of every array.
+"""List all joints of a robot, then the moving ones in the order of every array.
 
-python examples/list_joints.py --robot jaco2
-python examples/list_joints.py --robot path/to/any.urdf
+python examples/list_joints.py jaco2
+python examples/list_joints.py path/to/any.urdf
 """
-
-from typing import Annotated
 
 import numpy as np
 import tyro
@@ -12,8 +10,13 @@ import tyro
 from sim import Robot, Runner
 
 
-def main(robot: str = "panda", stiffness: Annotated[float, tyro.conf.arg(help="of the internal drive")] = 0.0) -> None:
-    """Print what SAPIEN's tutorial prints of every joint."""
+def main(robot: tyro.conf.Positional[str] = "panda", stiffness: float = 0.0) -> None:
+    """Print the properties of every joint that SAPIEN's tutorial prints.
+
+    Args:
+        robot: Bundled robot (panda or jaco2), or path of a URDF.
+        stiffness: Stiffness of the internal drive [N m/rad or N/m].
+    """
     loaded = Robot.load(robot)
     for joint in loaded.all_joints:
         drive = stiffness if joint.moves else 0.0

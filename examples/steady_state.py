@@ -1,9 +1,9 @@
-"""What error stays: PhysX's drive and the PID, each with and without compensation of gravity and Coriolis forces.
+"""Steady-state errors of PhysX's drive and of the PID, with and without compensation of gravity and Coriolis forces.
 
-    python examples/steady_state.py --out steady-state.png
+    python examples/steady_state.py --picture steady-state.png
 
-A drive pushes back only where there is an error, so against gravity it keeps one; compensation takes the load off it,
-as far as the model is right. The integral of a PID finds the load by itself.
+A drive's effort is proportional to its error, so it keeps an error against gravity; compensation removes the load as
+far as the model is right. The integral of a PID removes the error without a model.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ VARIANTS = (
     ("pid", "none", "PID, no compensation", "#15803d", True),
     ("pid", "gravity+coriolis", "PID, compensated", "#15803d", False),
 )
-FLOOR = 1e-6  # [rad]: below it the last bits of float32 positions speak
+FLOOR = 1e-6  # [rad]: resolution of float32 positions
 
 
 def final_errors(robot: Robot, control: str, compensate: str, seconds: float) -> np.ndarray:
@@ -34,14 +34,14 @@ def final_errors(robot: Robot, control: str, compensate: str, seconds: float) ->
 
 
 def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:
-    """One row a joint, one mark a variant: how far from the target it stays, in powers of ten."""
+    """Return a figure with one row per joint and one mark per variant, on a logarithmic scale."""
     figure = Figure(figsize=(7.5, 0.34 * len(names) + 1.5), layout="constrained")
     axes = figure.add_subplot()
     rows = np.arange(len(names))
     axes.axvspan(FLOOR / 10, FLOOR, color="#f1f3f6", lw=0)
     axes.text(FLOOR * 0.63, -0.8, "0 ± 1e-6", ha="center", va="center", fontsize=7, color="#6b7280")
-    beside = np.linspace(-0.24, 0.24, len(VARIANTS))  # so that no mark hides another
-    for (*_, label, colour, filled), error, shift in zip(VARIANTS, errors.values(), beside, strict=True):
+    shifts = np.linspace(-0.24, 0.24, len(VARIANTS))  # so that no mark hides another
+    for (*_, label, colour, filled), error, shift in zip(VARIANTS, errors.values(), shifts, strict=True):
         face = colour if filled else "white"
         at_least = np.maximum(error, FLOOR * 0.63)
         axes.plot(at_least, rows + shift, "o", ms=5, mec=colour, mfc=face, mew=1.2, label=label)
@@ -60,8 +60,16 @@ def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:
     return figure
 
 
-def main(robot: str = "panda", seconds: float = 12.0, out: Path = Path("out/steady-state.png")) -> None:
-    """Run the four, print the errors, and draw them."""
+def main(
+    robot: tyro.conf.Positional[str] = "panda", seconds: float = 12.0, picture: Path = Path("out/steady-state.png")
+) -> None:
+    """Run the four variants, print their final errors and draw them.
+
+    Args:
+        robot: Bundled robot: panda or jaco2.
+        seconds: Simulated time of each variant [s].
+        picture: Picture to draw: .png or .svg.
+    """
     loaded = Robot.load(robot)
     arm = [joint for joint, name in enumerate(loaded.joint_names) if "finger" not in name]
     names = [f"joint {joint + 1}" for joint in arm]
@@ -70,8 +78,8 @@ def main(robot: str = "panda", seconds: float = 12.0, out: Path = Path("out/stea
     for control, compensate, label, *_ in VARIANTS:
         errors[label] = final_errors(loaded, control, compensate, seconds)[arm]
         print(f"{label:32}", *(f"{error:9.1e}" for error in errors[label]))
-    title = f"What error stays: {loaded.name}, {seconds:g} s after a step to the tutorial's target"
-    print("picture:", plots.save(draw(errors, names, title), out))
+    title = f"Steady-state error: {loaded.name}, {seconds:g} s after a step to the tutorial's target"
+    print("picture:", plots.save(draw(errors, names, title), picture))
 
 
 if __name__ == "__main__":

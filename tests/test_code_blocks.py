@@ -1,8 +1,8 @@
-"""Every code block of README and docs runs.
+"""Every code block of README and docs runs, and every command in their text exists.
 
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
-which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf`` and ``gains.yaml``; what would take
-minutes or wait for a person is cut short or only parsed.
+which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf`` and ``gains.yaml``; commands that
+would take minutes or wait for a person are cut short or only parsed, and so are commands within the text.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SHORTER = {
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
-    "view": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1", "--port", "8765"],
+    "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
 ONLY_PARSED = ("bench", "tune", "render")
 
@@ -80,6 +80,15 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
         exec(compile("\n" * line + match["code"], page, "exec"), namespace)
 
 
+@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]), ids=name)
+def test_commands_in_the_text_have_flags_that_exist(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    arguments = [shlex.split(found) for found in re.findall(r"`batchpid (\w+ [^`]+)`", text)]
+    arguments += [["demo", *shlex.split(found)] for found in re.findall(r"`make demo ARGS=[\"'](.*)[\"']`", text)]
+    for words in arguments:
+        parse(words)
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=name)
 def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -114,10 +123,10 @@ def run(words: list[str]) -> None:
 def command(name: str, *flags: str) -> None:
     assert name in COMMANDS
     if name in ONLY_PARSED or "--viewer" in flags:
-        parse(name, flags)
+        parse([name, *flags])
         return
     if name == "view" and importlib.util.find_spec("viser") is None:
         return
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what a robot has to warn of is not the page's fault
+        warnings.simplefilter("ignore")  # findings of the preflight
         assert main([name, *flags, *SHORTER.get(name, [])]) in (0, None)

@@ -1,4 +1,4 @@
-"""What a user installs and reads: every package is shipped, every link leads somewhere, every command is told of."""
+"""The distribution and its pages: every package is shipped, every link has a target, every make target exists."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 from setuptools import find_packages
-
-from sim.cli import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -62,8 +60,3 @@ def test_make_targets_of_the_readme_exist():
         named = set(re.findall(r"\bmake ([a-z]+)\b", page.read_text()))
         assert named
         assert named <= targets
-
-
-def test_every_command_has_a_summary_that_fits_a_line():
-    for name, (_, summary) in COMMANDS.items():
-        assert 10 < len(summary) < 90, name

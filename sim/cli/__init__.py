@@ -1,13 +1,11 @@
-"""The command line: a table of commands, each a frozen dataclass whose flags tyro builds.
+"""The command line: each command is a frozen dataclass whose fields are its flags.
 
-A command is loaded only when it is named, and does its heavy imports inside ``run``, so that ``--help`` answers at
-once. To add one, write a module with a frozen dataclass that has ``run(self) -> int | None``, and add a line below.
+To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. Heavy imports belong inside
+``run``, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
 
-import difflib
-import importlib
 import importlib.metadata
 import os
 import signal
@@ -16,86 +14,83 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-COMMANDS = {
-    # name: (module:class, summary)
-    "demo": ("sim.cli.demo:Demo", "64 arms close on the tutorial's setpoint: a table and a picture"),
-    "rollout": (
-        "sim.cli.rollout:Rollout",
-        "N of any robot follow a setpoint; what happened goes to a file",
-    ),
-    "bench": ("sim.cli.bench:Bench", "the closed loop beside the tutorial's loop and the bare engine"),
-    "tune": ("sim.cli.tune:Tune", "gains that settle, for any robot, found on the real scenes"),
-    "compare": ("sim.cli.compare:Compare", "sets of gains on the same moves: a table and a picture"),
-    "inspect": ("sim.cli.inspect:Inspect", "the joints of a robot, and what is odd about it"),
-    "plot": ("sim.cli.plot:Plot", "a picture of a recording, or of two side by side"),
-    "view": ("sim.cli.view:View", "robots in the browser, live: sliders, charts, pushes and payloads"),
-    "render": ("sim.cli.render:Render", "a film of a recorded run, by SAPIEN's renderer where it works"),
-}
+import tyro
+
+from batchpid.errors import BatchPIDError
+from sim.cli.bench import BenchCommand
+from sim.cli.compare import CompareCommand
+from sim.cli.demo import DemoCommand
+from sim.cli.inspect import InspectCommand
+from sim.cli.plot import PlotCommand
+from sim.cli.render import RenderCommand
+from sim.cli.rollout import RolloutCommand
+from sim.cli.tune import TuneCommand
+from sim.cli.view import ViewCommand
 
 
 class Command(Protocol):
-    """What a command is: its fields are the flags, and ``run`` returns the exit status (None: 0)."""
+    """A command line, parsed."""
 
     def run(self) -> int | None:
-        """Do it."""
+        """Run the command and return its exit status (None: 0)."""
+
+
+COMMANDS: dict[str, type[Command]] = {
+    "demo": DemoCommand,
+    "rollout": RolloutCommand,
+    "bench": BenchCommand,
+    "tune": TuneCommand,
+    "compare": CompareCommand,
+    "inspect": InspectCommand,
+    "plot": PlotCommand,
+    "view": ViewCommand,
+    "render": RenderCommand,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 2 for bad input, 130 after Ctrl-C, 141 for a closed pipe."""
+    """Run one command and return its exit status.
+
+    0: success. 2: bad input. 130: Ctrl-C. 141: the reader of stdout closed it, as in ``| head``.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    name = arguments[0] if arguments else "--help"
-    if name in ("-h", "--help", "help"):
-        print(_overview())
-        return 0 if arguments else 2
-    if name == "--version":
-        print(_version())
-        return 0
-    if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"choose one of {', '.join(COMMANDS)}"
-        return _complain(f"no command {name!r}; {hint}")
-    return _run(name, arguments[1:])
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    from batchpid.errors import BatchPIDError
-
-    with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
-        try:
-            command = parse(name, arguments)
-            status = command.run()
+    try:
+        if arguments == ["--version"]:
+            print(_version())
+            return 0
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            status = parse(arguments).run()
             sys.stdout.flush()
-        except BatchPIDError as error:
-            return _complain(str(error))
-        except KeyboardInterrupt:
-            return _complain("interrupted", 128 + signal.SIGINT)
-        except BrokenPipeError:
-            # The reader left (``| head``). Python flushes stdout once more at exit: let that go nowhere.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 128 + signal.SIGPIPE
-        except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            return _complain(f"{where}{error.strerror or error}")
+    except BatchPIDError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        return _fail("interrupted", 128 + signal.SIGINT)
+    except BrokenPipeError:
+        # Python flushes stdout once more at exit, which must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}")
     return status or 0
 
 
-def load(name: str) -> Any:
-    """Return the dataclass of a command."""
-    module, _, attribute = COMMANDS[name][0].partition(":")
-    return getattr(importlib.import_module(module), attribute)
-
-
-def parse(name: str, arguments: Sequence[str]) -> Command:
-    """Return the command with its flags; for flags it does not know, or --help, print what helps and exit."""
-    import tyro
-
-    plain = (
+def parse(arguments: Sequence[str]) -> Command:
+    """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
+    app = tyro.extras.SubcommandApp()
+    named = bool(arguments) and arguments[0] in COMMANDS
+    for name, command in COMMANDS.items():
+        # The overview shows the first line of each docstring, the help of a command all of its own.
+        summary = None if named else (command.__doc__ or "").partition("\n")[0]
+        app.command(name=name, help=summary)(command)
+    options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
-        tyro.conf.FlagCreatePairsOff,  # --viewer, and no --no-viewer beside it
+        tyro.conf.FlagCreatePairsOff,  # --viewer without --no-viewer
         tyro.conf.PositionalMetavarFromFieldName,
     )
-    parsed: Command = tyro.cli(load(name), prog=f"batchpid {name}", args=list(arguments), config=plain)
+    about = "Joint-level PID control for many robots at once, in SAPIEN."
+    parsed: Command = app.cli(prog="batchpid", description=about, args=arguments, config=options)
     return parsed
 
 
@@ -106,21 +101,7 @@ def _version() -> str:
         return "not installed: running from its source tree"
 
 
-def _overview() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: batchpid COMMAND [flags]     (batchpid COMMAND --help lists the flags)",
-            "",
-            "Joint-level PID control for many robots at once, in SAPIEN.",
-            "",
-            *lines,
-        ]
-    )
-
-
-def _complain(message: str, status: int = 2) -> int:
+def _fail(message: str, status: int = 2) -> int:
     print(f"batchpid: {message}", file=sys.stderr)
     return status
 

@@ -1,12 +1,12 @@
-"""``batchpid bench``: the runner beside the tutorial's loop and the bare engine, in one run."""
+"""``batchpid bench``: the speed of the runner, paired with the tutorial's loop and the bare engine."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from sim.cli.optional import OptionalPath
+from sim.cli import flags
 
 if TYPE_CHECKING:
     from sim.benchmark.benchmark import Result
@@ -14,34 +14,35 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """Measure the closed loop beside the tutorial's loop and the bare engine, and where its time goes.
+class BenchCommand:
+    """Measure the speed of the closed loop and its phases, of the tutorial's loop and of the bare engine.
 
-    All cases move the same robots the same way, in turn, several rounds; rates are medians, ratios are medians of the
-    rounds' ratios. Ends with an error if the robots of a case did not move as they should.
+    All cases move the same robots the same way, in turn, in several rounds; rates are medians, ratios are medians of
+    the rounds' ratios. An error is raised if the robots of a case do not move as they should.
     """
 
-    robot: str = "panda"
-    """A bundled robot: panda or jaco2."""
-    num_envs: int = 64
-    """How many robots."""
-    workers: int = 2
-    """Processes that step them."""
-    physics: Literal["accurate", "fast"] = "accurate"
-    """Solver settings, the same in every case."""
+    robot: flags.RobotName = "panda"
+    num_envs: flags.NumEnvs = 64
+    physics: flags.Physics = "accurate"
     substeps: int = 20
-    """Sim steps of one tick of the closed loop."""
+    """Sim steps of a tick of the closed loop."""
     ticks: int = 100
     """Ticks of one measurement."""
     rounds: int = 5
-    """How often each case is measured."""
-    peers: bool = False
-    """Also measure MuJoCo's rollout and Gymnasium's AsyncVectorEnv around the tutorial's loop, where installed."""
-    json: OptionalPath = None
-    """File for the figures, with the machine and the versions."""
+    """Measurements of each case."""
+    peers: flags.Switch = False
+    """Measure MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop, too, where installed."""
+    workers: flags.Workers = None
+    missing_meshes: flags.MissingMeshes = "error"
+    out: flags.OptionalPath = None
+    """Figures to write, with the machine and the versions: .json."""
 
     def run(self) -> None:
-        """Run it."""
+        """Run the command."""
+        import json
+        import os
+
+        from batchpid.files import write_atomically
         from batchpid.validate import integer
         from sim import Robot
         from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
@@ -50,20 +51,22 @@ class Bench:
         from sim.cli import report
         from sim.cli.progress import bar
 
+        out = flags.output_path("out", self.out, (".json",))
+        workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         workload = Workload(
-            Robot.load(self.robot),
+            Robot.load(self.robot, missing_meshes=self.missing_meshes),
             num_envs=integer("num_envs", self.num_envs, 1, 1_000_000),
-            workers=integer("workers", self.workers, 0, 1024),
+            workers=integer("workers", workers, 0, 1024),
             physics=self.physics,
             substeps=integer("substeps", self.substeps, 1, 1_000_000),
             ticks=integer("ticks", self.ticks, 1, 1_000_000),
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
         peers = installed_peers() if self.peers else ()
-        what = CASES | {name: PEERS[name].description for name in peers}
-        advance = iter(bar("bench")(range(workload.rounds * len(what))))
+        descriptions = CASES | {name: PEERS[name].description for name in peers}
+        advance = iter(bar("bench")(range(workload.rounds * len(descriptions))))
         results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers)
-        next(advance, None)  # the bar closes
+        next(advance, None)  # close the bar
         spent = measure_phases(workload)
 
         print(
@@ -71,42 +74,31 @@ class Bench:
             f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds\n"
         )
         rows = [
-            [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", what[case]]
+            [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", descriptions[case]]
             for case, result in results.items()
         ]
-        print(report.table(rows, ["case", "thousand steps/s", "closed loop / case", "what it is"], "lrrl"))
+        print(report.table(rows, ["case", "thousand env-steps/s", "closed loop / case", "description"], "lrrl"))
         print("\nclosed loop, microseconds per env step in a worker:")
         print(report.table([[f"{value:.2f}" for value in spent.values()]], list(spent), "r" * len(spent)))
         absent = sorted({peer.package for name, peer in PEERS.items() if self.peers and name not in peers})
         if absent:
             print(f"\nnot installed: {', '.join(absent)} (pip install 'batchpid[peers]')")
-        if self.json is not None:
-            self.json.parent.mkdir(parents=True, exist_ok=True)
-            self.json.write_text(_as_json(workload, results, spent))
-            print(f"\nfigures: {self.json}")
+        if out is not None:
+            write_atomically(out, json.dumps(figures(workload, results, spent), indent=2) + "\n")
+            print(f"\nwritten: {out}")
 
 
 def ratio(results: dict[str, Result], case: str) -> float:
-    """Closed loop over ``case``: the median of the paired rounds' ratios."""
-    import statistics
+    """Return the rate of the closed loop over that of ``case``: the median of the rounds' ratios."""
+    import numpy as np
 
-    pairs = zip(results["closed loop"].rates, results[case].rates, strict=True)
-    return statistics.median(ours / theirs for ours, theirs in pairs)
+    return float(np.median(np.divide(results["closed loop"].rates, results[case].rates)))
 
 
-def _as_json(workload: Workload, results: dict[str, Result], spent: dict[str, float]) -> str:
-    import json
-
-    figures = {
-        "setup": {
-            "robot": workload.robot.name,
-            "num_envs": workload.num_envs,
-            "workers": workload.workers,
-            "physics": workload.physics,
-            "substeps": workload.substeps,
-            "ticks": workload.ticks,
-            "rounds": workload.rounds,
-        },
+def figures(workload: Workload, results: dict[str, Result], spent: dict[str, float]) -> dict[str, Any]:
+    """Return all that was measured, and on which machine, for JSON."""
+    return {
+        "setup": vars(workload) | {"robot": workload.robot.name},
         "machine": machine(),
         "cases": {
             case: {
@@ -119,23 +111,21 @@ def _as_json(workload: Workload, results: dict[str, Result], spent: dict[str, fl
         },
         "microseconds_per_env_step": spent,
     }
-    return json.dumps(figures, indent=2) + "\n"
 
 
 def machine() -> dict[str, Any]:
-    """Hardware and versions that a figure depends on."""
+    """Return the hardware and the versions that figures depend on."""
     import os
     import platform
+    import re
     from contextlib import suppress
 
     from batchpid.versions import package_versions
 
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-                break
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        processor = found[1] if found else processor
     return {
         "processor": processor,
         "cores": len(os.sched_getaffinity(0)),

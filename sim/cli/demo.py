@@ -1,95 +1,86 @@
-"""``batchpid demo``: the main job, end to end, with something to look at."""
+"""``batchpid demo``: many robots move to the tutorial's setpoint; a table and a picture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+
+from sim.cli import flags
 
 SUBSTEPS = 10
 """Sim steps between two samples of the picture."""
 SPREAD = 0.3
-"""How far from the tutorial's pose the others may start [rad]."""
+"""Largest distance of a start pose from the tutorial's [rad or m]."""
 
 
 @dataclass(frozen=True)
-class Demo:
-    """Robots close on the tutorial's setpoint, each in a headless scene, all under one batch PID.
+class DemoCommand:
+    """Move 64 arms to the tutorial's setpoint; print a table of the joints and draw a picture.
 
-    PID and passive force are computed at every one of the 2000 sim steps of a second. Env 0 starts where SAPIEN's
-    tutorial does, the others at seeded poses around it. Ends with the speed, a table of the joints, and a picture.
+    PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where SAPIEN's tutorial
+    does, the others at seeded poses around it.
     """
 
-    robot: str = "panda"
-    """A bundled robot: panda or jaco2."""
-    num_envs: int = 64
-    """How many robots."""
-    workers: int = 2
-    """Processes that step them; 0: this one."""
-    seconds: float = 2.0
-    """Simulated time [s]."""
-    gains: Literal["tuned", "tutorial"] = "tuned"
-    """Which gains: those that batchpid tune found, or SAPIEN's tutorial's, as they are."""
+    robot: flags.RobotName = "panda"
+    num_envs: flags.NumEnvs = 64
+    gains: flags.Gains = None
+    seconds: flags.Seconds = 2.0
     seed: int = 0
-    """Of the start poses."""
-    out: Path = Path("out/demo.png")
-    """The picture: .png or .svg."""
-    viewer: bool = False
-    """Play it in SAPIEN's window at the end, up to 16 robots. Needs a display and a Vulkan device."""
+    """Seed of the start poses."""
+    workers: flags.Workers = None
+    missing_meshes: flags.MissingMeshes = "error"
+    picture: Path = Path("out/demo.png")
+    """Step responses to draw: .png or .svg."""
+    viewer: flags.Switch = False
+    """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
 
     def run(self) -> None:
-        """Run it."""
+        """Run the command."""
         from batchpid.errors import InvalidArgumentError
+        from batchpid.validate import number
         from sim import Robot, Runner, plots
         from sim.cli import report
-        from sim.cli.follow import duration, follow, start_poses
-        from sim.tuning.evaluation import step_response_metrics
+        from sim.cli.run import hold_setpoint, start_poses
+        from sim.plots.figures import FORMATS
+        from sim.tuning.gain_sets import gain_set
 
-        out = plots.check_path(self.out)
+        picture = flags.output_path("picture", self.picture, FORMATS)
         if self.viewer:
             from sim.view.film import check_renderer, show_window
 
             check_renderer()
-        robot = Robot.load(self.robot)
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         settings = robot.settings
         if settings is None:
             raise InvalidArgumentError(
                 "robot",
-                "carries no tutorial settings to demonstrate",
+                "has no tutorial settings to demonstrate",
                 value=self.robot,
-                remedy=f"use one of {', '.join(Robot.bundled())}, or batchpid rollout --robot {self.robot}",
+                remedy=f"use one of {', '.join(Robot.bundled())}, or run: batchpid rollout {self.robot}",
             )
-        seconds = duration(self.seconds)
+        seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, SPREAD, self.seed)
-        params = robot.tuned() if self.gains == "tuned" else robot.params()
-        whose = "tuned gains" if self.gains == "tuned" else "the tutorial's gains"
+        gains = gain_set(robot, self.gains)
+        timestep = 1 / settings.rate_hz
         with Runner(
             robot,
             self.num_envs,
+            params=gains.params,
+            control=gains.control,
             workers=self.workers,
-            timestep=1 / settings.rate_hz,
+            timestep=timestep,
             substeps=SUBSTEPS,
-            params=params,
         ) as runner:
-            print(
-                f"{robot.name}: {self.num_envs} robots of {robot.dof} joints, {len(runner.pids) or 1} processes, "
-                f"PID and passive force at {settings.rate_hz:g} Hz, {whose}",
-                flush=True,
+            title = (
+                f"{robot.name}: {self.num_envs} robots, {runner.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
             )
-            run = follow(runner, settings.target, start, seconds, "simulating")
-        metrics = step_response_metrics(robot, run.rollout, run.start)
-        print(report.speed(self.num_envs, run.steps, 1 / settings.rate_hz, run.wall) + "\n")
-        print(report.joint_table(robot, metrics) + "\n")
-        for verdict in report.verdicts(robot, run.rollout, metrics):
-            print(verdict)
+            print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes", flush=True)
+            rollout, wall = hold_setpoint(runner, start, settings.target, seconds)
+        print(report.run_report(runner, rollout, start, wall))
         for note in settings.notes:
             print(f"Note: {note}")
-        figure = plots.step_responses(
-            plots.Traces.of(run.rollout, robot),
-            mark=0,
-            title=f"{self.num_envs} {robot.name}s under one batch PID at {settings.rate_hz:g} Hz: "
-            f"{whose}, env 0 from the tutorial's pose",
-        )
-        print(f"\npicture: {plots.save(figure, out)}")
+        traces = plots.Traces.of(rollout, robot)
+        figure = plots.step_responses(traces, mark=0, title=f"{title}; env 0 from the tutorial's pose")
+        print(f"\npicture: {plots.save(figure, picture)}")
         if self.viewer:
-            show_window(run.rollout.for_envs(slice(0, 16)))
+            show_window(rollout.for_envs(slice(0, 16)))

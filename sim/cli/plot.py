@@ -1,50 +1,52 @@
-"""``batchpid plot``: draw a recording."""
+"""``batchpid plot``: a picture of a recording, or of two."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
-from sim.cli.optional import Names, OptionalPath
+from sim.cli import flags
 
 
 @dataclass(frozen=True)
-class Plot:
-    """Draw a recording: step responses, or efforts against limits; or compare it with another one.
+class PlotCommand:
+    """Draw a recorded run, or compare it with another one.
 
-    It may be complete, cut short by a kill (``NAME.h5.partial``), or still being written.
+    The recording may be complete, cut short by a kill (``NAME.h5.partial``), or still being written.
     """
 
-    recording: Annotated[Path, tyro.conf.Positional]
-    """What ``rollout --out`` or a ``sim.Recorder`` wrote: .h5 or .npz."""
-    versus: OptionalPath = None
+    recording: tyro.conf.Positional[Path]
+    """File that `batchpid rollout --out` or a sim.Recorder wrote: .npz or .h5."""
+    versus: flags.OptionalPath = None
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
-    """What to draw of one recording."""
-    joints: Names = ()
-    """Names of joints. Default: all."""
+    """Step responses, or efforts against their limits, of one recording."""
+    joints: flags.Names = ()
+    """Names of joints to draw. Default: all."""
     every: int = 1
-    """Take only every n-th tick, for long recordings."""
-    out: OptionalPath = None
-    """Picture to write: .png or .svg. Default: beside the recording."""
+    """Draw only every n-th tick, for long recordings."""
+    picture: flags.OptionalPath = None
+    """Picture to draw: .png or .svg. Default: a .png named as the recording."""
 
     def run(self) -> None:
-        """Run it."""
+        """Run the command."""
         from batchpid.validate import integer
         from sim import plots
+        from sim.plots.figures import FORMATS
 
         every = integer("every", self.every, 1, 10**9)
-        out = plots.check_path(self.out or self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png"))
+        picture = flags.output_path("picture", self.picture, FORMATS)
         traces = _read(self.recording, every)
         if self.versus is not None:
             figure = plots.comparison(traces, _read(self.versus, every), joints=self.joints or None)
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
             figure = draw(traces, joints=self.joints or None)
-        print(f"picture: {plots.save(figure, out)}")
+        named_alike = self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png")
+        print(f"picture: {plots.save(figure, picture or named_alike)}")
 
 
 def _read(path: Path, every: int) -> Any:

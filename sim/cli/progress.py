@@ -1,4 +1,4 @@
-"""The bar of commands that take longer than a second."""
+"""Progress bars of commands that may take longer than a second."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 DELAY = 1.0
-"""Seconds before a bar shows: shorter runs need none."""
+"""Time before a bar is shown [s]."""
 
 
 def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
-    """Return a wrapper for an iterable that shows a bar on stderr once the loop has taken a second.
-
-    ``options`` go to :class:`tqdm.tqdm`.
-    """
+    """Return a function that wraps an iterable with a bar on stderr; ``options`` go to :class:`tqdm.tqdm`."""
     from tqdm import tqdm
 
-    # A log keeps every state of the bar: a few will do there.
-    pace = 0.1 if sys.stderr.isatty() else 5.0
+    # A log file keeps every state of the bar, so it gets few.
+    interval = 0.1 if sys.stderr.isatty() else 5.0
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
-        return tqdm(items, desc=label, delay=DELAY, mininterval=pace, leave=False, dynamic_ncols=True, **options)
+        return tqdm(items, desc=label, delay=DELAY, mininterval=interval, leave=False, dynamic_ncols=True, **options)
 
     return wrap

@@ -7,49 +7,45 @@ from pathlib import Path
 
 import tyro
 
-from sim.cli.optional import OptionalStr
+from sim.cli import flags
 
 
 @dataclass(frozen=True)
-class Render:
-    """A film of a recorded run, in real time, all envs side by side.
+class RenderCommand:
+    """Film a recorded run in real time, all envs side by side.
 
-    Needs a Vulkan device, a software one included; without one it says what to install. ``batchpid view --play`` shows
-    the same anywhere.
+    Needs a Vulkan device, which may be a software one. ``batchpid view --play`` shows the same in a browser without.
     """
 
-    run_file: tyro.conf.Positional[Path]
-    """What batchpid rollout --out wrote."""
-    out: Path = Path("out/film.mp4")
-    """The film: .mp4 or .gif."""
-    robot: OptionalStr = None
-    """A bundled robot or the path of a URDF. Default: the recorded one."""
-    envs: int = 16
-    """Show so many envs, the first ones."""
-    fps: float = 30.0
-    """Frames a second."""
+    recording: tyro.conf.Positional[Path]
+    """File that `batchpid rollout --out` or a sim.Recorder wrote: .npz or .h5."""
+    robot: flags.RecordedRobot = None
+    num_envs: int = 16
+    """Number of envs to show, the first ones; 64 at most."""
+    fps: flags.Fps = 30.0
     width: int = 960
-    """Pixels."""
+    """Width of the film [pixels]."""
     height: int = 540
-    """Pixels."""
+    """Height of the film [pixels]."""
+    missing_meshes: flags.MissingMeshes = "error"
+    out: Path = Path("out/film.mp4")
+    """Film to write: .mp4 or .gif."""
 
     def run(self) -> None:
-        """Run it."""
-        from tqdm import tqdm
-
+        """Run the command."""
         from batchpid.validate import integer
         from sim import Robot
+        from sim.cli.progress import bar
         from sim.recording.dataset import read_rollout
-        from sim.view.film import write_film
+        from sim.view.film import FORMATS, write_film
+        from sim.view.layout import MAX_ROBOTS
 
-        recorded = read_rollout(self.run_file)
-        robot = Robot.load(self.robot or recorded.robot)
-        rollout = recorded.rollout.for_envs(slice(0, integer("envs", self.envs, 1, 64)))
-
-        def progress(rows: object) -> object:
-            return tqdm(rows, desc="filming", unit="frame", leave=False)
-
+        out = flags.output_path("out", self.out, FORMATS)
+        recorded = read_rollout(self.recording)
+        robot = Robot.load(self.robot or recorded.robot, missing_meshes=self.missing_meshes)
+        rollout = recorded.rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
+        progress = bar("filming", unit="frame")
         path = write_film(
-            rollout, self.out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
+            rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
         )
         print(f"film: {path}")

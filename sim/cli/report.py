@@ -1,9 +1,9 @@
-"""What a run says of itself at its end: speed, the joints one by one, and what went wrong."""
+"""Reports printed at the end of a run: its speed, a table of the joints, and what went wrong."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,41 +12,55 @@ from numpy.typing import NDArray
 from batchpid.metrics import StepMetrics
 
 if TYPE_CHECKING:
-    from sim import Robot, Rollout
+    from sim import Robot, Rollout, Runner
     from sim.tuning.evaluation import Evaluation
 
 
-def table(rows: list[list[str]], headers: list[str], align: str) -> str:
-    """``rows`` under ``headers`` as text; ``align`` has one letter a column, "l" or "r"."""
+def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
+    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or "r"."""
     from tabulate import tabulate
 
     sides = tuple("left" if side == "l" else "right" for side in align)
     return tabulate(rows, headers, disable_numparse=True, colalign=sides)
 
 
-def speed(num_envs: int, steps: int, timestep: float, wall: float) -> str:
-    """``steps`` sim steps of ``num_envs`` robots took ``wall`` seconds."""
-    factor = steps * timestep / wall
+def run_report(runner: Runner, rollout: Rollout, start: NDArray[np.float64], wall: float) -> str:
+    """Return the report of a ``rollout`` of ``runner`` from ``start`` (envs, dof) that took ``wall`` seconds."""
+    from sim.tuning.evaluation import step_response_metrics
+
+    robot = runner.robot
+    metrics = step_response_metrics(robot, rollout, start)
+    speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
+    outcome = "\n".join(outcome_lines(robot, rollout, metrics))
+    return f"{speed}\n\n{joint_table(robot, metrics)}\n\n{outcome}"
+
+
+def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:
+    """Return the speed of a run: ``simulated`` seconds of ``num_envs`` robots in ``wall`` seconds."""
+    factor = simulated / wall
     return (
-        f"{num_envs * steps / wall:,.0f} env-steps/s: {steps * timestep:g} s of {num_envs} robots in {wall:.2f} s; "
-        f"real-time factor {factor:.3g} ({num_envs * factor:.3g} robot-seconds a second)"
+        f"{num_envs * factor / timestep:,.0f} env-steps/s: {simulated:g} s of {num_envs} robots in {wall:.2f} s; "
+        f"real-time factor {factor:.3g} per robot, {num_envs * factor:.3g} in total"
     )
 
 
 def joint_table(robot: Robot, metrics: StepMetrics) -> str:
-    """Final error, overshoot, settling time and saturation of each joint: median and worst over envs."""
+    """Return a table with final error, overshoot, settling time and saturation of each joint over the envs."""
     median, worst = metrics.median(), metrics.worst()
-    envs = len(metrics.settling_time)
     settled = np.isfinite(metrics.settling_time).sum(0)
     saturation = np.nan_to_num(metrics.saturation_share).mean(0)
+
+    def both(figure: str, joint: int, *style: str) -> str:
+        return " / ".join(_cell(getattr(metrics, figure)[joint], *style) for metrics in (median, worst))
+
     rows = [
         [
             joint.name,
-            f"{_number(median.steady_state_error[j])} / {_number(worst.steady_state_error[j])} {joint.unit}",
-            f"{_percent(median.overshoot[j])} / {_percent(worst.overshoot[j])}",
-            f"{_seconds(median.settling_time[j])} / {_seconds(worst.settling_time[j])}",
-            f"{settled[j]} of {envs}",
-            _percent(saturation[j]),
+            f"{both('steady_state_error', j, '.2g')} {joint.unit}",
+            both("overshoot", j, ".0%"),
+            both("settling_time", j, ".2f", "never", " s"),
+            f"{settled[j]} of {len(metrics.settling_time)}",
+            _cell(saturation[j], ".0%"),
         ]
         for j, joint in enumerate(robot.joints)
     ]
@@ -57,91 +71,63 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
     )
 
 
-def verdicts(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
-    """What a reader must know: envs that diverged, joints that do not settle, setpoints out of reach."""
-    seconds = rollout.time[-1]
-    dead = np.flatnonzero(~rollout.ok.all(0))
-    envs = rollout.ok.shape[1]
-    if dead.size:
-        first = rollout.time[np.argmin(rollout.ok[:, dead].all(1))]
+def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
+    """Yield a line on envs that diverged, one on joints that did not settle, and those of :func:`limit_lines`."""
+    seconds, num_envs = rollout.time[-1], rollout.num_envs
+    diverged = np.flatnonzero(~rollout.ok.all(0))
+    if diverged.size:
+        first = rollout.time[np.argmin(rollout.ok[:, diverged].all(1))]
+        more = f" and {diverged.size - 8} more" if diverged.size > 8 else ""
         yield (
-            f"DIVERGED: {dead.size} of {envs} envs are no longer finite, the first after {first:.3g} s: "
-            f"{_list(dead)}. These gains are unstable on this robot."
+            f"DIVERGED: {diverged.size} of {num_envs} envs are no longer finite, the first after {first:.3g} s: "
+            f"env {', '.join(map(str, diverged[:8]))}{more}. These gains are unstable on this robot."
         )
-    alive = np.delete(metrics.settling_time, dead, axis=0)
-    never = np.isinf(alive).sum(0) if len(alive) else np.zeros(robot.dof, int)
-    unsettled = [f"{name} ({n})" for name, n in zip(robot.joint_names, never, strict=True) if n]
+    never = np.isinf(np.delete(metrics.settling_time, diverged, axis=0)).sum(0)
+    unsettled = [f"{name} ({count})" for name, count in zip(robot.joint_names, never, strict=True) if count]
     if unsettled:
-        yield (f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {', '.join(unsettled)}.")
-    if not dead.size and not unsettled:
+        yield f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {', '.join(unsettled)}."
+    if not diverged.size and not unsettled:
         yield f"Every joint of every env settled within {seconds:g} s to 2 % of its move."
-    yield from limit_notes(robot, rollout.setpoint[-1])
+    yield from limit_lines(robot, rollout.setpoint[-1])
 
 
-def limit_notes(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
-    """Which setpoints (envs, dof) no joint can reach; one line says so if there are none."""
-    worst: dict[int, float] = {}
-    for _, index, value in robot.limit_violations(setpoint):
-        joint = robot.joints[index]
-        far = max(joint.lower - value, value - joint.upper)
-        known = worst.get(index)
-        if known is None or far > max(joint.lower - known, known - joint.upper):
-            worst[index] = value
-    for index, value in sorted(worst.items()):
-        joint = robot.joints[index]
+def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
+    """Yield a line for each joint with setpoints (envs, dof) out of its limits, with the worst; one line if none."""
+    beyond = np.maximum(robot.lower - setpoint, setpoint - robot.upper)
+    violations = robot.limit_violations(setpoint)
+    for index in sorted({index for _, index, _ in violations}):
+        joint, value = robot.joints[index], setpoint[beyond[:, index].argmax(), index]
         yield (
             f"OUT OF LIMITS: setpoint {value:g} {joint.unit} of {joint.name}, whose limits are "
             f"[{joint.lower:g}, {joint.upper:g}]: that error cannot go."
         )
-    if not worst:
+    if not violations:
         yield "Setpoints out of limits: none."
 
 
-def _number(value: float) -> str:
-    return "diverged" if math.isinf(value) else "-" if math.isnan(value) else f"{value:.2g}"
-
-
-def _percent(share: float) -> str:
-    return "diverged" if math.isinf(share) else "-" if math.isnan(share) else f"{share:.0%}"
-
-
-def _seconds(value: float) -> str:
-    return "never" if math.isinf(value) else "-" if math.isnan(value) else f"{value:.2f} s"
-
-
-def _list(envs: NDArray[Any], most: int = 8) -> str:
-    shown = ", ".join(map(str, envs[:most]))
-    return f"env {shown}" + (f" and {len(envs) - most} more" if len(envs) > most else "")
-
-
-def evaluation_table(robot: Robot, evaluations: list[Evaluation]) -> str:
-    """One line per evaluation: the arm's joints over all moves, median and worst."""
+def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
+    """Return a table with one row per evaluation: median and worst over the arm's joints and all moves."""
     from sim.tuning.evaluation import arm_joints
 
     arm = arm_joints(robot)
     rows = []
     for evaluation in evaluations:
-        m = evaluation.metrics
-        settled = np.isfinite(m.settling_time[:, arm]).all(axis=1)
-        in_time = (np.where(arm, m.settling_time, 0).max(1) <= evaluation.settling_limit).sum()
-        columns = [
-            _both(m.settling_time[:, arm], "{:.2f} s"),
-            _both(m.overshoot[:, arm], "{:.1%}"),
-            _both(m.steady_state_error[:, arm], "{:.1e}"),
-            _both(evaluation.chatter[:, arm], "{:.1f}"),
-            f"{settled.sum()} / {in_time} of {len(m.settling_time)}",
-        ]
+        metrics = evaluation.metrics
+        settled = np.isfinite(metrics.settling_time[:, arm]).all(axis=1)
+        in_time = np.where(arm, metrics.settling_time, 0).max(1) <= evaluation.settling_limit
         diverged = int((~evaluation.rollout.ok.all(0)).sum())
-        rows.append([evaluation.name, *columns, str(diverged) if diverged else "-"])
-    headers = [
-        "median / worst",
-        "settling",
-        "overshoot",
-        "final error",
-        "chatter",
-        "settled / in time",
-        "diverged",
-    ]
+        rows.append(
+            [
+                evaluation.name,
+                _median_and_worst(metrics.settling_time[:, arm], ".2f", " s"),
+                _median_and_worst(metrics.overshoot[:, arm], ".1%"),
+                _median_and_worst(metrics.steady_state_error[:, arm], ".1e"),
+                _median_and_worst(evaluation.chatter[:, arm], ".1f"),
+                f"{settled.sum()} / {in_time.sum()} of {len(evaluation.moves.start)}",
+                str(diverged or "-"),
+            ]
+        )
+    headers = ["median / worst", "settling", "overshoot", "final error", "chatter", "settled / in time", "diverged"]
     return table(rows, headers, "lrrrrrr") + (
         "\nOver the arm's joints and all moves. settled / in time: moves of which every joint settled, within the run"
         "\nand within a second or 1.2 times the shortest that the effort limits allow. chatter: variation of the effort"
@@ -149,9 +135,13 @@ def evaluation_table(robot: Robot, evaluations: list[Evaluation]) -> str:
     )
 
 
-def _both(figure: Any, style: str) -> str:
-    values = figure[~np.isnan(figure)]
-    if not values.size:
+def _median_and_worst(figure: NDArray[Any], style: str, unit: str = "") -> str:
+    if np.isnan(figure).all():
         return "-"
-    pair = (np.quantile(values, 0.5, method="higher"), values.max())
-    return " / ".join("never" if np.isinf(value) else style.format(value) for value in pair)
+    return " / ".join(
+        _cell(value, style, "never", unit) for value in np.nanquantile(figure, [0.5, 1.0], method="higher")
+    )
+
+
+def _cell(value: float, style: str, infinite: str = "diverged", unit: str = "") -> str:
+    return infinite if math.isinf(value) else "-" if math.isnan(value) else f"{value:{style}}{unit}"

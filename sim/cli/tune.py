@@ -1,36 +1,33 @@
-"""``batchpid tune``: gains that settle, found on the real scenes."""
+"""``batchpid tune``: gains that settle, found by simulation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-import tyro
-
-from sim.cli.optional import OptionalFloat, OptionalInt, OptionalPath
+from sim.cli import flags
 
 
 @dataclass(frozen=True)
-class Tune:
-    """Tune the gains of any robot: from its inertia, then by CMA-ES on seeded moves, many candidates at once.
+class TuneCommand:
+    """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated moves.
 
-    Ends with a table of the gains before and after on moves that the search did not see, and writes the params.
+    Ends with a table of the gains before and after, on moves that the search did not see, and writes the params.
     """
 
-    robot: Annotated[str, tyro.conf.Positional] = "panda"
-    """A bundled robot, or the path of a URDF."""
+    robot: flags.RobotName = "panda"
     generations: int = 10
-    """How often the population is tried."""
+    """Number of populations that the search evaluates."""
     population: int = 8
-    """Candidates tried at once."""
+    """Candidates of a population, evaluated at once."""
     seed: int = 0
-    """Of the search and its moves. The result does not depend on the number of workers."""
-    seconds: float = 1.5
-    """Simulated time of each move [s]."""
+    """Seed of the search and its moves. The result does not depend on the number of workers."""
+    search_seconds: float = 1.5
+    """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
-    """What the gains are per: with the mass matrix all joints respond alike; effort gains serve any controller."""
-    per_joint: bool = False
+    """Gains per mass matrix (all joints respond alike), per joint inertia, or as efforts (for any controller)."""
+    per_joint: flags.Switch = False
     """Search for a factor of each joint too; needs more generations."""
     itae: float = 1.0
     """Weight of the time-weighted error."""
@@ -39,66 +36,55 @@ class Tune:
     overshoot: float = 1.0
     """Weight of the overshoot."""
     final: float = 2.0
-    """Weight of the error left at the end."""
+    """Weight of the final error."""
     chatter: float = 0.3
-    """Weight of the effort's variation beyond the smooth move's."""
+    """Weight of the effort's variation beyond that of the smooth move."""
     saturation: float = 3.0
     """Weight of the time in saturation."""
-    variation: bool = False
-    """Payload, friction, coarse sensors and late efforts, drawn for each move."""
-    payload: float = 2.0
-    """With variation: the largest payload [kg], less where the robot does not carry it."""
-    friction: float = 0.1
-    """With variation: the largest joint friction (PhysX's coefficient)."""
-    physics: Literal["accurate", "fast"] = "accurate"
-    """Solver settings."""
-    workers: OptionalInt = None
-    """Processes; 0: this one. Default: one for each available core."""
-    time_limit: OptionalFloat = None
-    """Stop after the generation in which this many seconds have passed."""
-    missing_meshes: Literal["error", "skip"] = "error"
-    """Go on without collision shapes whose mesh is missing."""
-    resume: bool = False
-    """Go on where a search with the same options stopped."""
-    out: OptionalPath = None
+    variation: flags.Variation = False
+    payload: flags.Payload = 2.0
+    friction: flags.Friction = 0.1
+    physics: flags.Physics = "accurate"
+    workers: flags.Workers = None
+    time_limit: flags.TimeLimit = None
+    missing_meshes: flags.MissingMeshes = "error"
+    resume: flags.Switch = False
+    """Continue a search with the same options that was stopped."""
+    out: flags.OptionalPath = None
     """Params file to write: .yaml or .json. Default: out/ROBOT.tuned.yaml."""
-    picture: OptionalPath = None
-    """Before and after on the first move: .png or .svg. Default: beside the params."""
+    picture: flags.OptionalPath = None
+    """Before and after on the first move, to draw: .png or .svg. Default: named as the params file."""
 
     def run(self) -> None:
-        """Run it."""
+        """Run the command."""
         from batchpid import save_params
-        from batchpid.errors import InvalidArgumentError
-        from sim import Robot, plots
+        from sim import Robot
+        from sim.cli.compare import draw_first_move, evaluate_sets
         from sim.cli.progress import bar
         from sim.cli.report import evaluation_table
-        from sim.tuning.evaluation import arm_joints, evaluate_gains
-        from sim.tuning.moves import random_moves, tutorial_move
-        from sim.tuning.randomization import draw_variation
+        from sim.plots.figures import FORMATS
+        from sim.tuning.evaluation import arm_joints
+        from sim.tuning.gain_sets import GainSet
         from sim.tuning.search import Weights, tune
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
-        out = Path(f"out/{robot.path.stem}.tuned.yaml") if self.out is None else self.out
-        if out.suffix not in (".yaml", ".yml", ".json"):
-            raise InvalidArgumentError("out", "unknown file format", value=str(out), remedy="end it in .yaml or .json")
-        picture = plots.check_path(out.with_suffix(".png") if self.picture is None else self.picture)
-        out.parent.mkdir(parents=True, exist_ok=True)
+        out = self.out or Path(f"out/{robot.path.stem}.tuned.yaml")
+        out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
+        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), FORMATS)
         history = out.with_suffix(".search.json")
         if not self.resume:
             history.unlink(missing_ok=True)
-        varied: dict[str, Any] | None = None
-        if self.variation:
-            varied = {"payload": self.payload, "friction": self.friction}
+        variation = {"payload": self.payload, "friction": self.friction} if self.variation else None
         found = tune(
             robot,
             seed=self.seed,
             generations=self.generations,
             population=self.population,
-            seconds=self.seconds,
+            seconds=self.search_seconds,
             gain_units=self.gain_units,
             per_joint=self.per_joint,
             weights=Weights(self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation),
-            variation=varied,
+            variation=variation,
             workers=self.workers,
             time_limit=self.time_limit,
             history=history,
@@ -106,39 +92,27 @@ class Tune:
             physics=self.physics,
         )
         print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
-        moves = tutorial_move(robot) + random_moves(robot, 20, self.seed + 1)
-        drawn = None if varied is None else draw_variation(robot, len(moves.start), self.seed + 1, **varied)
-        evaluations = [
-            evaluate_gains(
-                robot,
-                params,
-                moves,
-                name=name,
-                workers=self.workers,
-                physics=self.physics,
-                variation=drawn,
-            )
-            for name, params in bar("judging", unit="set")([("designed", found.start_params), ("tuned", found.params)])
-        ]
+        sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
+        evaluations = evaluate_sets(
+            robot, sets, moves=20, seed=self.seed, variation=variation, workers=self.workers, physics=self.physics
+        )
         print(evaluation_table(robot, evaluations))
-        arm = arm_joints(robot)
-        worst = evaluations[1].metrics.worst()
+        tuned, arm = evaluations[1], arm_joints(robot)
+        worst = tuned.metrics.worst()
         about = found.settings | {
             "cost": found.cost,
             "start_cost": found.start_cost,
             "judged": {
-                "moves": len(moves.start),
+                "moves": len(tuned.moves.start),
                 "seed": self.seed + 1,
                 "settling_time": float(worst.settling_time[arm].max()),
                 "overshoot": float(worst.overshoot[arm].max()),
                 "steady_state_error": float(worst.steady_state_error[arm].max()),
-                "chatter": float(evaluations[1].chatter[:, arm].max()),
+                "chatter": float(tuned.chatter[:, arm].max()),
             },
         }
         save_params(out, found.params, robot.joint_names, about)
         history.unlink(missing_ok=True)
-        before, after = (plots.Traces.of(t.rollout.for_envs(slice(0, 1)), robot, t.name) for t in evaluations)
-        image = plots.save(plots.comparison(before, after, title=f"{robot.name}, {moves.names[0]} move"), picture)
-        print(f"\nwritten: {out}\npicture: {image}")
-        for text in evaluations[1].shortfalls(arm)[:5]:
+        print(f"\nwritten: {out}\npicture: {draw_first_move(robot, evaluations, picture)}")
+        for text in tuned.shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {text}")

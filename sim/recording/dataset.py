@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.files import write_atomically
 from sim.observation import OBSERVED, Observation, Rollout, RunInfo
 from sim.recording.reader import read_recording
 from sim.robot.robot import Robot
@@ -43,6 +44,20 @@ class Recorded(NamedTuple):
     effort_limit: NDArray[np.float64]
     """(joints,) [N m or N]."""
     complete: bool = True
+
+
+def write_rollout(path: str | Path, rollout: Rollout) -> None:
+    """Write ``rollout`` to a .npz file, for :func:`read_rollout`.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written; an older one is left as it was.
+    """
+    arrays: dict[str, Any] = {**rollout.arrays(), "tick": rollout.tick}
+    for name in ("robot", "joint_names", "units", "lower", "upper", "effort_limit", "start"):
+        arrays[name] = getattr(rollout.info, name)
+    write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
 def read_rollout(path: str | Path, *, every: int = 1) -> Recorded:

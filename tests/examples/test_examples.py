@@ -1,4 +1,4 @@
-"""Every example runs as its docstring says, and shows what it claims to show."""
+"""Every example runs with the flags of its docstring, and its results support its claims."""
 
 import re
 import runpy
@@ -32,7 +32,7 @@ def test_every_example_is_tested():
 
 @pytest.mark.parametrize("robot", ["jaco2", "panda"])
 def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot):
-    drive = ("drive_robot.py", "--robot", robot, "--num-envs", "1", "--seconds", "4", "--use-internal-drive")
+    drive = ("drive_robot.py", robot, "--num-envs", "1", "--seconds", "4", "--use-internal-drive")
     kept = errors(run(*drive, "--compensate", "none"))
     removed = errors(run(*drive))
     joint = {"jaco2": "j2s7s300_joint_4", "panda": "panda_joint2"}[robot]
@@ -40,45 +40,45 @@ def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, ro
     assert removed[joint] < 0.02
 
 
-def test_undriven_it_falls_and_the_pid_brings_it_there(run):
-    panda = ("drive_robot.py", "--robot", "panda", "--num-envs", "2")
+def test_an_undriven_robot_falls_and_the_pid_reaches_the_target(run):
+    panda = ("drive_robot.py", "panda", "--num-envs", "2")
     rows = [row.split() for row in run(*panda, "--seconds", "1").splitlines()[2:]]
     assert max(abs(float(end) - float(start)) for _, start, _, end, *_ in rows) > 0.5
     held = errors(run(*panda, "--seconds", "1.5", "--use-external-pid"))
     assert max(held.values()) < 2e-3
 
 
-def test_both_switches_are_an_error(run):
+def test_drive_and_pid_together_are_an_error(run):
     with pytest.raises(SystemExit, match="choose one"):
         run("drive_robot.py", "--use-internal-drive", "--use-external-pid")
 
 
-def test_hello_world_drops_the_boxes(run):
+def test_the_boxes_of_hello_world_fall_to_the_ground(run):
     rows = [line.split() for line in run("hello_world.py").splitlines() if re.match(r" +\d\.\d\d ", line)]
     first, last = ([float(z) for z in row[1:]] for row in (rows[0], rows[-1]))
     assert first == pytest.approx([0.5, 0.6, 0.7, 0.8])
     assert last == pytest.approx([0, 0, 0, 0], abs=5e-3)
 
 
-def test_list_joints_tells_of_every_joint(run):
-    text = run("list_joints.py", "--robot", "jaco2")
+def test_list_joints_lists_every_joint(run):
+    text = run("list_joints.py", "jaco2")
     assert text.count("name: ") == 13
     assert "child link: j2s7s300_link_1  parent link: j2s7s300_link_base" in text
     assert "qpos: [0.   3.14 0." in text
 
 
-def test_a_profile_is_easier_to_follow_than_a_step(run):
+def test_a_profile_is_followed_with_less_error_than_a_step(run):
     text = run("follow_trajectory.py")
     worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " rad " in row}
     assert set(worst) >= {"trapezoidal", "minimum jerk", "step"}
     assert worst["minimum jerk"] < worst["trapezoidal"] < 0.1 < worst["step"]
 
 
-def test_the_integral_removes_what_an_uncompensated_drive_keeps(run, tmp_path):
-    out = tmp_path / "errors.png"
-    text = run("steady_state.py", "--seconds", "3", "--out", str(out))
+def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path):
+    picture = tmp_path / "errors.png"
+    text = run("steady_state.py", "--seconds", "3", "--picture", str(picture))
     errors = {row[:32].strip(): [float(e) for e in row[32:].split()] for row in text.splitlines() if "compensat" in row}
     assert max(errors["drive (20, 5), no compensation"]) > 0.3
     assert max(errors["PID, no compensation"]) < 2e-3
     assert max(errors["PID, compensated"]) < 1e-3
-    assert out.stat().st_size > 10_000
+    assert picture.stat().st_size > 10_000

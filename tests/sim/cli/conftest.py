@@ -9,12 +9,12 @@ from sim.cli import main
 
 @pytest.fixture
 def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """The command in this process: arguments in, (exit status, stdout, stderr) out."""
+    """Function that runs a command line in this process and returns (exit status, stdout, stderr)."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         try:
             status = main([str(argument) for argument in arguments])
-        except SystemExit as exit:  # tyro leaves so
+        except SystemExit as exit:  # tyro, for --help and bad flags
             status = exit.code if isinstance(exit.code, int) else 1
         captured = capsys.readouterr()
         return status, captured.out, captured.err

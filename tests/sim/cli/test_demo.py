@@ -1,4 +1,4 @@
-"""batchpid demo: runs, reports and draws."""
+"""batchpid demo: a run, its report and its picture."""
 
 from __future__ import annotations
 
@@ -8,45 +8,45 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.cli.follow import start_poses
+from sim.cli.run import start_poses
 
 ROBOTS = {name: Robot.load(name) for name in ("panda", "jaco2")}
 
 
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
-    out = tmp_path / "new" / "demo.png"
-    status, said, _ = batchpid(
-        "demo", "--robot", name, "--num-envs", 3, "--workers", 2, "--seconds", 0.05, "--out", out
-    )
+    path = tmp_path / "new" / "demo.png"
+    flags = ("--num-envs", 3, "--workers", 2, "--seconds", 0.05, "--picture", path)
+    status, said, _ = batchpid("demo", name, *flags)
     assert status == 0
     for line in (
         "env-steps/s",
         "real-time factor",
         "Setpoints out of limits: none.",
         "NOT SETTLED",
-        str(out),
+        str(path),
     ):
         assert line in said
     for joint in ROBOTS[name].joint_names:
         assert f"\n{joint} " in said
-    with Image.open(out) as picture:
+    with Image.open(path) as picture:
         assert picture.width > 1000
         assert len(np.unique(np.asarray(picture))) > 20
 
 
-def test_demo_tells_where_it_leaves_the_tutorial(batchpid, tmp_path):
-    args = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02, "--out", tmp_path / "x.svg")
+def test_demo_notes_where_it_differs_from_the_tutorial(batchpid, tmp_path):
+    args = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02, "--picture", tmp_path / "x.svg")
     assert "panda_joint4 goes to -1 rad" in batchpid("demo", *args)[1]
 
 
-def test_demo_is_the_same_for_a_seed(batchpid, tmp_path, monkeypatch):
+def test_demo_depends_on_nothing_but_its_flags(batchpid, tmp_path, monkeypatch):
     monkeypatch.setattr("sim.plots.figures.save", lambda _, path: path)  # drawing takes longer than the robots
 
     def table(*flags):
-        args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--out", tmp_path / "x.png")
+        args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--picture", tmp_path / "x.png")
         return batchpid("demo", *args, *flags)[1].partition("\n\n")[2]
 
     assert table() == table("--seed", 0)
@@ -54,7 +54,7 @@ def test_demo_is_the_same_for_a_seed(batchpid, tmp_path, monkeypatch):
 
 
 def test_a_picture_that_cannot_be_written_is_refused_first(batchpid):
-    status, said, err = batchpid("demo", "--out", "demo.jpg")
+    status, said, err = batchpid("demo", "--picture", "demo.jpg")
     assert (status, said) == (2, "")
     assert ".png or .svg" in err
 
@@ -62,7 +62,7 @@ def test_a_picture_that_cannot_be_written_is_refused_first(batchpid):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--robot", "pander"), "no robot 'pander'"),
+        (("pander",), "no robot 'pander'"),
         (("--num-envs", "0"), "num_envs: out of range (got 0)"),
         (("--workers", "-1"), "workers: out of range (got -1)"),
         (("--seconds", "nan"), "seconds: out of range (got nan)"),
@@ -79,9 +79,18 @@ def test_bad_flags_are_named(flags, message, batchpid):
 def test_a_robot_without_tutorial_settings_is_sent_to_rollout(batchpid, tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOTS["panda"].path.read_text())
-    status, _, err = batchpid("demo", "--robot", path)
+    status, _, err = batchpid("demo", path)
     assert status == 2
-    assert "batchpid rollout" in err
+    assert f"batchpid rollout {path}" in err
+
+
+def test_demo_runs_with_gains_by_name_or_from_a_file(batchpid, tmp_path):
+    robot = ROBOTS["panda"]
+    bp.save_params(tmp_path / "mine.yaml", robot.params(kp=7.0), robot.joint_names)
+    flags = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02, "--picture", tmp_path / "x.svg")
+    assert "pid at 2000 Hz, gains tuned" in batchpid("demo", *flags)[1]
+    assert "pid at 2000 Hz, gains mine.yaml" in batchpid("demo", *flags, "--gains", tmp_path / "mine.yaml")[1]
+    assert "drive at 2000 Hz, gains drive (30, 6)" in batchpid("demo", *flags, "--gains", "drive:30,6")[1]
 
 
 @given(
@@ -90,7 +99,7 @@ def test_a_robot_without_tutorial_settings_is_sent_to_rollout(batchpid, tmp_path
     spread=st.floats(0, 10),
     seed=st.integers(0, 2**63 - 1),
 )
-def test_start_poses_are_near_inside_limits_and_do_not_depend_on_their_number(name, num_envs, spread, seed):
+def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_number(name, num_envs, spread, seed):
     robot = ROBOTS[name]
     poses = start_poses(robot, num_envs, spread, seed)
     assert poses.shape == (num_envs, robot.dof)

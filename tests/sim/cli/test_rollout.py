@@ -1,4 +1,4 @@
-"""batchpid rollout: the flags reach the runner, and the file holds what it returned."""
+"""batchpid rollout: the flags reach the runner, and the file holds its rollout."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 import batchpid as bp
 from sim import Runner
-from sim.cli.follow import start_poses
+from sim.cli.run import start_poses
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
@@ -19,15 +19,15 @@ def saved(batchpid, path, *flags):
         return dict(file)
 
 
-def test_file_holds_the_runner_s_rollout(batchpid, tmp_path, panda):
+def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_path, panda):
     file = saved(batchpid, tmp_path / "new" / "run.npz", "--workers", 2, "--seed", 7, "--substeps", 10)
     start = start_poses(panda, 3, 0.3, 7)
-    with Runner(panda, 3, workers=0, substeps=10) as runner:
+    with Runner(panda, 3, params=panda.tuned(), workers=0, substeps=10) as runner:
         runner.reset(qpos=start)
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (10, panda.dof)))
     for name, value in expected.arrays().items():
         np.testing.assert_array_equal(file[name], value)
-    np.testing.assert_array_equal(file["start"], start)
+    np.testing.assert_array_equal(file["start"], start.astype(np.float32))
     assert tuple(file["joint_names"]) == panda.joint_names
     assert list(file["units"]) == [joint.unit for joint in panda.joints]
     np.testing.assert_array_equal(file["effort_limit"], panda.effort_limit)
@@ -52,19 +52,19 @@ def test_every_flag_changes_the_motion(flags, batchpid, tmp_path):
     assert np.abs(file["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
 
 
-def test_params_from_a_file(batchpid, tmp_path, panda):
+def test_gains_from_a_file(batchpid, tmp_path, panda):
     params = panda.params(kp=7.0, ki=0.0, kd=1.0)
     bp.save_params(tmp_path / "gains.yaml", params, panda.joint_names)
-    file = saved(batchpid, tmp_path / "run.npz", "--params", tmp_path / "gains.yaml", "--spread", 0)
+    file = saved(batchpid, tmp_path / "run.npz", "--gains", tmp_path / "gains.yaml", "--spread", 0)
     with Runner(panda, 3, workers=0, params=params) as runner:
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
 
 
 def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
-    """By name or from the file that tune wrote: with the units and the measured rate that the file tells of."""
+    """By name, or from the params file with its gain units and measurement rate."""
     path = panda.path.with_name("panda.tuned.yaml")
-    by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--params", each) for each in ("tuned", path))
+    by_name, by_file = (saved(batchpid, tmp_path / "run.npz", "--gains", each) for each in ("tuned", path))
     with Runner(panda, 3, workers=0, params=panda.tuned()) as runner:
         runner.reset(start_poses(panda, 3, 0.3, 0))
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
@@ -72,18 +72,19 @@ def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     np.testing.assert_array_equal(by_file["qpos"], expected.qpos)
 
 
-def test_gains_that_ring_are_told_of(batchpid):
-    assert "--params tuned" in batchpid("rollout", *SHORT)[1]
-    assert "--params tuned" not in batchpid("rollout", *SHORT, "--params", "tuned")[1]
+def test_the_default_gains_settle_and_the_tutorial_s_do_not(batchpid):
+    flags = ("--num-envs", 3, "--workers", 0, "--seconds", 1.2)
+    assert "Every joint of every env settled" in batchpid("rollout", *flags)[1]
+    assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "tutorial")[1]
 
 
 def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, panda):
     path = tmp_path / "arm.urdf"
     path.write_text(panda.path.read_text())
-    assert batchpid("rollout", *SHORT, "--robot", path)[0] == 0  # with gains designed from its inertia
+    assert batchpid("rollout", path, *SHORT)[0] == 0  # with designed gains
     bp.save_params(tmp_path / "gains.json", panda.params(), panda.joint_names)
-    file = saved(batchpid, tmp_path / "run.npz", "--robot", path, "--params", tmp_path / "gains.json")
-    # Without settings of its own it holds its start pose: zero, moved inside the limits.
+    file = saved(batchpid, tmp_path / "run.npz", path, "--gains", tmp_path / "gains.json")
+    # Without settings it holds its start pose: zero, moved inside the limits.
     np.testing.assert_allclose(file["setpoint"][0, 0], np.clip(np.zeros(9), panda.lower, panda.upper))
 
 
@@ -100,9 +101,9 @@ def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
         (("--setpoint", "1", "2"), "setpoint: has shape (2,)"),
         (("--setpoint", *["nan"] * 9), "setpoint, joint 'panda_joint1'"),
         (("--out", "run.csv"), "out: unknown file format"),
-        (("--picture", "run.bmp"), "path: unknown picture format"),
+        (("--picture", "run.bmp"), "picture: unknown file format"),
         (
-            ("--params", "/nowhere/gains.yaml"),
+            ("--gains", "/nowhere/gains.yaml"),
             "gains: is neither a name nor a file (got '/nowhere/gains.yaml')",
         ),
         (("--seconds", "-1"), "seconds: out of range"),

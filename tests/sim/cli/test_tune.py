@@ -7,15 +7,15 @@ import pytest
 
 import batchpid as bp
 from sim import Robot
-from sim.cli.tune import Tune
+from sim.cli.tune import TuneCommand
 from sim.tuning.search import Weights
 
 pytest.importorskip("cmaes")
 
-SHORT = ("--generations", 1, "--population", 4, "--seconds", 0.1, "--workers", 0)
+SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--workers", 0)
 
 
-def test_tune_writes_params_with_what_they_are_and_how_they_did(batchpid, tmp_path):
+def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_path):
     out = tmp_path / "panda.yaml"
     status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 0
@@ -32,7 +32,7 @@ def test_tune_writes_params_with_what_they_are_and_how_they_did(batchpid, tmp_pa
     assert not out.with_suffix(".search.json").exists()
 
 
-def test_tune_resumes_what_was_cut_short(batchpid, tmp_path, monkeypatch):
+def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypatch):
     out = tmp_path / "a.yaml"
 
     def interrupt(*_, **__):
@@ -53,12 +53,12 @@ def test_tune_resumes_what_was_cut_short(batchpid, tmp_path, monkeypatch):
     assert f"{costs[0][0]:.4f} as designed" in said
 
 
-def test_compare_tells_the_sets_apart(batchpid, tmp_path):
+def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     robot = Robot.load("panda")
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)
     picture = tmp_path / "two.png"
     flags = ("--moves", 1, "--seconds", 1.2, "--workers", 0, "--picture", picture)
-    status, said, _ = batchpid("compare", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags)
+    status, said, _ = batchpid("compare", "--gains", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags)
     assert status == 0
     rows = {line.split("  ")[0]: line for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned", "mine.yaml", "drive (30, 6)"}
@@ -67,8 +67,8 @@ def test_compare_tells_the_sets_apart(batchpid, tmp_path):
     assert picture.stat().st_size > 10_000
 
 
-def test_the_flags_weigh_as_the_search_does_by_itself():
-    flags, weights = Tune(), Weights()
+def test_the_weights_of_the_flags_are_those_of_the_search():
+    flags, weights = TuneCommand(), Weights()
     assert {field.name: getattr(flags, field.name) for field in dataclasses.fields(weights)} == (
         dataclasses.asdict(weights)
     )
@@ -77,15 +77,15 @@ def test_the_flags_weigh_as_the_search_does_by_itself():
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("compare", "nothing.yaml"), "neither a name nor a file"),
-        (("compare", "drive:a,b"), "DAMPING"),
-        (("compare", "tuned", "--picture", "x.png"), "name two"),
+        (("compare", "--gains", "nothing.yaml"), "neither a name nor a file"),
+        (("compare", "--gains", "drive:a,b"), "DAMPING"),
+        (("compare", "--gains", "tuned", "--picture", "x.png"), "name two"),
         (("tune", "nobody"), "no robot 'nobody'"),
         (("tune", "panda", "--population", "1"), "population"),
         (("tune", "panda", "--out", "gains.txt"), "gains.txt"),
     ],
 )
-def test_bad_input_is_told_with_status_2(batchpid, tmp_path, monkeypatch, arguments, complaint):
+def test_bad_input_is_an_error_of_status_2(batchpid, tmp_path, monkeypatch, arguments, complaint):
     monkeypatch.chdir(tmp_path)
     status, _, said = batchpid(*arguments)
     assert status == 2

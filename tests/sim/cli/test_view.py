@@ -1,4 +1,4 @@
-"""batchpid view: how it begins and ends; the page itself is looked at in tests/view."""
+"""batchpid view: its start and its end. The page is tested in tests/sim/view."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def write(path, robot="panda", envs=1):
     return path
 
 
-def test_ctrl_c_is_how_it_ends(batchpid, monkeypatch):
+def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -29,21 +29,21 @@ def test_ctrl_c_is_how_it_ends(batchpid, monkeypatch):
     status, said, err = batchpid("view", *SHORT)
     assert (status, err) == (0, "")
     assert "http://127.0.0.1:" in said
-    assert "x real time" in said
+    assert "real-time factor" in said
 
 
 def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
     robot = Robot.load("panda")
     bp.save_params(tmp_path / "plain.yaml", robot.params(kp=50.0), robot.joint_names)
-    for params in ("tuned", "tutorial", tmp_path / "plain.yaml"):
-        status, _, err = batchpid("view", *SHORT, "--params", params, "--seconds", 0.1)
+    for gains in ("tuned", "tutorial", tmp_path / "plain.yaml"):
+        status, _, err = batchpid("view", *SHORT, "--gains", gains, "--time-limit", 0.1)
         assert (status, err) == (0, "")
-    assert "--control drive" in batchpid("view", *SHORT, "--params", "drive:20,5")[2]
+    assert "--control drive" in batchpid("view", *SHORT, "--gains", "drive:20,5")[2]
 
 
-def test_of_many_recorded_robots_those_are_shown_that_fit(batchpid, tmp_path):
+def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
     run = write(tmp_path / "run.npz", envs=70)
-    status, said, _ = batchpid("view", *SHORT, "--play", run, "--seconds", 0.2)
+    status, said, _ = batchpid("view", *SHORT, "--play", run, "--time-limit", 0.2)
     assert status == 0
     assert "the first 64 of 70" in said
 
@@ -68,4 +68,4 @@ def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_pa
     assert "batchpid view path/to/arm.urdf --play" in batchpid("view", *SHORT, "--play", run)[2]
     path = tmp_path / "arm.urdf"
     path.write_text(Robot.load("panda").path.read_text())
-    assert batchpid("view", path, *SHORT, "--play", run, "--seconds", 0.1)[0] == 0
+    assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

@@ -366,7 +366,7 @@ def test_plot_draws_whole_and_cut_recordings(tmp_path, capsys):
     assert main(["plot", str(tmp_path / "a.h5")]) == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
     picture = tmp_path / "both.svg"
-    arguments = ["--versus", str(tmp_path / "b.h5"), "--joints", "panda_joint1", "--out", str(picture)]
+    arguments = ["--versus", str(tmp_path / "b.h5"), "--joints", "panda_joint1", "--picture", str(picture)]
     assert main(["plot", str(tmp_path / "a.h5"), *arguments]) == 0
     assert "<svg" in picture.read_text()
     assert main(["plot", str(tmp_path / "c.h5.partial"), "--kind", "efforts", "--every", "3"]) == 0

@@ -1,0 +1,93 @@
+"""Flags that several commands share: one name, one meaning and one help text each; and checks of output files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import file_path
+
+P = TypeVar("P", bound=Path | None)
+
+
+def _flag(help: str | None = None, **options: Any) -> Any:
+    """Return tyro's options of a flag; its help leaves out the defaults None, False and ()."""
+
+    def hint(default: str) -> str:
+        return "" if default in ("None", "False", "") else f"(default: {default})"
+
+    return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
+
+
+OptionalStr = Annotated[str | None, _flag()]
+OptionalFloat = Annotated[float | None, _flag()]
+OptionalPath = Annotated[Path | None, _flag()]
+OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
+Names = Annotated[tuple[str, ...], _flag(metavar="NAME [NAME ...]")]
+Switch = Annotated[bool, _flag()]
+
+RobotName = Annotated[str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF.")]
+RecordedRobot = Annotated[
+    str | None, tyro.conf.Positional, _flag("Bundled robot, or path of a URDF. Default: the recorded robot.")
+]
+ViewedRobot = Annotated[
+    str | None,
+    tyro.conf.Positional,
+    _flag("Bundled robot (panda or jaco2), or path of a URDF. Default: panda, or the recorded robot."),
+]
+MissingMeshes = Annotated[
+    Literal["error", "skip"], _flag("Raise an error for collision meshes that are missing, or skip their shapes.")
+]
+NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
+Workers = Annotated[
+    int | None, _flag("Processes that step the scenes; 0: this one. Default: one for each available core.")
+]
+Gains = Annotated[
+    str | None,
+    _flag(
+        "Gains: tuned, designed, tutorial, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
+        "`batchpid tune` or batchpid.save_params wrote. Default: tuned where the robot has them, else designed.",
+        metavar="NAME|FILE",
+    ),
+]
+GainSets = Annotated[
+    tuple[str, ...],
+    _flag(
+        "Sets of gains: tuned, designed, tutorial, drive, drive:STIFFNESS,DAMPING, or params files. Default: tuned, "
+        "tutorial and drive for a bundled robot, else designed and drive.",
+        metavar="NAME|FILE [NAME|FILE ...]",
+    ),
+]
+Physics = Annotated[Literal["accurate", "fast"], _flag("Solver settings: SAPIEN's, or fewer iterations.")]
+Compensate = Annotated[
+    Literal["gravity+coriolis", "gravity", "none"], _flag("Passive force added to the joints at every sim step.")
+]
+Seconds = Annotated[float, _flag("Simulated time [s].")]
+Fps = Annotated[float, _flag("Frames per second.")]
+TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]
+Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
+Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")]
+Friction = Annotated[float, _flag("With --variation: largest joint friction [PhysX's coefficient].")]
+
+
+def output_path(argument: str, path: P, suffixes: Collection[str]) -> P:
+    """Return ``path`` if a file can be written there, and make its folder; None is returned as None.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Its suffix is not one of ``suffixes``, it is a folder, or its folder cannot be written to.
+    OSError
+        Its folder cannot be made.
+    """
+    if path is not None:
+        file_path(argument, path, suffixes)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise InvalidArgumentError(argument, "cannot be written", value=str(path), remedy="choose another file")
+    return path
