@@ -13,7 +13,8 @@ from typing import Any
 import tyro
 
 from sim import Robot
-from sim.benchmark.accuracy import REFERENCES, TIMESTEP, measure_errors
+from sim.benchmark.accuracy import REFERENCES, measure_errors
+from sim.benchmark.workload import TIMESTEP
 from sim.cli.report import table
 
 EVERY = 20

@@ -7,7 +7,7 @@ import pytest
 from test_throughput import measure
 
 from sim import Robot
-from sim.benchmark.peers import PEERS, make_peer
+from sim.benchmark.peers import PEERS, make_peers
 from sim.benchmark.workload import Workload
 
 
@@ -17,4 +17,4 @@ def test_peer(benchmark, name, peer):
     pytest.importorskip(PEERS[peer].package)
     benchmark.group = f"{name}, accurate"
     workload = Workload(Robot.load(name))
-    measure(benchmark, workload, peer, make_peer(peer, workload))
+    measure(benchmark, workload, peer, make_peers(workload, [peer])[peer])

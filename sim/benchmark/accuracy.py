@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice, integer, number
+from sim.benchmark.workload import TIMESTEP
 from sim.engine.building import SceneSpec, parse
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS, Physics
@@ -32,7 +33,6 @@ from sim.tuning.moves import Moves, random_moves
 
 Float64 = NDArray[np.float64]
 
-TIMESTEP = 1 / 2000
 REFINEMENT = 20
 """Steps of the reference in one of the engine's."""
 REFERENCES: dict[str, dict[str, Physics | None]] = {
@@ -50,18 +50,11 @@ _LINE = 60
 _TRIES = 100
 
 
-class Plant(Protocol):
-    """Robots under control: the part of :class:`sim.engine.pack.Pack` that a loop needs. Arrays are (M, dof)."""
-
-    def read_qpos(self) -> Float64: ...  # noqa: D102
-    def read_qvel(self) -> Float64: ...  # noqa: D102
-    def passive_force(self, gravity: bool, coriolis: bool) -> Float64: ...  # noqa: D102
-    def write_qf(self, effort: Float64) -> None: ...  # noqa: D102
-    def step(self) -> None: ...  # noqa: D102
-
-
 class EquationOfMotion:
-    """:class:`Plant` without contact and joint limits, by steps of the Runge-Kutta method of order 4."""
+    """Robots without contact and joint limits, by steps of the Runge-Kutta method of order 4; arrays are (M, dof).
+
+    It stands in for a :class:`sim.engine.pack.Pack` in the loop.
+    """
 
     def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
         self._dynamics, self._damping, self._h = dynamics, damping, timestep
@@ -168,7 +161,7 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     return table
 
 
-def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) -> Plant:
+def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) -> Pack | EquationOfMotion:
     if solver is None:
         return EquationOfMotion(robot.dynamics(), robot.damping, moves.start, timestep)
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, timestep, solver)

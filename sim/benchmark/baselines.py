@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.benchmark.tutorial import TutorialLoop
+from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from sim.benchmark.workload import Case, Workload
 from sim.engine.building import parse
 from sim.engine.pack import Pack
@@ -114,7 +114,7 @@ class _DriveLoop:
     """Scenes under PhysX's drive without control, and without gravity, so that the drive reaches the PID's place."""
 
     def __init__(self, name: str, workload: Workload, share: int) -> None:
-        spec, settings = workload.scene(gravity=False), workload.settings
+        spec, settings = workload.scene(gravity=False), tutorial_settings(workload.robot)
         size, self._in_turn = ENGINES[name]
         self._start, self._substeps = workload.start, workload.substeps
         builder = parse(spec)

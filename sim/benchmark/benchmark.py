@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.errors import InvalidArgumentError
 from sim.benchmark.baselines import make_baselines
-from sim.benchmark.peers import make_peer
+from sim.benchmark.peers import make_peers
 from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays
 from sim.loop.loop import Loop, LoopSpec
-from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 CASES = {
@@ -78,7 +76,7 @@ def make_closed_loops(workload: Workload) -> dict[str, Case]:
 
 
 def measure_rates(
-    workload: Workload, progress: Callable[[str], None] = lambda case: None, peers: Sequence[str] = ()
+    workload: Workload, progress: Callable[[str], None] = lambda case: None, peers: Collection[str] = ()
 ) -> dict[str, Result]:
     """Measure every case ``workload.rounds`` times in turn; the rounds of different cases are paired.
 
@@ -91,28 +89,15 @@ def measure_rates(
 
     Raises
     ------
-    InvalidArgumentError
-        The robot carries no gains and target to move with.
     BatchPIDError
         The robots of a case did not move, or ended elsewhere: its figure would mean nothing.
     MissingDependencyError
         The package of a peer is not installed.
     """
-    if workload.robot.settings is None:
-        raise InvalidArgumentError(
-            "robot", f"{workload.robot.name!r} carries no gains and target", remedy=f"use one of {Robot.bundled()}"
-        )
     with ExitStack() as stack:
-
-        def closed_at_exit(cases: Mapping[str, Case]) -> dict[str, Case]:
-            for case in cases.values():
-                stack.callback(case.close)
-            return dict(cases)
-
-        cases = closed_at_exit(make_baselines(workload))
-        for name in peers:
-            cases |= closed_at_exit({name: make_peer(name, workload)})
-        cases |= closed_at_exit(make_closed_loops(workload))
+        cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload)
+        for case in cases.values():
+            stack.callback(case.close)
         seconds: dict[str, list[float]] = {name: [] for name in (*CASES, *peers)}
         final = {}
         for _ in range(workload.rounds):

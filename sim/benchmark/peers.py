@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
 from sim.benchmark.baselines import single_threaded
-from sim.benchmark.tutorial import TutorialLoop
-from sim.benchmark.workload import Case, Workload
+from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
+from sim.benchmark.workload import TIMESTEP, Case, Workload
 
 Float64 = NDArray[np.float64]
 
@@ -81,9 +81,9 @@ def _mujoco_rollout(workload: Workload) -> Case:
     import mujoco
     import mujoco.rollout
 
-    robot, settings = workload.robot, workload.settings
+    robot, settings = workload.robot, tutorial_settings(workload.robot)
     spec = mujoco.MjSpec.from_string(robot.urdf)
-    spec.option.timestep = 1 / 2000
+    spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     for body in spec.bodies:
@@ -142,15 +142,15 @@ def installed_peers() -> tuple[str, ...]:
     return tuple(name for name, peer in PEERS.items() if importlib.util.find_spec(peer.package) is not None)
 
 
-def make_peer(name: str, workload: Workload) -> Case:
-    """Return a peer, ready to run.
+def make_peers(workload: Workload, names: Collection[str]) -> dict[str, Case]:
+    """Return the peers of these names, ready to run.
 
     Raises
     ------
     MissingDependencyError
-        Its package is not installed.
+        The package of one is not installed; none is started.
     """
-    peer = PEERS[name]
-    if importlib.util.find_spec(peer.package) is None:
-        raise MissingDependencyError(peer.package, f"peer {name!r}", "peers")
-    return peer.make(workload)
+    for name in names:
+        if importlib.util.find_spec(PEERS[name].package) is None:
+            raise MissingDependencyError(PEERS[name].package, f"peer {name!r}", "peers")
+    return {name: PEERS[name].make(workload) for name in names}

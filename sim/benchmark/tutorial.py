@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,25 @@ from numpy.typing import NDArray
 from batchpid.errors import InvalidArgumentError
 from batchpid.reference import SimplePID
 from sim.engine.building import bare_scene
+from sim.robot.description import Settings
 from sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+
+
+def tutorial_settings(robot: Robot) -> Settings:
+    """Return the tutorial's gains, start and target for a bundled robot.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot is not bundled.
+    """
+    if robot.settings is None:
+        raise InvalidArgumentError(
+            "robot", f"{robot.name!r} carries no gains and target", remedy=f"use one of {', '.join(Robot.bundled())}"
+        )
+    return robot.settings
 
 
 class TutorialLoop:
@@ -25,42 +42,29 @@ class TutorialLoop:
 
     ``external_pid`` and ``internal_drive`` are the tutorial's two switches; ``target`` and ``start`` (dof,) [rad or m],
     the start by default the robot's own.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The robot is not bundled, so that it carries no gains of the tutorial.
     """
 
     def __init__(
         self,
         robot: Robot,
-        target: NDArray[np.float64],
+        target: Float64,
         *,
         external_pid: bool = True,
         internal_drive: bool = False,
-        start: NDArray[np.float64] | None = None,
+        start: Float64 | None = None,
     ) -> None:
-        settings = robot.settings
-        if settings is None:
-            raise InvalidArgumentError(
-                "robot",
-                "carries no gains of the tutorial",
-                value=robot.name,
-                remedy=f"use one of {', '.join(Robot.bundled())}",
-            )
+        settings = tutorial_settings(robot)
         self.scene = bare_scene()
         self.scene.set_timestep(1 / settings.rate_hz)
         self.scene.add_ground(0, render=False)
         loader = self.scene.create_urdf_loader()
         loader.fix_root_link = True
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.urdf"
-            path.write_text(robot.urdf)
-            self.robot: Any = loader.load(str(path))
+        with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+            file.write(robot.urdf)
+            file.flush()
+            self.robot: Any = loader.load(file.name)
         self._gains = list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
-        self.target = target
-        self._start = settings.start if start is None else start
+        self._start, self.target = settings.start if start is None else start, target
         self.reset()
         if internal_drive:
             for joint, position in zip(self.robot.get_active_joints(), target, strict=True):
@@ -89,6 +93,6 @@ class TutorialLoop:
                 record(self.robot.get_qpos())
         return self.robot.get_qpos()
 
-    def _pid_forward(self, position: NDArray[np.float32], dt: float) -> NDArray[np.float64]:
+    def _pid_forward(self, position: NDArray[np.float32], dt: float) -> Float64:
         errors = self.target - position
         return np.array([pid.compute(error, dt) for pid, error in zip(self.pids, errors, strict=True)])

@@ -11,20 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError
+from sim.benchmark.tutorial import tutorial_settings
 from sim.engine.building import SceneSpec
 from sim.engine.physics import PHYSICS
-from sim.robot.description import Settings
 from sim.robot.robot import Robot
 from sim.runner import Runner
 
 Float64 = NDArray[np.float64]
+TIMESTEP = 1 / 2000
+"""Of simulation and control [s]."""
 DISTANCE = 0.3
 """Distance of the start from the target, per joint [rad]."""
 
 
 @dataclass(frozen=True)
 class Workload:
-    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps of 0.5 ms."""
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot is not bundled, so that it carries no gains and target to move with.
+    """
 
     robot: Robot
     num_envs: int = 64
@@ -34,16 +42,13 @@ class Workload:
     ticks: int = 100
     rounds: int = 5
 
-    @property
-    def settings(self) -> Settings:
-        """Gains, start and target of the tutorial."""
-        assert self.robot.settings is not None
-        return self.robot.settings
+    def __post_init__(self) -> None:
+        tutorial_settings(self.robot)
 
     @property
     def target(self) -> Float64:
         """Setpoint of every case (dof,) [rad or m]."""
-        return self.settings.target
+        return tutorial_settings(self.robot).target
 
     @property
     def start(self) -> Float64:
@@ -69,28 +74,15 @@ class Workload:
 
     def scene(self, gravity: bool) -> SceneSpec:
         """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
-        robot = self.robot
-        spec = SceneSpec(
-            urdf=robot.urdf,
-            srdf=robot.srdf,
-            joints=robot.joints,
-            timestep=1 / 2000,
-            physics=PHYSICS[self.physics],
-            dissipation="sapien",
-        )
+        robot, physics = self.robot, PHYSICS[self.physics]
+        spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, physics, dissipation="sapien")
         return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
 
     def runner(self) -> Runner:
         """Return a runner of the robots with the tutorial's gains and SAPIEN's default friction and damping."""
         robot = Robot.load(self.robot.path, dissipation="sapien")
-        return Runner(
-            robot,
-            self.num_envs,
-            params=robot.params(),
-            workers=self.workers,
-            physics=self.physics,
-            substeps=self.substeps,
-        )
+        options: dict[str, Any] = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP}
+        return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **options)
 
     def check_motion(self, case: str, final: Float64) -> None:
         """Raise unless the robot at ``final`` (dof,) has moved from the start towards the target.

@@ -7,7 +7,7 @@ import pytest
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
-from sim.benchmark.peers import PEERS, make_peer
+from sim.benchmark.peers import PEERS, make_peers
 from sim.benchmark.workload import Workload, run_round
 
 
@@ -33,9 +33,8 @@ def test_robots_that_rest_are_refused(workload):
 
 
 def test_robot_without_gains_is_refused(panda):
-    bare = Workload(dataclasses.replace(panda, settings=None))
     with pytest.raises(InvalidArgumentError, match="robot"):
-        measure_rates(bare)
+        Workload(dataclasses.replace(panda, settings=None))
 
 
 def test_phases_are_positive_and_the_engine_takes_most(workload):
@@ -48,7 +47,7 @@ def test_phases_are_positive_and_the_engine_takes_most(workload):
 @pytest.mark.parametrize("name", [name for name in PEERS if name != "gymnasium, all envs"])
 def test_peers_reach_the_same_place_in_every_round(workload, name):
     pytest.importorskip(PEERS[name].package)
-    peer = make_peer(name, workload)
+    peer = make_peers(workload, [name])[name]
     try:
         seconds, final = run_round(peer)
         _, again = run_round(peer)
@@ -65,11 +64,11 @@ def test_mujoco_runs_the_whole_pid(workload):
     mujoco = pytest.importorskip("mujoco")
     if not hasattr(mujoco.MjsActuator, "set_to_pid"):
         pytest.skip("MuJoCo before 3.12 has no actuator pid")
-    settings = workload.settings
+    settings = workload.robot.settings
 
     def final(ki):
         robot = dataclasses.replace(workload.robot, settings=dataclasses.replace(settings, ki=ki))
-        peer = make_peer("mujoco", dataclasses.replace(workload, robot=robot))
+        peer = make_peers(dataclasses.replace(workload, robot=robot), ["mujoco"])["mujoco"]
         try:
             return run_round(peer)[1]
         finally:
@@ -82,4 +81,4 @@ def test_mujoco_runs_the_whole_pid(workload):
 def test_peer_that_is_not_installed_is_named_with_its_extra(workload, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingDependencyError, match="peers"):
-        make_peer("mujoco", workload)
+        make_peers(workload, ["mujoco"])
