@@ -13,14 +13,11 @@ slide, however fine the steps; so there are two references, and an error against
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
 from sim.engine.building import SceneSpec, parse
@@ -29,7 +26,7 @@ from sim.engine.physics import PHYSICS, Physics
 from sim.loop.control import make_control
 from sim.robot.description import Dynamics
 from sim.robot.robot import Robot
-from sim.tuning.moves import Moves, random_moves
+from sim.tuning.moves import Moves, draw_moves, random_moves
 
 Float64 = NDArray[np.float64]
 
@@ -47,7 +44,6 @@ APPROACH, PRESS = 0.2, 0.02
 BEYOND = 0.1
 """Distance beyond its limit to which a joint is sent [rad]."""
 _LINE = 60
-_TRIES = 100
 
 
 class EquationOfMotion:
@@ -172,56 +168,39 @@ def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) 
 
 def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
     """Return ``count`` seeded moves from free poses until some link presses gently on the ground or on another."""
-    dynamics, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+    rng, dynamics, line = np.random.default_rng(seed), robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
 
-    def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
+    def draw(_: int) -> tuple[Float64, Float64, str] | None:
         here, there = robot.sample(2, seed=int(rng.integers(2**31)))
         touches = dynamics.touches(here + line * (there - here))
         touch = here + line[np.argmax(touches)] * (there - here)
         if touches[0] or not touches.any() or np.abs(touch - here).max() < APPROACH:
             return None
         direction = (there - here) / np.abs(there - here).max()
-        return touch - APPROACH * direction, np.clip(touch + PRESS * direction, robot.lower, robot.upper)
+        target = np.clip(touch + PRESS * direction, robot.lower, robot.upper)
+        return touch - APPROACH * direction, target, "contact"
 
-    return _draw_moves(robot, "contact", count, seed, draw)
+    return draw_moves(robot, count, draw)
 
 
 def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
     """Return ``count`` seeded moves, each of one revolute joint to beyond one of its limits, touching nothing."""
-    dynamics, line = robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
+    rng, dynamics, line = np.random.default_rng(seed), robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
     bounded = np.isfinite(robot.lower) & np.isfinite(robot.upper)
     joints = [j for j, joint in enumerate(robot.joints) if joint.type != "prismatic" and bounded[j]]
 
-    def draw(rng: np.random.Generator) -> tuple[Float64, Float64] | None:
+    def draw(_: int) -> tuple[Float64, Float64, str] | None:
+        if not joints:
+            return None
         start = robot.sample(1, seed=int(rng.integers(2**31)))[0]
         joint = rng.choice(joints)
         limit, sign = (robot.upper[joint], 1) if rng.integers(2) else (robot.lower[joint], -1)
         start[joint] = limit - sign * APPROACH
         target = start.copy()
         target[joint] = limit + sign * BEYOND
-        return None if dynamics.touches(start + line * (target - start)).any() else (start, target)
+        return None if dynamics.touches(start + line * (target - start)).any() else (start, target, "limit")
 
-    return _draw_moves(robot, "limit", count, seed, draw if joints else lambda rng: None)
-
-
-def _draw_moves(
-    robot: Robot,
-    motion: str,
-    count: int,
-    seed: int,
-    draw: Callable[[np.random.Generator], tuple[Float64, Float64] | None],
-) -> Moves:
-    rng = np.random.default_rng(seed)
-    drawn = (draw(rng) for _ in range(_TRIES * count))
-    pairs = list(itertools.islice((pair for pair in drawn if pair is not None), count))
-    if len(pairs) < count:
-        raise InvalidArgumentError(
-            "robot",
-            f"{robot.name!r} has hardly a move of kind {motion!r}: {len(pairs)} of {count} were found",
-            remedy="look at its collision shapes and limits with: batchpid inspect",
-        )
-    starts, targets = zip(*pairs, strict=True)
-    return Moves(np.array(starts), np.array(targets), (motion,) * count)
+    return draw_moves(robot, count, draw)
 
 
 _MOVES = {"free": random_moves, "contact": contact_moves, "limit": limit_moves}

@@ -23,6 +23,7 @@ from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays
 from sim.loop.loop import Loop, LoopSpec
+from sim.workers.shared_memory import SharedArrays
 
 Float64 = NDArray[np.float64]
 CASES = {
@@ -122,21 +123,20 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     """
     share = max(1, workload.num_envs // workload.processes)
     spec = LoopSpec(workload.scene(gravity=True), share, workload.robot.params())
-    layout = Arrays.layout(1, share, workload.robot.dof).items()
-    fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout}
-    loop = Loop(spec, Arrays.of_ticks(fields, slice(0, share)))
+    shared = SharedArrays(Arrays.layout(1, share, workload.robot.dof))
+    loop = Loop(spec, Arrays.of_ticks(shared.arrays, slice(0, share)))
     loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, workload.robot.dof)))
     loop.ticks[0].command.setpoint[...] = workload.target
-    spent = dict.fromkeys(PHASES, 0.0)
+    spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
         _time_calls(group.pack, spent)
     total = sum(loop.run(1, workload.substeps, False, False) for _ in range(workload.ticks))
     loop.close()
+    shared.close()
     env_steps = workload.steps * share
     spent["control"] = total - sum(spent.values())
     spent["waiting"] = _waiting(workload) * env_steps
-    order = ("read", "control", "passive", "write", "step", "waiting")
-    return {phase: spent[phase] / env_steps * 1e6 for phase in order}
+    return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
 
 
 def _time_calls(pack: Pack, spent: dict[str, float]) -> None:

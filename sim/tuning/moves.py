@@ -13,7 +13,7 @@ Such a motion exists, so the shortest of all motions takes no longer.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -101,31 +101,48 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     reach = np.ptp(robot.sample(1000, seed=0), axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
-    starts, targets = np.empty((2, count, robot.dof))
-    names: list[str] = []
-    for _ in range(200 * count + 200):
-        if len(names) == count:
-            break
-        kind = KINDS[len(names) % len(KINDS)]
+
+    def draw(index: int) -> tuple[Float64, Float64, str] | None:
+        kind = KINDS[index % len(KINDS)]
         start = np.clip(robot.sample(1, seed=int(rng.integers(2**31)))[0], low, high)
         joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
             fraction[:] = fraction[0]
         if kind == "one joint":
             fraction[np.arange(robot.dof) != joint] = 0.0
+            kind = f"{robot.joint_names[joint]} alone"
         step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
         start, target = _with_mimics(robot, start), _with_mimics(robot, target)
-        if not dynamics.touches(start + line * (target - start)).any():
-            starts[len(names)], targets[len(names)] = start, target
-            names.append(kind if kind != "one joint" else f"{robot.joint_names[joint]} alone")
-    if len(names) < count:
+        return None if dynamics.touches(start + line * (target - start)).any() else (start, target, kind)
+
+    return draw_moves(robot, count, draw)
+
+
+def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Float64, str] | None]) -> Moves:
+    """Return ``count`` moves: the start, target and name that ``draw(moves so far)`` returns, skipping None.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Nearly every draw is None.
+    """
+    moves: list[tuple[Float64, Float64, str]] = []
+    for _ in range(200 * count + 200):
+        if len(moves) == count:
+            break
+        move = draw(len(moves))
+        if move is not None:
+            moves.append(move)
+    if len(moves) < count:
         raise InvalidArgumentError(
             "robot",
-            f"{robot.name!r} touches itself or the ground on nearly every move: {len(names)} of {count} were free",
+            f"{robot.name!r} touches itself or the ground where it should not in nearly every draw of a move: "
+            f"{len(moves)} of {count} were found",
             remedy="give the moves yourself, or correct the collision shapes (batchpid inspect shows them)",
         )
-    return Moves(starts, targets, tuple(names))
+    starts, targets = (np.array([move[end] for move in moves]).reshape(-1, robot.dof) for end in (0, 1))
+    return Moves(starts, targets, tuple(name for _, _, name in moves))
 
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:

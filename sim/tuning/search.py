@@ -22,7 +22,7 @@ import dataclasses
 import json
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -180,7 +180,7 @@ def tune(
         **{name: str(value) for name, value in runner_options.items()},
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
-    known = _read_history(history, settings)
+    record = _History(history, settings)
     if variation is not None:
         drawn = draw_variation(robot, count, seed, **variation)
         runner_options["variation"] = drawn.for_envs(np.tile(np.arange(count), population))
@@ -188,30 +188,26 @@ def tune(
     optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
     start = search.params(np.zeros((1, search.dimension)))
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
-    tried: list[tuple[float, Float64]] = []
-    costs: list[tuple[float, ...]] = []
+    points: list[Float64] = []
     began = time.monotonic()
     with Runner(robot, population * count, **options) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
         bar = (progress or (lambda items: items))(range(generations))
         for generation in bar:
-            points = np.array([optimizer.ask() for _ in range(population)])
+            points += [optimizer.ask() for _ in range(population)]
             if generation == 0:
-                points[0] = 0.0  # the designed gains are a candidate too
-            replayed = generation < len(known)
-            costs.append(known[generation] if replayed else search.costs(runner, points))
-            optimizer.tell(list(zip(points, costs[-1], strict=True)))
-            tried += zip(costs[-1], points, strict=True)
-            if history is not None and not replayed:
-                write_atomically(history, json.dumps({"settings": settings, "costs": costs}))
+                points[0] = np.zeros(search.dimension)  # the designed gains are a candidate too
+            if generation == len(record.costs):
+                record.append(search.costs(runner, np.array(points[-population:])))
+            optimizer.tell(list(zip(points[-population:], record.costs[generation], strict=True)))
+            costs = record.costs[: generation + 1]
             if hasattr(bar, "set_postfix"):
-                bar.set_postfix(cost=f"{min(map(min, costs)):.4f}", designed=f"{costs[0][0]:.4f}")
+                bar.set_postfix(cost=f"{np.min(costs):.4f}", designed=f"{costs[0][0]:.4f}")
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
-    cost, best = min(tried, key=lambda candidate: candidate[0])
     return Tuning(
-        params=search.params(best[None]),
-        cost=cost,
+        params=search.params(points[int(np.argmin(costs))][None]),
+        cost=float(np.min(costs)),
         start_params=start,
         start_cost=costs[0][0],
         history=tuple(costs),
@@ -292,28 +288,31 @@ class _Search:
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)
 
 
-def _read_history(path: Path | str | None, settings: Mapping[str, Any]) -> Sequence[tuple[float, ...]]:
-    """Return the costs in the history of the same search; none without a file."""
-    if path is None or not Path(path).exists():
-        return []
-    try:
-        document = json.loads(Path(path).read_text())
-        costs = [tuple(map(float, row)) for row in document["costs"]]
-        theirs = document["settings"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InvalidArgumentError(
-            "history",
-            f"is no history of a search: {error}",
-            value=str(path),
-            remedy="remove it, or name another file",
-        ) from None
-    ours = json.loads(json.dumps(settings))
-    different = sorted(key for key in {*ours, *theirs} if ours.get(key) != theirs.get(key))
-    if different or any(len(row) != settings["population"] for row in costs):
-        raise InvalidArgumentError(
-            "history",
-            f"is of another search ({', '.join(different)} differ)",
-            value=str(path),
-            remedy="use the same options, remove it, or name another file",
-        )
-    return costs
+class _History:
+    """Costs of the generations of a search, kept in a file unless ``path`` is None; read from it if it exists."""
+
+    def __init__(self, path: Path | str | None, settings: dict[str, Any]) -> None:
+        self.costs: list[tuple[float, ...]] = []
+        self._path, self._settings = path, settings
+        if path is None or not Path(path).exists():
+            return
+        try:
+            document = json.loads(Path(path).read_text())
+            self.costs = [tuple(map(float, row)) for row in document["costs"]]
+            ours, theirs = json.loads(json.dumps(settings)), document["settings"]
+            different = sorted(key for key in {*ours, *theirs} if ours.get(key) != theirs.get(key))
+            if any(len(row) != settings["population"] for row in self.costs):
+                different.append("costs")
+            problem = f"is of another search ({', '.join(different)} differ)" if different else None
+        except (ValueError, KeyError, TypeError) as error:
+            problem = f"is no history of a search: {error}"
+        if problem is not None:
+            raise InvalidArgumentError(
+                "history", problem, value=str(path), remedy="use the same options, remove it, or name another file"
+            )
+
+    def append(self, costs: tuple[float, ...]) -> None:
+        """Append those of a generation, and write the file."""
+        self.costs.append(costs)
+        if self._path is not None:
+            write_atomically(self._path, json.dumps({"settings": self._settings, "costs": self.costs}))
