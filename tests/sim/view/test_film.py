@@ -46,6 +46,7 @@ def test_bad_arguments_are_named(rollout, tmp_path):
             film.write_film(rollout, **({"out": tmp_path / "film.mp4"} | options))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves pipes to ffmpeg open
 def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
@@ -54,7 +55,8 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
     assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
-    frames = np.array([frame for frame in imageio.get_reader("film.mp4")])
+    with imageio.get_reader("film.mp4") as reader:
+        frames = np.array(list(reader))
     assert frames.shape[1:] == (180, 320, 3)
     assert 8 <= len(frames) <= 10
     assert frames[0].std() > 5  # not empty
