@@ -1,4 +1,4 @@
-"""A runner that is used from where it cannot be says so, and stays as sound as it was."""
+"""Calls of a runner from the wrong place or moment raise an error that says so, and change nothing."""
 
 from __future__ import annotations
 
@@ -13,29 +13,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from identical import assert_identical
 
 from batchpid.errors import ClosedError, InUseError
-from sim import Robot, Runner
+from sim import Runner
 
-ROBOT = Robot.load("panda")
 ROOT = Path(__file__).resolve().parents[2]
-LONG = 100_000  # substeps that nobody waits for
-NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
 
 
 @pytest.fixture(params=[0, 1])
-def runner(request):
-    with Runner(ROBOT, 8, workers=request.param) as made:
+def runner(request, panda):
+    with Runner(panda, 8, workers=request.param) as made:
         yield made
 
 
 @pytest.fixture
 def on_alarm():
-    """Let a function run, as a signal handler, so many seconds from now."""
+    """Function that makes another one the handler of a signal that arrives 0.1 s later."""
 
-    def on_alarm(act, seconds=0.1):
+    def on_alarm(act):
         signal.signal(signal.SIGALRM, lambda *_: act())
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
 
     before = signal.getsignal(signal.SIGALRM)
     yield on_alarm
@@ -43,21 +41,15 @@ def on_alarm():
     signal.signal(signal.SIGALRM, before)
 
 
-def busy(runner, until):
-    """A thread that steps the runner until then."""
+def test_a_call_from_another_thread_raises(runner, panda):
+    done = threading.Event()
 
     def work():
-        while not until.is_set():
-            runner.step(ROBOT.start, substeps=200)
+        while not done.is_set():
+            runner.step(panda.start, substeps=200)
 
     thread = threading.Thread(target=work)
     thread.start()
-    return thread
-
-
-def test_two_threads_at_once(runner):
-    done = threading.Event()
-    thread = busy(runner, done)
     try:
         with pytest.raises(InUseError, match="another thread; take turns"):  # noqa: PT012
             while True:
@@ -65,58 +57,58 @@ def test_two_threads_at_once(runner):
     finally:
         done.set()
         thread.join()
-    assert runner.step(ROBOT.start).ok.all()
+    assert runner.step(panda.start).ok.all()
 
 
-def test_in_turn_threads_may_share_it(runner):
-    expected = []
+def test_threads_may_take_turns(runner, panda):
+    steps = []
     lock = threading.Lock()
 
     def work():
         for _ in range(5):
             with lock:
-                expected.append(runner.step(ROBOT.settings.target).qpos)
+                steps.append(runner.step(panda.settings.target))
 
     threads = [threading.Thread(target=work) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    with Runner(ROBOT, 8, workers=0) as alone:
-        for qpos in expected:
-            np.testing.assert_array_equal(alone.step(ROBOT.settings.target).qpos, qpos)
+    with Runner(panda, 8, workers=0) as other:
+        for step in steps:
+            assert_identical(other.step(panda.settings.target), step)
 
 
-def test_from_a_signal_handler(runner, on_alarm):
-    seen = []
+def test_a_call_from_a_signal_handler_raises(runner, panda, on_alarm):
+    raised = []
 
     def handler():
         with pytest.raises(InUseError, match="that this one interrupted"):
-            runner.step(ROBOT.start)
-        seen.append(True)
+            runner.step(panda.start)
+        raised.append(True)
 
     on_alarm(handler)
-    while not seen:
-        obs = runner.step(ROBOT.start, substeps=500)
+    while not raised:
+        obs = runner.step(panda.start, substeps=500)
     assert obs.ok.all()
 
 
-def test_closed_by_a_signal_handler(runner, on_alarm):
+def test_a_signal_handler_may_close_the_runner(runner, panda, on_alarm):
     on_alarm(runner.close)
     with pytest.raises(ClosedError):  # noqa: PT012
         while True:
-            runner.step(ROBOT.start, substeps=500)
+            runner.step(panda.start, substeps=500)
     with pytest.raises(ClosedError):
         runner.observe()
 
 
-def test_closed_by_another_thread():
-    with Runner(ROBOT, 8, workers=1) as runner:
+def test_another_thread_may_close_the_runner(panda):
+    with Runner(panda, 8, workers=1) as runner:
         pids = runner.pids
         timer = threading.Timer(0.2, runner.close)
         timer.start()
         with pytest.raises(ClosedError, match="amid a call"):
-            runner.step(ROBOT.start, substeps=LONG)
+            runner.step(panda.start, substeps=100_000)
         timer.join()
     for pid in pids:
         with pytest.raises(ProcessLookupError):
@@ -125,50 +117,57 @@ def test_closed_by_another_thread():
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # of JAX, which other tests may have loaded
-def test_in_a_forked_child(runner):
-    before = runner.step(ROBOT.settings.target)
+def test_a_call_from_a_forked_child_raises(runner, panda):
+    before = runner.step(panda.settings.target)
     read, write = os.pipe()
     if (child := os.fork()) == 0:
         try:
-            runner.step(ROBOT.start)
+            runner.step(panda.start)
         except BaseException as error:
             os.write(write, f"{type(error).__name__}: {error}".encode())
         os._exit(0)
     os.waitpid(child, 0)
     os.close(write)
-    with os.fdopen(read) as said:
-        assert said.read().startswith("InUseError: this Runner belongs to process")
-    np.testing.assert_array_equal(runner.observe().qpos, before.qpos)
-    assert runner.step(ROBOT.start).ok.all()
+    with os.fdopen(read) as message:
+        assert message.read().startswith("InUseError: this Runner belongs to process")
+    assert_identical(runner.observe(), before)
+    assert runner.step(panda.start).ok.all()
 
 
-def test_a_stopped_worker_does_not_hang_whoever_has_much_to_send():
-    with Runner(ROBOT, 64, workers=1) as runner:
-        runner._workers[0]._channel._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # as much as nothing
+def test_a_stopped_worker_with_a_full_socket_does_not_block_the_caller(panda, monkeypatch):
+    def small_socketpair():
+        ends = socketpair()
+        for end in ends:
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the system's minimum, about 4 kB
+        return ends
+
+    socketpair = socket.socketpair
+    monkeypatch.setattr(socket, "socketpair", small_socketpair)
+    near = np.tile(0.9 * panda.start + 0.1 * panda.settings.target, (64, 1))
+    with Runner(panda, 64, workers=1) as runner:
         os.kill(runner.pids[0], signal.SIGSTOP)
         with pytest.warns(UserWarning, match="stuck: stopped"):
-            obs = runner.reset(qpos=np.tile(NEAR, (64, 1)))
+            obs = runner.reset(qpos=near)
         assert runner.recoveries == 1
-    np.testing.assert_allclose(obs.qpos, np.tile(NEAR, (64, 1)), atol=1e-6)
+    np.testing.assert_allclose(obs.qpos, near, atol=1e-6)
 
 
-def run(program, *arguments, **options):
-    """What a program prints that is not installed, but found where it was started."""
+def run(program):
+    """Return the lines that a program prints; batchpid is not installed for it, but lies in its working folder."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     paths = [path for path in sys.path if path and Path(path) != ROOT]
     done = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
+        [sys.executable, "-c", program],
         capture_output=True,
         text=True,
         env=environment | {"PYTHONPATH": os.pathsep.join(paths)},
         cwd=ROOT,
         timeout=120,
-        **options,
     )
     return done.stdout.splitlines() or done.stderr
 
 
-def test_from_another_folder_and_with_odd_paths():
+def test_workers_start_from_another_folder_and_with_odd_entries_in_sys_path():
     program = """
 import os, pathlib, sys, warnings
 warnings.simplefilter("ignore")
