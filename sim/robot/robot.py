@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 import assets
 import batchpid as bp
+from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
 from sim.robot.description import DISSIPATION, Joint, RobotDescription, Settings
@@ -147,6 +148,7 @@ class Robot(RobotDescription):
         InvalidArgumentError
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
+        choice("gain_units", gain_units, CHOICES["gain_units"])
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, gain_units=gain_units, measurement_rate="measured")
         integral_time = 4.5 / (2 * np.pi * DESIGN_HZ)
