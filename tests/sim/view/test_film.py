@@ -56,7 +56,7 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
     assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
     with imageio.get_reader("film.mp4") as reader:
-        frames = np.array(list(reader))
+        frames = np.array(list(reader.iter_data()))
     assert frames.shape[1:] == (180, 320, 3)
     assert 8 <= len(frames) <= 10
     assert frames[0].std() > 5  # not empty
