@@ -1,1 +1,1 @@
-"""Robots that ship with batchpid: URDF files written by this project (see README.md beside this file)."""
+"""Robots that ship with batchpid: URDF files written by this project (see README.md in this folder)."""

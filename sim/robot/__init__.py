@@ -1,1 +1,1 @@
-"""Robot descriptions: from a URDF to a checked :class:`Robot`. Pure Python and NumPy."""
+"""Robot descriptions, from a URDF to a checked :class:`sim.Robot`, without SAPIEN."""

@@ -1,4 +1,4 @@
-"""The bundled robots: the figures of the real ones, the tutorial's settings, and shapes that stay apart."""
+"""Bundled robots: the figures of their sources, the tutorial's settings, and shapes that do not touch each other."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def settings(name: str) -> dict:
 
 
 class World:
-    """One robot in one scene, built without its visuals; keeps the scene alive."""
+    """Scene of one robot, built without its visuals."""
 
     def __init__(self, root: etree._Element, folder: Path) -> None:
         for visual in list(root.iter("visual")):
@@ -79,7 +79,7 @@ class World:
         return self.robot.compute_passive_force()
 
     def touching(self, qpos: np.ndarray) -> set[tuple[str, ...]]:
-        """Pairs of bodies whose shapes overlap at ``qpos``."""
+        """Return the pairs of bodies whose shapes overlap at ``qpos``."""
         self.robot.set_qpos(np.asarray(qpos, np.float32))
         self.robot.set_qvel(np.zeros(self.robot.dof, np.float32))
         self.scene.step()
@@ -110,7 +110,7 @@ def test_shapes_are_primitives_and_materials_exist(name: str) -> None:
     assert {material.get("name") for material in root.iterfind("link/visual/material")} == defined
 
 
-def test_every_link_can_be_seen_touched_and_weighed(name: str) -> None:
+def test_every_link_has_a_material_a_collision_shape_and_a_possible_inertia(name: str) -> None:
     for link in xml(name).findall("link"):
         assert link.find("visual/material") is not None
         assert link.find("collision") is not None
@@ -125,7 +125,7 @@ def test_every_link_can_be_seen_touched_and_weighed(name: str) -> None:
         assert small + middle >= large, "no solid has these moments"
 
 
-def test_limits_and_dynamics_are_the_robots_own(name: str) -> None:
+def test_limits_and_dynamics_are_those_of_the_sources(name: str) -> None:
     joints = [joint for joint in xml(name).findall("joint") if joint.get("type") != "fixed"]
     limits = {
         key: [float(joint.find("limit").get(key)) for joint in joints]
@@ -140,7 +140,7 @@ def test_limits_and_dynamics_are_the_robots_own(name: str) -> None:
     assert xml(name).find("joint/mimic") is None
 
 
-def test_sapien_sees_every_joint_in_file_order(name: str, world: World) -> None:
+def test_sapien_orders_the_joints_as_the_file_does(name: str, world: World) -> None:
     listed = [joint.get("name") for joint in xml(name).findall("joint") if joint.get("type") != "fixed"]
     assert [joint.name for joint in world.joints] == listed == list(settings(name)["joints"])
     assert world.robot.dof == len(LOWER[name])
@@ -172,33 +172,23 @@ def test_sapien_orders_joints_breadth_first(tmp_path: Path) -> None:
     assert [joint.name for joint in world.joints] == ["ab", "ac", "ce", "dg", "ef"]
 
 
-def test_mass_is_the_robots_own_and_no_link_is_massless(name: str, world: World) -> None:
+def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name: str, world: World) -> None:
     masses = [link.mass for link in world.robot.links]
     assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)
     assert min(masses) == pytest.approx(0.01 if name == "jaco2" else 0.015)
 
 
-def test_panda_passive_force_equals_the_sources(tmp_path: Path) -> None:
-    # Expected: SAPIEN 3.0.3 on the source description itself, mimic and meshes taken out.
+def test_panda_passive_force_is_that_of_the_source(tmp_path: Path) -> None:
+    # Expected values: SAPIEN 3.0.3 on the source description, without mimic and meshes.
     passive = World(xml("panda"), tmp_path).passive(
         [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03], [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.05, -0.02]
     )
-    expected = [
-        1.782364,
-        -14.247656,
-        -5.767752,
-        19.389013,
-        1.209106,
-        2.049891,
-        -0.035392,
-        0.028486,
-        -0.038695,
-    ]
+    expected = [1.782364, -14.247656, -5.767752, 19.389013, 1.209106, 2.049891, -0.035392, 0.028486, -0.038695]
     np.testing.assert_allclose(passive, expected, atol=5e-5)
 
 
-def test_jaco2_passive_force_equals_the_sources_without_what_was_added(tmp_path: Path) -> None:
-    # Expected: SAPIEN 3.0.3 on the source description itself, which has neither finger 2 nor moving tips.
+def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_path: Path) -> None:
+    # Expected values: SAPIEN 3.0.3 on the source description, which has neither finger 2 nor moving tips.
     root = xml("jaco2")
     for element in root.findall("link") + root.findall("joint"):
         label = element.get("name")
@@ -216,14 +206,14 @@ def test_jaco2_passive_force_equals_the_sources_without_what_was_added(tmp_path:
 def test_jaco2_fingers_2_and_3_are_mirror_images(tmp_path: Path) -> None:
     world = World(xml("jaco2"), tmp_path)
     qpos = np.array(START["jaco2"], np.float32)
-    qpos[7:] = [0.3, 0.6, 0.6, 0.2, 0.9, 0.9]  # fingers 2 and 3 alike, finger 1 not
+    qpos[7:] = [0.3, 0.6, 0.6, 0.2, 0.9, 0.9]  # fingers 2 and 3 have the same angles
     world.robot.set_qpos(qpos)
     links = {link.name: link.entity_pose for link in world.robot.links}
     palm = links["j2s7s300_link_7"].inv()
     for part in ("finger", "finger_tip"):
         second = (palm * links[f"j2s7s300_link_{part}_2"]).to_transformation_matrix()
         third = (palm * links[f"j2s7s300_link_{part}_3"]).to_transformation_matrix()
-        # Mirroring a right-handed frame in x = 0 needs one axis turned round: z, the bending axis.
+        # Mirroring a right-handed frame in x = 0 needs one axis reversed: z, the bending axis.
         mirrored = np.diag([-1, 1, 1, 1]) @ third @ np.diag([1, 1, -1, 1])
         np.testing.assert_allclose(second, mirrored, atol=1e-6)
 
@@ -233,7 +223,7 @@ def test_jaco2_fingers_close_with_positive_angles(finger: int, tmp_path: Path) -
     world = World(xml("jaco2"), tmp_path)
 
     def reach(angle: float) -> float:
-        """Distance of the finger tip's frame from the palm's axis."""
+        """Return the distance of the finger tip's frame from the palm's axis."""
         qpos = np.array(START["jaco2"], np.float32)
         qpos[6 + finger] = angle
         world.robot.set_qpos(qpos)
@@ -250,8 +240,8 @@ def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -
     assert touching == set()
 
 
-def test_a_folded_arm_does_touch_itself(tmp_path: Path) -> None:
-    # Guards the test above: the shapes do collide where a real arm would.
+def test_a_folded_arm_touches_itself(tmp_path: Path) -> None:
+    # Control of the test above: the shapes collide where those of a real arm would.
     touching = World(xml("panda"), tmp_path).touching([0, 1.7, 0, -3.0, 0, 0.5, 0, 0, 0])
     assert any("ground" not in pair for pair in touching)
 

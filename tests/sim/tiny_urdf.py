@@ -1,4 +1,4 @@
-"""Small URDFs for tests: two links on a joint, with whatever is to be odd about them."""
+"""Small URDFs for tests: links and joints, with the oddities that a test asks for."""
 
 from __future__ import annotations
 
