@@ -29,7 +29,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callab
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with temporary.open("xb") as file:
+        with temporary.open("x+b") as file:
             if callable(content):
                 content(file)
             else:

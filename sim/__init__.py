@@ -17,7 +17,7 @@ for _name in ("batchpid", "assets"):
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo
-from sim.recording.reader import Recording, read_recording
+from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, RobotDescription, register_dynamics
 from sim.robot.limits import SetpointWarning
@@ -36,7 +36,7 @@ __all__ = [
     "Observation",
     "Physics",
     "Recorder",
-    "Recording",
+    "RecordingError",
     "RecoveryWarning",
     "Robot",
     "Rollout",
@@ -45,6 +45,7 @@ __all__ = [
     "SetpointWarning",
     "Snapshot",
     "read_recording",
+    "write_recording",
 ]
 
 _LOADS_SAPIEN = {"Physics": "sim.engine.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}

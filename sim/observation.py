@@ -107,10 +107,10 @@ class RunInfo:
     faults: tuple[Any, ...] = ()
     """Each :class:`sim.Fault` of the runner up to the end of the run."""
 
-    def units_of(self, name: str) -> tuple[str, ...]:
-        """Return the unit for each joint of the quantity ``name`` of :data:`RECORDED`."""
-        quantity = RECORDED["effort" if name == "setpoint" and self.control == "effort" else name]
-        return tuple(map(quantity.unit_for, self.units))
+    def quantity(self, name: str) -> Quantity:
+        """Return the quantity ``name`` of :data:`RECORDED`; under control "effort" the setpoint is an effort."""
+        effort = name == "setpoint" and self.control == "effort"
+        return RECORDED[name]._replace(unit=OBSERVED["effort"].unit) if effort else RECORDED[name]
 
     def for_envs(self, envs: slice | Any) -> RunInfo:
         """Return the info of some envs (a slice or an index array)."""

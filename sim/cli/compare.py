@@ -91,9 +91,11 @@ def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path)
     """Draw the first two ``evaluations`` on their first move to ``path``, and return it."""
     from sim import plots
 
-    first, second = (
-        plots.Traces.of(evaluation.rollout.for_envs(slice(0, 1)), robot, evaluation.name)
-        for evaluation in evaluations[:2]
+    first, second = evaluations[:2]
+    figure = plots.comparison(
+        first.rollout.for_envs(slice(0, 1)),
+        second.rollout.for_envs(slice(0, 1)),
+        labels=(first.name, second.name),
+        title=f"{robot.name}, {first.moves.names[0]} move",
     )
-    title = f"{robot.name}, {evaluations[0].moves.names[0]} move"
-    return plots.save(plots.comparison(first, second, title=title), path)
+    return plots.save(figure, path)

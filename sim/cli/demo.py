@@ -79,8 +79,7 @@ class DemoCommand:
         print(report.run_report(runner, rollout, start, wall))
         for note in settings.notes:
             print(f"Note: {note}")
-        traces = plots.Traces.of(rollout, robot)
-        figure = plots.step_responses(traces, mark=0, title=f"{title}; env 0 from the tutorial's pose")
+        figure = plots.step_responses(rollout, mark=0, title=f"{title}; env 0 from the tutorial's pose")
         print(f"\npicture: {plots.save(figure, picture)}")
         if self.viewer:
             show_window(rollout.for_envs(slice(0, 16)))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from sim.cli import flags
+
+if TYPE_CHECKING:
+    from sim import Rollout
 
 
 @dataclass(frozen=True)
@@ -39,33 +42,28 @@ class PlotCommand:
 
         every = integer("every", self.every, 1, 10**9)
         picture = flags.output_path("picture", self.picture, FORMATS)
-        traces = _read(self.recording, every)
+        rollout = _read(self.recording, every)
         if self.versus is not None:
-            figure = plots.comparison(traces, _read(self.versus, every), joints=self.joints or None)
+            labels = (self.recording.name, self.versus.name)
+            figure = plots.comparison(rollout, _read(self.versus, every), labels=labels, joints=self.joints or None)
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
-            figure = draw(traces, joints=self.joints or None)
+            figure = draw(rollout, joints=self.joints or None)
         named_alike = self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png")
         print(f"picture: {plots.save(figure, picture or named_alike)}")
 
 
-def _read(path: Path, every: int) -> Any:
+def _read(path: Path, every: int) -> Rollout:
+    """Return the run in a file, unless it is empty, and print a line about it."""
     from batchpid.errors import InvalidArgumentError
-    from sim.plots import Traces
-    from sim.recording.dataset import read_rollout
+    from sim import read_recording
 
-    recorded = read_rollout(path, every=every)
-    run = recorded.rollout
-    failed = int((~run.ok[-1:]).sum())
-    print(
-        f"{path}{'' if recorded.complete else ' (cut short)'}: {run.ok.shape[1]} x {recorded.robot}, "
-        f"{len(run.time)} ticks up to {run.time[-1] if len(run.time) else 0:g} s"
-        + (f", {failed} envs diverged" if failed else "")
-    )
-    if not len(run.time):
+    rollout = read_recording(path, every=every)
+    print(f"{path}{'' if rollout.info.complete else ' (cut short)'}: {rollout.info.robot}, {rollout!r}")
+    if not len(rollout.time):
         raise InvalidArgumentError(
             "recording",
             f"{path} holds no tick",
             remedy="its run was cut short in its first second: run it again",
         )
-    return Traces.of(run, recorded, label=path.name)
+    return rollout

@@ -34,16 +34,15 @@ class RenderCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.validate import integer
-        from sim import Robot
+        from sim import Robot, read_recording
         from sim.cli.progress import bar
-        from sim.recording.dataset import read_rollout
         from sim.view.film import FORMATS, write_film
         from sim.view.layout import MAX_ROBOTS
 
         out = flags.output_path("out", self.out, FORMATS)
-        recorded = read_rollout(self.recording)
-        robot = Robot.load(self.robot or recorded.robot, missing_meshes=self.missing_meshes)
-        rollout = recorded.rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
+        rollout = read_recording(self.recording)
+        robot = Robot.load(self.robot or rollout.info.robot, missing_meshes=self.missing_meshes)
+        rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")
         path = write_film(
             rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress

@@ -49,11 +49,10 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.validate import array, number
-        from sim import Recorder, Robot, Runner, plots
+        from sim import Recorder, Robot, Runner, plots, write_recording
         from sim.cli import report
         from sim.cli.run import hold_setpoint, start_poses
         from sim.plots.figures import FORMATS as PICTURES
-        from sim.recording.dataset import write_rollout
         from sim.tuning.gain_sets import gain_set
 
         out = flags.output_path("out", self.out, FORMATS)
@@ -83,8 +82,8 @@ class RolloutCommand:
         print(report.run_report(runner, rollout, start, wall))
         if out:
             if not streamed:
-                write_rollout(out, rollout)
+                write_recording(rollout, out, seed=self.seed, overwrite=True)
             print(f"written: {out}")
         if picture is not None:
-            figure = plots.step_responses(plots.Traces.of(rollout, robot), mark=0, title=robot.name)
+            figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")

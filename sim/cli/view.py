@@ -91,23 +91,22 @@ class ViewCommand:
     def _recorded(self, path: Path) -> Playback:
         """Return the run in the file; of many envs those that fit on the page."""
         from batchpid.errors import InvalidArgumentError, RobotNotFoundError
-        from sim import Robot
-        from sim.recording.dataset import read_rollout
+        from sim import Robot, read_recording
         from sim.view import Playback
         from sim.view.layout import MAX_ROBOTS
 
-        recorded = read_rollout(path)
+        rollout = read_recording(path)
         try:
-            robot = Robot.load(self.robot or recorded.robot, missing_meshes=self.missing_meshes)
+            robot = Robot.load(self.robot or rollout.info.robot, missing_meshes=self.missing_meshes)
         except RobotNotFoundError as error:
             if self.robot is not None:
                 raise
             raise InvalidArgumentError(
                 "play",
-                f"is a run of {recorded.robot!r}, which is not bundled",
+                f"is a run of {rollout.info.robot!r}, which is not bundled",
                 value=str(path),
-                remedy=f"pass its URDF too: batchpid view path/to/{recorded.robot}.urdf --play {path}",
+                remedy=f"pass its URDF too: batchpid view path/to/{rollout.info.robot}.urdf --play {path}",
             ) from error
-        if recorded.rollout.num_envs > MAX_ROBOTS:
-            print(f"showing the first {MAX_ROBOTS} of {recorded.rollout.num_envs} envs")
-        return Playback(recorded.rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=1 / self.fps)
+        if rollout.num_envs > MAX_ROBOTS:
+            print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
+        return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=1 / self.fps)

@@ -1,6 +1,5 @@
 """Figures of runs, drawn by Matplotlib."""
 
-from sim.plots.figures import check_path, comparison, efforts, save, step_responses
-from sim.plots.traces import Traces
+from sim.plots.figures import comparison, efforts, save, step_responses
 
-__all__ = ["Traces", "check_path", "comparison", "efforts", "save", "step_responses"]
+__all__ = ["comparison", "efforts", "save", "step_responses"]

@@ -1,17 +1,19 @@
-"""What goes into a panel: the envs as a fan, setpoint, limits, efforts; and the part of the axis that is shown."""
+"""Parts of a figure: the envs as a fan or a band, setpoints, limits and efforts, and the range of an axis."""
 
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from sim.plots.traces import Traces
+from sim.observation import OBSERVED, Rollout
 
 ENV = "#4c78a8"
 MEDIAN = "#16324f"
@@ -24,7 +26,7 @@ SMALL = 7.0
 
 
 def draw_fan(axes: Axes, time: NDArray[Any], values: NDArray[Any], mark: int | None) -> None:
-    """Every env as a thin line, the median as a bold one, ``mark`` apart."""
+    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env ``mark`` in colour."""
     lines = np.empty((values.shape[1], len(time), 2))
     lines[..., 0], lines[..., 1] = time, values.T
     alpha = min(0.9, max(0.08, 12.0 / len(lines)))
@@ -32,30 +34,32 @@ def draw_fan(axes: Axes, time: NDArray[Any], values: NDArray[Any], mark: int | N
     axes.add_collection(
         LineCollection(list(lines), colors=ENV, linewidths=0.6, alpha=alpha, rasterized=True), autolim=False
     )
-    axes.plot(time, quantile(values, 0.5), color=MEDIAN, lw=1.5)
+    axes.plot(time, *quantiles(values, 0.5), color=MEDIAN, lw=1.5)
     if mark is not None:
         axes.plot(time, values[:, mark], color=MARKED, lw=1.1)
 
 
 def draw_band(axes: Axes, time: NDArray[Any], values: NDArray[Any], colour: str) -> None:
-    """The median of the envs as a line, 10 to 90 % of them as a band."""
-    axes.fill_between(time, quantile(values, 0.1), quantile(values, 0.9), color=colour, alpha=0.2, lw=0)
-    axes.plot(time, quantile(values, 0.5), color=colour, lw=1.4)
+    """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
+    low, median, high = quantiles(values, 0.1, 0.5, 0.9)
+    axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
+    axes.plot(time, median, color=colour, lw=1.4)
 
 
-def draw_setpoint(axes: Axes, traces: Traces, joint: int, band: float | None) -> None:
-    """The setpoint, one line where all envs share it; around its last value the settling band."""
-    setpoint = traces.setpoint[..., joint]
+def draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> None:
+    """Draw the setpoint, one line where all envs share it, and the settling band around its last value."""
+    setpoint = run.setpoint[..., joint]
     shared = (setpoint == setpoint[:, :1]).all()
-    axes.plot(traces.time, setpoint[:, 0] if shared else setpoint, color=SETPOINT, lw=1.1, ls="--", zorder=3)
-    move = np.abs(setpoint[-1] - traces.qpos[0, :, joint])
-    if band is not None and shared and np.isfinite(move).any():
-        half = band * float(np.nanmedian(move))
+    axes.plot(run.time, setpoint[:, 0] if shared else setpoint, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    move = np.abs(setpoint[-1] - run.qpos[0, :, joint])
+    move = move[np.isfinite(move)]
+    if band is not None and shared and move.size:
+        half = band * float(np.median(move))
         axes.axhspan(setpoint[-1, 0] - half, setpoint[-1, 0] + half, color=SETPOINT, alpha=0.2, lw=0)
 
 
 def draw_limits(axes: Axes, low: float, high: float) -> None:
-    """A line at each finite limit, and hatching beyond."""
+    """Draw a line at each finite limit, and hatching beyond it."""
     for limit, sign in ((low, -1), (high, 1)):
         if math.isfinite(limit):
             far = limit + sign * 1e3 * max(1.0, abs(limit))
@@ -63,23 +67,23 @@ def draw_limits(axes: Axes, low: float, high: float) -> None:
             axes.axhline(limit, color=LIMIT, lw=0.9, zorder=2)
 
 
-def draw_efforts(axes: Axes, traces: Traces, joint: int, mark: int | None) -> None:
-    """A joint's efforts as a fan against its limit, with the share of envs in saturation as a strip above."""
-    values, limit = traces.effort[..., joint], float(traces.effort_limit[joint])
+def draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None:
+    """Draw the efforts as a fan against their limit, with the share of envs in saturation as a strip at the top."""
+    values, limit = run.effort[..., joint], float(run.info.effort_limit[joint])
     draw_limits(axes, -limit, limit)
-    draw_fan(axes, traces.time, values, mark)
-    view_efforts(axes, values, traces, joint)
-    share = traces.saturated[..., joint].mean(1)
+    draw_fan(axes, run.time, values, mark)
+    set_effort_range(axes, [run], joint)
+    share = run.saturated[..., joint].mean(1)
     if share.any():
         strip = axes.inset_axes((0, 0.97, 1, 0.06))
-        strip.imshow(share[None], aspect="auto", cmap=_saturation_colours(), vmin=0, vmax=1, interpolation="nearest")
+        colours = LinearSegmentedColormap.from_list("saturation", [to_rgba(LIMIT, 0.0), to_rgba(LIMIT, 0.9)])
+        strip.imshow(share[None], aspect="auto", cmap=colours, vmin=0, vmax=1, interpolation="nearest")
         strip.set_axis_off()
-    peak = np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+    peak, unit = np.max(np.abs(values), initial=0.0, where=np.isfinite(values)), _effort_unit(run, joint)
+    note = f"peak {peak:.3g} {unit}, no limit"
     if math.isfinite(limit):
-        note = f"peak {peak / limit:.0%} of ±{limit:g} {traces.effort_unit(joint)}"
-    else:
-        note = f"peak {peak:.3g} {traces.effort_unit(joint)}, no limit"
-    # Out of the way of the curves' ends.
+        note = f"peak {peak / limit:.0%} of ±{limit:g} {unit}"
+    # The note goes where the curves do not end.
     low, high = axes.get_ylim()
     ends = values[2 * len(values) // 3 :]
     above = np.mean(ends, where=np.isfinite(ends)) < (low + high) / 2 if np.isfinite(ends).any() else False
@@ -96,49 +100,53 @@ def draw_efforts(axes: Axes, traces: Traces, joint: int, mark: int | None) -> No
     )
 
 
-def _saturation_colours() -> Any:
-    return LinearSegmentedColormap.from_list("saturation", [to_rgba(LIMIT, 0.0), to_rgba(LIMIT, 0.9)])
+def set_position_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
+    """Show all positions and the first run's setpoints, but no more than 15 % beyond the limits.
+
+    A limit that is infinite is taken two turns, or 1 m, beyond the setpoints.
+    """
+    info, positions = runs[0].info, _joint_values(runs, "qpos", joint)
+    setpoints = _joint_values(runs[:1], "setpoint", joint)
+    targets = setpoints if setpoints.size else np.zeros(1)
+    low, high = info.lower[joint], info.upper[joint]
+    far = 4 * np.pi if info.units[joint] == "rad" else 1.0
+    low = low if math.isfinite(low) else targets.min() - far
+    high = high if math.isfinite(high) else targets.max() + far
+    margin = 0.15 * (high - low)
+    low, high = min(low - margin, targets.min()), max(high + margin, targets.max())
+    _set_range(axes, np.clip(np.append(positions, setpoints), low, high))
+    axes.set_ylabel(info.units[joint], fontsize=SMALL)
 
 
-# -- what part of the axis is shown ------------------------------------------------------------------------------
+def set_effort_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
+    """Show all efforts, and the limit of the first run unless it is more than five times as far."""
+    limit, efforts = float(runs[0].info.effort_limit[joint]), _joint_values(runs, "effort", joint)
+    near = math.isfinite(limit) and np.abs(efforts).max(initial=0.0) > 0.2 * limit
+    _set_range(axes, np.append(efforts, [0.0, limit, -limit] if near else [0.0]))
+    axes.set_ylabel(_effort_unit(runs[0], joint), fontsize=SMALL)
 
 
-def view(axes: Axes, values: NDArray[Any], traces: Traces, joint: int) -> None:
-    """Show the positions, but of a run that flies off only a little beyond the limits (or two turns)."""
-    setpoint = traces.setpoint[..., joint]
-    low, high = traces.lower[joint], traces.upper[joint]
-    turn = 4 * np.pi if traces.units[joint] == "rad" else 1.0
-    low = low if math.isfinite(low) else setpoint.min() - turn
-    high = high if math.isfinite(high) else setpoint.max() + turn
-    room = 0.15 * (high - low)
-    low, high = min(low - room, setpoint.min()), max(high + room, setpoint.max())
-    _set_view(axes, np.clip(values[np.isfinite(values)], low, high))
-    axes.set_ylabel(traces.units[joint], fontsize=SMALL)
+def quantiles(values: NDArray[Any], *at: float) -> NDArray[Any]:
+    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN where there are none."""
+    finite = np.where(np.isfinite(values), values, np.nan)
+    if not np.isnan(finite).any():  # nanquantile is many times slower
+        return np.quantile(finite, at, axis=1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN slice")
+        return np.nanquantile(finite, at, axis=1)
 
 
-def view_efforts(axes: Axes, values: NDArray[Any], traces: Traces, joint: int) -> None:
-    """Show the efforts, and their limit too where it is not many times farther."""
-    limit, finite = float(traces.effort_limit[joint]), values[np.isfinite(values)]
-    peak = np.abs(finite).max(initial=0.0)
-    reach = [limit, -limit] if math.isfinite(limit) and peak > 0.2 * limit else []
-    _set_view(axes, np.append(finite, [0.0, *reach]))
-    axes.set_ylabel(traces.effort_unit(joint), fontsize=SMALL)
+def _joint_values(runs: Sequence[Rollout], name: str, joint: int) -> NDArray[Any]:
+    values = np.concatenate([getattr(run, name)[..., joint].ravel() for run in runs])
+    return values[np.isfinite(values)]
 
 
-def _set_view(axes: Axes, values: NDArray[Any]) -> None:
+def _effort_unit(run: Rollout, joint: int) -> str:
+    return OBSERVED["effort"].unit_for(run.info.units[joint])
+
+
+def _set_range(axes: Axes, values: NDArray[Any]) -> None:
     if values.size:
         low, high = float(values.min()), float(values.max())
-        room = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)
-        axes.set_ylim(low - room, high + room)
-
-
-def quantile(values: ArrayLike, q: float) -> NDArray[Any]:
-    """Quantile over envs (axis 1) of what is finite; NaN where nothing is."""
-    table = np.sort(np.where(np.isfinite(values), values, np.nan), axis=1)  # NaN last
-    count = np.isfinite(table).sum(1)
-    place = q * np.maximum(count - 1, 0)
-    low = np.floor(place).astype(int)
-    high = np.minimum(low + 1, np.maximum(count - 1, 0))
-    rows = np.arange(len(table))
-    result = table[rows, low] + (place - low) * (table[rows, high] - table[rows, low])
-    return np.where(count > 0, result, np.nan)
+        margin = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)
+        axes.set_ylim(low - margin, high + margin)

@@ -1,4 +1,4 @@
-"""Pictures of a run: step responses, efforts against their limits, and two runs side by side.
+"""Figures of runs: step responses, efforts against their limits, and two runs compared.
 
 Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no global state.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,28 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.validate import file_path
+from sim.observation import Rollout
 from sim.plots import drawing
-from sim.plots.traces import Traces
-
-__all__ = ["Traces", "check_path", "comparison", "efforts", "save", "step_responses"]
 
 FORMATS = (".png", ".svg")
+_MEDIAN = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")
+_SETPOINT = Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint")
+_BEYOND = Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits")
+_SATURATION = Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs in saturation")
 
 
 def step_responses(
-    traces: Traces,
+    rollout: Rollout,
     *,
     joints: Sequence[int | str] | None = None,
     band: float = 0.02,
     mark: int | None = None,
     title: str = "",
 ) -> Figure:
-    """For each joint, positions against setpoint and limits above efforts against their limit.
+    """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
+
+    Not-finite samples are gaps; so is everything of an env from where ``ok`` is False.
 
     Parameters
     ----------
@@ -45,103 +51,96 @@ def step_responses(
     band
         Half width of the settling band around the last setpoint, as a fraction of the median move.
     mark
-        An env to draw apart from the fan.
-    """
-    figure, blocks = _figure(traces, joints, rows=2, title=title)
-    for joint, (above, below) in blocks:
-        _name(above, traces, joint)
-        drawing.draw_limits(above, traces.lower[joint], traces.upper[joint])
-        drawing.draw_setpoint(above, traces, joint, band)
-        drawing.draw_fan(above, traces.time, traces.qpos[..., joint], mark)
-        drawing.view(above, np.stack([traces.qpos[..., joint], traces.setpoint[..., joint]]), traces, joint)
-        drawing.draw_efforts(below, traces, joint, mark)
-    median = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")
-    _legend(
-        figure,
-        [
-            Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {traces.num_envs} envs"),
-            *([] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]),
-            median,
-            Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint"),
-            Patch(color=drawing.SETPOINT, alpha=0.2, lw=0, label=f"settling band, {band:.0%} of the move"),
-            Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits"),
-            Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs in saturation"),
-        ],
-    )
-    return figure
-
-
-def efforts(
-    traces: Traces, *, joints: Sequence[int | str] | None = None, mark: int | None = None, title: str = ""
-) -> Figure:
-    """For each joint, efforts against their limit, and the share of envs in saturation."""
-    figure, blocks = _figure(traces, joints, rows=1, title=title)
-    for joint, (axes,) in blocks:
-        _name(axes, traces, joint)
-        drawing.draw_efforts(axes, traces, joint, mark)
-    _legend(
-        figure,
-        [
-            Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {traces.num_envs} envs"),
-            Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median"),
-            Line2D([], [], color=drawing.LIMIT, lw=1.0, label="limit"),
-            Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs in saturation"),
-        ],
-    )
-    return figure
-
-
-def comparison(first: Traces, second: Traces, *, joints: Sequence[int | str] | None = None, title: str = "") -> Figure:
-    """Two runs of the same joints: median and 10 to 90 % of the envs, positions above efforts.
+        An env to draw in a colour apart.
 
     Raises
     ------
     InvalidArgumentError
-        The runs have different joints.
+        The robot has no such joint.
     """
-    if first.joint_names != second.joint_names:
+    run = _blank_failed(rollout)
+    figure, blocks = _figure(run, joints, rows=2, title=title)
+    for joint, (above, below) in blocks:
+        drawing.draw_limits(above, run.info.lower[joint], run.info.upper[joint])
+        drawing.draw_setpoint(above, run, joint, band)
+        drawing.draw_fan(above, run.time, run.qpos[..., joint], mark)
+        drawing.set_position_range(above, [run], joint)
+        drawing.draw_efforts(below, run, joint, mark)
+    settling = Patch(color=drawing.SETPOINT, alpha=0.2, lw=0, label=f"settling band, {band:.0%} of the move")
+    _legend(figure, [*_fan_entries(run, mark), _SETPOINT, settling, _BEYOND, _SATURATION])
+    return figure
+
+
+def efforts(
+    rollout: Rollout, *, joints: Sequence[int | str] | None = None, mark: int | None = None, title: str = ""
+) -> Figure:
+    """Draw, for each joint, efforts against their limit, and the share of envs in saturation.
+
+    Parameters as in :func:`step_responses`.
+    """
+    run = _blank_failed(rollout)
+    figure, blocks = _figure(run, joints, rows=1, title=title)
+    for joint, (axes,) in blocks:
+        drawing.draw_efforts(axes, run, joint, mark)
+    limit = Line2D([], [], color=drawing.LIMIT, lw=1.0, label="limit")
+    _legend(figure, [*_fan_entries(run, mark), limit, _SATURATION])
+    return figure
+
+
+def comparison(
+    first: Rollout,
+    second: Rollout,
+    *,
+    labels: tuple[str, str] = ("first", "second"),
+    joints: Sequence[int | str] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above efforts.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The runs have different joints, or the robot has no such joint.
+    """
+    ours, theirs = first.info.joint_names, second.info.joint_names
+    if ours != theirs:
         raise InvalidArgumentError(
             "second",
-            f"has the joints {', '.join(second.joint_names)}, the first run {', '.join(first.joint_names)}",
+            f"has the joints {', '.join(theirs)}, the first run {', '.join(ours)}",
             remedy="compare runs of the same robot",
         )
-    runs = ((first, drawing.ENV, first.label or "first"), (second, drawing.SECOND, second.label or "second"))
-    figure, blocks = _figure(first, joints, rows=2, title=title)
+    runs = [_blank_failed(run) for run in (first, second)]
+    colours = (drawing.ENV, drawing.SECOND)
+    info = first.info
+    figure, blocks = _figure(runs[0], joints, rows=2, title=title)
     for joint, (above, below) in blocks:
-        _name(above, first, joint)
-        drawing.draw_limits(above, first.lower[joint], first.upper[joint])
-        drawing.draw_setpoint(above, first, joint, None)
-        drawing.draw_limits(below, -first.effort_limit[joint], first.effort_limit[joint])
-        for run, colour, _ in runs:
+        drawing.draw_limits(above, info.lower[joint], info.upper[joint])
+        drawing.draw_setpoint(above, runs[0], joint, None)
+        drawing.draw_limits(below, -info.effort_limit[joint], info.effort_limit[joint])
+        for run, colour in zip(runs, colours, strict=True):
             drawing.draw_band(above, run.time, run.qpos[..., joint], colour)
             drawing.draw_band(below, run.time, run.effort[..., joint], colour)
-        both = [run.qpos[..., joint].ravel() for run, _, _ in runs]
-        drawing.view(above, np.concatenate([*both, first.setpoint[..., joint].ravel()]), first, joint)
-        drawing.view_efforts(
-            below, np.concatenate([run.effort[..., joint].ravel() for run, _, _ in runs]), first, joint
-        )
+        drawing.set_position_range(above, runs, joint)
+        drawing.set_effort_range(below, runs, joint)
         for axes in (above, below):
             axes.set_xlim(0, max(first.time[-1], second.time[-1]))
-    _legend(
-        figure,
-        [
-            *(Line2D([], [], color=colour, lw=1.6, label=f"{label}: median, 10 to 90 %") for _, colour, label in runs),
-            Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint"),
-            Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits"),
-        ],
-    )
+    bands = [
+        Line2D([], [], color=colour, lw=1.6, label=f"{label}: median, 10 to 90 %")
+        for label, colour in zip(labels, colours, strict=True)
+    ]
+    _legend(figure, [*bands, _SETPOINT, _BEYOND])
     return figure
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
-    """Write ``figure`` to ``path`` (.png or .svg), making its folder; returns the path.
+    """Write ``figure`` to ``path`` (.png or .svg), making its folder, and return the path.
 
     Raises
     ------
     InvalidArgumentError
         Another suffix.
     """
-    path = check_path(path)
+    path = file_path("path", path, FORMATS)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".svg":
         figure.savefig(path, dpi=dpi)
@@ -155,35 +154,39 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
     return path
 
 
-def check_path(path: str | Path) -> Path:
-    """``path`` if its suffix is one that :func:`save` can write; see there."""
-    path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise InvalidArgumentError(
-            "path", "unknown picture format", value=str(path), remedy=f"end it in {' or '.join(FORMATS)}"
-        )
-    return path
+def _blank_failed(rollout: Rollout) -> Rollout:
+    """Return the rollout with NaN where an env has failed, and for setpoints that are no positions."""
+    alive, seen = rollout.ok[..., None], rollout.observation
+    blank = seen._replace(qpos=np.where(alive, seen.qpos, np.nan), effort=np.where(alive, seen.effort, np.nan))
+    position = np.isfinite(rollout.setpoint) & (rollout.info.control != "effort")
+    return replace(rollout, setpoint=np.where(position, rollout.setpoint, np.nan), observation=blank)
 
 
-# -- layout ------------------------------------------------------------------------------------------------------
+def _joint_indices(run: Rollout, joints: Sequence[int | str] | None) -> list[int]:
+    names = run.info.joint_names
+    known: dict[int | str, int] = {key: index for index, name in enumerate(names) for key in (name, index)}
+    for joint in joints or ():
+        if joint not in known:
+            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}")
+    return list(range(len(names))) if joints is None else [known[joint] for joint in joints]
 
 
 def _figure(
-    traces: Traces, joints: Sequence[int | str] | None, *, rows: int, title: str
+    run: Rollout, joints: Sequence[int | str] | None, *, rows: int, title: str
 ) -> tuple[Figure, Iterator[tuple[int, list[Axes]]]]:
-    """A figure with one block of ``rows`` panels for each joint, in a grid; and (joint, panels) pairs."""
-    chosen = traces.chosen(joints)
-    # As few empty places as can be, in three columns, or four or five of many joints.
+    """Return a figure with ``rows`` axes for each joint, in a grid; and (joint, axes) pairs."""
+    chosen = _joint_indices(run, joints)
+    # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty cells.
     columns = min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
     lines = math.ceil(len(chosen) / columns)
     heights = (1.7, 0.85)[:rows]
-    between = 0.06  # a thin empty row sets one joint's panels apart from the next one's
+    between = 0.06  # a thin empty row separates the joints
     size = ((4.0 if columns < 5 else 3.6) * columns, (sum(heights) + between) * lines + 0.75)
     figure = Figure(figsize=size, layout="constrained")
     figure.get_layout_engine().set(h_pad=0.02, w_pad=0.05, hspace=0.0)  # type: ignore[call-arg, union-attr]
     if title:
         figure.suptitle(title, fontsize=11)
-    # One flat grid, so that the panels of a column are aligned.
+    # One flat grid, so that the axes of a column are aligned.
     grid = figure.add_gridspec(lines * (rows + 1), columns, height_ratios=(*heights, between) * lines)
 
     def blocks() -> Iterator[tuple[int, list[Axes]]]:
@@ -194,22 +197,25 @@ def _figure(
             for axes in block:
                 axes.tick_params(labelsize=drawing.SMALL, length=2)
                 axes.spines[["top", "right"]].set_visible(False)
-                axes.set_xlim(0, traces.time[-1])
+                axes.set_xlim(0, run.time[-1])
                 axes.yaxis.set_major_locator(MaxNLocator(4))
                 axes.tick_params(labelbottom=axes is block[-1] and last)
             if last:
                 block[-1].set_xlabel("time [s]", fontsize=drawing.SMALL)
+            block[0].set_title(run.info.joint_names[joint], fontsize=8, loc="left", pad=3, fontweight="bold")
             yield joint, block
 
     return figure, blocks()
 
 
-def _name(axes: Axes, traces: Traces, joint: int) -> None:
-    axes.set_title(traces.joint_names[joint], fontsize=8, loc="left", pad=3, fontweight="bold")
+def _fan_entries(run: Rollout, mark: int | None) -> list[Line2D]:
+    each = Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs")
+    marked = [] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]
+    return [each, *marked, _MEDIAN]
 
 
 def _legend(figure: Figure, handles: list[Any]) -> None:
-    # As many side by side as the figure is wide enough for: an entry of n letters takes about n + 8 of them.
+    # As many columns as the figure is wide enough for: an entry of n letters takes about n + 8 of them.
     letters = figure.get_figwidth() * 17
     columns = max(1, min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles)))))
     if sum(len(handle.get_label()) + 8 for handle in handles) < letters:

@@ -1,1 +1,1 @@
-"""Runs on disk: one writer and one reader."""
+"""Rollouts in files, and as labelled data."""

@@ -71,7 +71,7 @@ def test_hours_leave_memory_flat_and_two_halves_make_a_whole(tmp_path):
     warming_up = 0 if ticks >= 30_000 else 8 << 20
     assert late <= 1.02 * early + warming_up
     recording = read_recording(tmp_path / "run.h5", every=max(1, ticks // 100))
-    assert recording.complete
+    assert recording.info.complete
     assert np.ptp(recording.qpos[:, :, 0], axis=0).min() > 0.1
     with make() as runner:
         runner.restore(Snapshot.load(tmp_path / "half.npz"))

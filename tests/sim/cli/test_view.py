@@ -1,24 +1,24 @@
 """batchpid view: its start and its end. The page is tested in tests/sim/view."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Observation, Robot, Rollout
+from sim import Observation, Robot, Rollout, write_recording
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
 
 
 def write(path, robot="panda", envs=1):
-    """A rollout of two ticks at rest, as batchpid rollout --out writes it."""
+    """Write a rollout of two ticks at rest."""
     panda = Robot.load("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
-    rollout = Rollout(np.array([0.1, 0.2]), zeros, seen, tick=0.1, info=panda.run_info())
-    told = {name: getattr(panda, name) for name in ("joint_names", "units", "lower", "upper", "effort_limit")}
-    np.savez(path, **rollout.arrays(), tick=rollout.tick, **told, robot=robot)
-    return path
+    info = replace(panda.run_info(), robot=robot)
+    return write_recording(Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path)
 
 
 def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
@@ -53,7 +53,7 @@ def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
     [
         (("--port", 99999), "port: out of range (got 99999)"),
         (("--fps", 0), "fps: out of range"),
-        (("--play", "nothing.npz"), "path: is no file"),
+        (("--play", "nothing.npz"), "nothing.npz: there is no such file"),
         (("--num-envs", 65), "num_envs: out of range"),
     ],
 )
