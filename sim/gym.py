@@ -1,7 +1,7 @@
-"""Gymnasium: reach a drawn pose with N robots, joint setpoints as actions, the PID beside the physics.
+"""Gymnasium environments: N robots reach random joint poses, with joint setpoints as actions.
 
 ``import sim.gym`` registers ``batchpid/Reach-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``;
-``make_vec("sim.gym:batchpid/Reach-v0", ...)`` imports it by itself. Arrays are NumPy's, fresh at every step:
+``make_vec("sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every step:
 ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
 """
 
@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.validate import choice, integer, number
+from batchpid.validate import array, choice, env_mask, integer, number
+from sim.observation import Observation
 from sim.robot.robot import Robot
 from sim.runner import Runner
 
@@ -31,15 +32,15 @@ Bool = NDArray[np.bool_]
 
 ACTIONS = ("setpoint", "increment")
 SPREAD = 0.1
-"""How far from the robot's start pose an episode may begin [rad or m]."""
+"""Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or m]."""
 MARGIN = 0.05
-"""Share of a joint's range at each end in which no goal is drawn."""
-FASTEST = 100.0
-"""The velocity at which PhysX stops every joint, and bound of the observed one [rad/s or m/s]."""
+"""Share of a joint's range, at each end, in which no goal is drawn."""
+MAX_SPEED = 100.0
+"""Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
 
 
 class ReachVectorEnv(VectorEnv):
-    """N robots, each to reach a joint pose of its own: a :class:`gymnasium.vector.VectorEnv` over the Runner.
+    """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
     - *Observation* (envs, 3 dof): qpos, qvel, goal [rad or m, and per second], clipped to the space.
     - *Action* (envs, dof) in [-1, 1]: the setpoint within the joint limits, or an increment of the setpoint.
@@ -51,13 +52,13 @@ class ReachVectorEnv(VectorEnv):
     Parameters
     ----------
     robot
-        A bundled robot's name, a URDF path, or a :class:`sim.Robot`.
+        Name of a bundled robot, URDF path, or :class:`sim.Robot`.
     rate_hz
-        Actions per second; the PID runs at every sim step between.
+        Actions per second; the PID runs at every sim step in between.
     actions
         ``"setpoint"`` or ``"increment"``.
     max_increment
-        An increment of 1 moves the setpoint so far, scalar or (dof,) [rad or m]; default the velocity limit times the
+        Change of the setpoint by an increment of 1, scalar or (dof,) [rad or m]; default the velocity limit times the
         time of a step.
     tolerance
         Largest error of a reached goal [rad or m].
@@ -79,7 +80,7 @@ class ReachVectorEnv(VectorEnv):
         *,
         rate_hz: float = 50.0,
         actions: str = "setpoint",
-        max_increment: Any = None,
+        max_increment: ArrayLike | None = None,
         tolerance: float = 0.02,
         terminate_on_success: bool = False,
         max_episode_steps: int | None = 250,
@@ -97,64 +98,54 @@ class ReachVectorEnv(VectorEnv):
         )
         if render_mode is not None:
             raise InvalidArgumentError(
-                "render_mode", "is not offered", value=render_mode, remedy="watch robots with batchpid view"
+                "render_mode", "is not supported", value=render_mode, remedy="watch robots with batchpid view"
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         timestep = options.get("timestep", 1 / 2000)
-        rate = number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second")
+        substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
 
-        far = np.pi
-        self.low = np.where(np.isfinite(self.robot.lower), self.robot.lower, -far)
-        self.high = np.where(np.isfinite(self.robot.upper), self.robot.upper, far)
-        substeps = round(1 / (rate * timestep))
-        increment = np.minimum(self.robot.velocity_limit, FASTEST) * substeps * timestep
-        self.max_increment = np.broadcast_to(
-            np.asarray(increment if max_increment is None else max_increment, np.float64), (self.robot.dof,)
-        )
-        fastest = np.full(self.robot.dof, FASTEST)
+        dof = self.robot.dof
+        self.low = np.where(np.isfinite(self.robot.lower), self.robot.lower, -np.pi)
+        self.high = np.where(np.isfinite(self.robot.upper), self.robot.upper, np.pi)
+        if max_increment is None:
+            max_increment = np.minimum(self.robot.velocity_limit, MAX_SPEED) * substeps * timestep
+        self.max_increment = array("max_increment", max_increment, (1, dof), self.robot.joint_names)[0]
+        speed = np.full(dof, MAX_SPEED)
         self.single_observation_space = spaces.Box(
-            np.concatenate([self.low - far, -fastest, self.low]).astype(np.float32),
-            np.concatenate([self.high + far, fastest, self.high]).astype(np.float32),
+            np.concatenate([self.low - np.pi, -speed, self.low]).astype(np.float32),
+            np.concatenate([self.high + np.pi, speed, self.high]).astype(np.float32),
         )
-        self.single_action_space = spaces.Box(-1.0, 1.0, (self.robot.dof,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (dof,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-        shape = (self.num_envs, self.robot.dof)
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
         self._generators = np.random.default_rng().spawn(self.num_envs)
-        self._goal, self._setpoint = np.zeros(shape), np.zeros(shape)
-        self._observation = np.zeros((self.num_envs, 3 * self.robot.dof), np.float32)
+        self._goal, self._setpoint = np.zeros((2, self.num_envs, dof))
+        self._observation = np.zeros((self.num_envs, 3 * dof), np.float32)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32, dict[str, Any]]:
-        """Begin new episodes, in the envs of ``options["reset_mask"]`` or in all.
+        """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
 
-        An int ``seed`` gives env k the seed + k; a sequence has one for each env. What an env draws depends on its
-        seed alone, not on its company.
+        An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
+        an env draws depends on its own seed alone.
         """
-        mask = np.ones(self.num_envs, bool) if not options else options.get("reset_mask", np.ones(self.num_envs, bool))
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
+        mask = np.ones(self.num_envs, bool)
+        if options and "reset_mask" in options:
+            mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
+        if not mask.any():
             raise InvalidArgumentError(
-                "options['reset_mask']",
-                f"must be a bool array of shape ({self.num_envs},) with a True in it",
-                remedy="use e.g. mask = terminated | truncated",
+                "options['reset_mask']", "selects no env", remedy="use e.g. mask = terminated | truncated"
             )
-        seeds = [seed + k for k in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
         if seeds is not None and len(seeds) != self.num_envs:
             raise InvalidArgumentError(
-                "seed",
-                f"has {len(seeds)} entries for {self.num_envs} envs",
-                remedy="give an int, or one for each env",
+                "seed", f"has {len(seeds)} entries for {self.num_envs} envs", remedy="give an int, or one for each env"
             )
         for env in np.flatnonzero(mask).tolist():
             if seeds is not None and seeds[env] is not None:
@@ -162,109 +153,81 @@ class ReachVectorEnv(VectorEnv):
         self._begin(mask)
         return self._observation.copy(), self._info(mask)
 
-    def step(self, actions: Any) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
-        """Let every robot follow its action for one step; arrays are (envs, ...)."""
-        action = np.asarray(actions, np.float64)
-        if action.shape != self._goal.shape or not np.isfinite(action).all():
-            raise InvalidArgumentError(
-                "actions",
-                f"must be finite, of shape {self._goal.shape}",
-                value=action.shape,
-                remedy="see action_space",
-            )
+    def step(self, actions: ArrayLike) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
+        """Apply an action (envs, dof) for one step; return observation, reward, terminated, truncated and info."""
+        action = np.clip(array("actions", actions, self._goal.shape, self.robot.joint_names), -1.0, 1.0)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
-        action = np.clip(action, -1.0, 1.0)
         if self.actions == "setpoint":
-            wanted = self.low + (action + 1) / 2 * (self.high - self.low)
+            setpoint = self.low + (action + 1) / 2 * (self.high - self.low)
         else:
-            wanted = np.clip(self._setpoint + action * self.max_increment, self.low, self.high)
-        self._setpoint = np.where(begins[:, None], self._setpoint, wanted)
+            setpoint = np.clip(self._setpoint + action * self.max_increment, self.low, self.high)
+        self._setpoint = np.where(begins[:, None], self._setpoint, setpoint)
         self._observe(self.runner.step(self._setpoint))
         self._steps += 1
 
         reward = 1.0 * self._success - (self._error / (self.high - self.low)).mean(1)
         terminated = self._diverged | (self._success & self.terminate_on_success)
-        truncated = np.zeros(self.num_envs, bool)
-        if self.max_episode_steps is not None:
-            truncated = self._steps >= self.max_episode_steps
-        if begins.any():  # next-step mode: this step of theirs begins the new episode
+        truncated = self._steps >= (np.inf if self.max_episode_steps is None else self.max_episode_steps)
+        if begins.any():  # in next-step mode this step begins the next episode
             self._begin(begins)
-            reward, terminated, truncated = (
-                np.where(begins, 0.0, reward),
-                terminated & ~begins,
-                truncated & ~begins,
-            )
+            reward[begins] = 0.0
+            terminated, truncated = terminated & ~begins, truncated & ~begins
         self._done = terminated | truncated
-        info = self._info(np.ones(self.num_envs, bool))
+        everywhere = np.ones(self.num_envs, bool)
+        info = self._info(everywhere)
         if self._done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
             done = self._done
             final = np.full(self.num_envs, None, object)
             for env in np.flatnonzero(done):
                 final[env] = self._observation[env].copy()
-            info = {
-                "final_obs": final,
-                "_final_obs": done,
-                "final_info": self._info(done),
-                "_final_info": done,
-            }
+            info = {"final_obs": final, "_final_obs": done, "final_info": self._info(done), "_final_info": done}
             self._begin(done)
-            info |= self._info(np.ones(self.num_envs, bool))
+            info |= self._info(everywhere)
         return self._observation.copy(), reward, terminated, truncated, info
 
     def close_extras(self, **_: Any) -> None:
-        """End the workers."""
+        """Close the runner."""
         self.runner.close()
 
-    # -- inside --------------------------------------------------------------------------------------------------
-
     def _begin(self, mask: Bool) -> None:
-        """Draw start and goal of the envs of ``mask``, and place their robots."""
-        start = np.array(self._setpoint)
-        room = MARGIN * (self.high - self.low)
+        """Draw start and goal of the masked envs, and place their robots."""
+        start = self._setpoint.copy()
+        margin = MARGIN * (self.high - self.low)
         for env in np.flatnonzero(mask).tolist():
-            draw = self._generators[env]
-            start[env] = self.robot.start + draw.uniform(-SPREAD, SPREAD, self.robot.dof)
-            self._goal[env] = draw.uniform(self.low + room, self.high - room)
-        start = np.clip(start, self.low, self.high)
-        self._setpoint = np.where(mask[:, None], start, self._setpoint)
+            generator = self._generators[env]
+            drawn = self.robot.start + generator.uniform(-SPREAD, SPREAD, self.robot.dof)
+            start[env] = np.clip(drawn, self.low, self.high)
+            self._goal[env] = generator.uniform(self.low + margin, self.high - margin)
+        self._setpoint = start
         self._steps[mask] = 0
         self._done = self._done & ~mask
         self._observe(self.runner.reset(start, mask=mask))
 
-    def _observe(self, obs: Any) -> None:
-        """Take in what the runner saw; an env that diverged keeps its last finite observation."""
-        seen = np.concatenate([obs.qpos, obs.qvel, self._goal.astype(np.float32)], axis=1)
+    def _observe(self, observed: Observation) -> None:
+        """Update the observation; an env that diverged keeps its last finite one."""
         space: Any = self.single_observation_space
-        self._diverged = ~obs.ok
-        self._observation = np.where(obs.ok[:, None], np.clip(seen, space.low, space.high), self._observation)
+        joined = np.concatenate([observed.qpos, observed.qvel, self._goal.astype(np.float32)], axis=1)
+        self._diverged = ~observed.ok
+        self._observation = np.where(observed.ok[:, None], np.clip(joined, space.low, space.high), self._observation)
         self._error = np.abs(self._goal - self._observation[:, : self.robot.dof])
-        self._success = obs.ok & (self._error <= self.tolerance).all(1)
+        self._success = observed.ok & (self._error <= self.tolerance).all(1)
 
     def _info(self, mask: Bool) -> dict[str, Any]:
-        """Info in Gymnasium's vector style: a key, and under _key which envs it holds for."""
+        """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
         values = {"success": self._success, "error": self._error.max(1), "diverged": self._diverged}
-        info: dict[str, Any] = {}
-        for key, value in values.items():
-            info |= {key: np.where(mask, value, np.zeros_like(value)), f"_{key}": mask.copy()}
-        return info
+        info = {key: np.where(mask, value, np.zeros_like(value)) for key, value in values.items()}
+        return info | {f"_{key}": mask.copy() for key in values}
 
 
 class ReachEnv(gymnasium.Env):
-    """One robot of :class:`ReachVectorEnv`, for code that wants a plain environment. It runs in this process."""
+    """One robot of :class:`ReachVectorEnv` as a :class:`gymnasium.Env`, by default in this process."""
 
     def __init__(self, robot: str | Robot = "panda", *, render_mode: None = None, **options: Any) -> None:
-        options = {"workers": 0} | options
-        self._envs = ReachVectorEnv(
-            1,
-            robot,
-            max_episode_steps=None,
-            autoreset_mode=AutoresetMode.DISABLED,
-            render_mode=render_mode,
-            **options,
-        )
-        self.metadata = {"render_modes": []}
+        options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
+        self._envs = ReachVectorEnv(1, robot, max_episode_steps=None, render_mode=render_mode, **options)
+        self.runner = self._envs.runner
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
@@ -276,23 +239,21 @@ class ReachEnv(gymnasium.Env):
         observation, info = self._envs.reset(seed=seed)
         return observation[0], self._single(info)
 
-    def step(self, action: Any) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
-        """Let the robot follow its action for one step."""
+    def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
+        """Apply an action (dof,) for one step; return observation, reward, terminated, truncated and info."""
         observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
 
     def close(self) -> None:
-        """Free the scene."""
+        """Close the runner."""
         self._envs.close()
 
     @staticmethod
     def _single(info: dict[str, Any]) -> dict[str, Any]:
+        """Return the info of the first env."""
         return {key: value[0].item() for key, value in info.items() if not key.startswith("_")}
 
 
 gymnasium.register(
-    id="batchpid/Reach-v0",
-    entry_point="sim.gym:ReachEnv",
-    vector_entry_point="sim.gym:ReachVectorEnv",
-    max_episode_steps=250,
+    "batchpid/Reach-v0", "sim.gym:ReachEnv", max_episode_steps=250, vector_entry_point="sim.gym:ReachVectorEnv"
 )
