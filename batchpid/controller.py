@@ -206,9 +206,7 @@ class BatchPID:
         if self._state is None:
             return self._engine.init(y)
         if self._stale:
-            fresh, self._stale = self._engine.init(y), False
-            kept = zip(fresh, self._state, strict=True)
-            self._state = PIDState(*(new if new is None or old is None else old for new, old in kept))
+            self._state, self._stale = self._state.matched_to(self._engine.init(y)), False
         return self._state
 
     def _numbers(self, name: str, value: Any) -> Any:

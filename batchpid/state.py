@@ -32,6 +32,11 @@ class PIDState(NamedTuple):
         """Return the state of some envs (a slice or an index array)."""
         return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
 
+    def matched_to(self, fresh: PIDState) -> PIDState:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped."""
+        both = zip(self, fresh, strict=True)
+        return PIDState(*(new if new is None or old is None else old for old, new in both))
+
 
 class Terms(NamedTuple):
     """Terms of the law in one step, each (envs, joints); 0 for a term that is off."""

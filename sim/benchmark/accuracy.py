@@ -23,7 +23,8 @@ from sim.benchmark.workload import TIMESTEP
 from sim.engine.building import SceneSpec, parse
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS, Physics
-from sim.loop.control import make_control
+from sim.loop.arrays import Command
+from sim.loop.control import PIDControl
 from sim.robot.description import Dynamics
 from sim.robot.robot import Robot
 from sim.tuning.moves import Moves, draw_moves, random_moves
@@ -141,16 +142,13 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     ``solver`` None is the equation of motion. ``refinement`` sim steps are made in each period.
     """
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
-    size, plant = len(moves.start), _plant(robot, moves, solver, TIMESTEP / refinement)
-    params = robot.tuned()
-    control = make_control("pid", spec, params, size)
-    control.set_params(plant, params)  # type: ignore[arg-type]
-    control.reset(plant.read_qpos(), np.ones(size, bool))
-    control.begin(plant, steps, moves.target)  # type: ignore[arg-type]
+    plant = _plant(robot, moves, solver, TIMESTEP / refinement)
+    control = PIDControl(spec, robot.tuned(), plant)
+    control.begin(Command(moves.target), steps)
     table = np.empty((steps, *moves.start.shape))
     for step in range(steps):
         passive = plant.passive_force(True, True)
-        plant.write_qf(control.effort(plant, plant.read_qpos(), passive, step, False))  # type: ignore
+        plant.write_qf(control.effort(plant.read_qpos(), passive, step))
         for _ in range(refinement):
             plant.step()
         table[step] = plant.read_qpos()
@@ -172,7 +170,7 @@ def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
 
     def draw(_: int) -> tuple[Float64, Float64, str] | None:
         here, there = robot.sample(2, seed=int(rng.integers(2**31)))
-        touches = dynamics.touches(here + line * (there - here))
+        touches = dynamics.in_contact(here + line * (there - here))
         touch = here + line[np.argmax(touches)] * (there - here)
         if touches[0] or not touches.any() or np.abs(touch - here).max() < APPROACH:
             return None
@@ -198,7 +196,7 @@ def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
         start[joint] = limit - sign * APPROACH
         target = start.copy()
         target[joint] = limit + sign * BEYOND
-        return None if dynamics.touches(start + line * (target - start)).any() else (start, target, "limit")
+        return None if dynamics.in_contact(start + line * (target - start)).any() else (start, target, "limit")
 
     return draw_moves(robot, count, draw)
 

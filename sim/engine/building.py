@@ -1,4 +1,4 @@
-"""Scenes of one robot: the engine's settings, the robot from its URDF, its collision group."""
+"""Scenes of one robot: the engine's settings, the robot from its URDF, its collision groups."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
-from sim.engine.contact_prediction import Link
+from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, HeadlessScene
 from sim.robot.description import DISSIPATION, Joint
@@ -23,9 +23,9 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Everything that decides how a scene is built, picklable.
+    """Everything that a scene is built from, picklable.
 
-    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` the degrees of freedom in SAPIEN's order.
+    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` are the degrees of freedom in SAPIEN's order.
     """
 
     urdf: str
@@ -41,14 +41,14 @@ class SceneSpec:
 
 
 def parse(spec: SceneSpec) -> ArticulationBuilder:
-    """Parse the robot once; the builder makes any number of copies.
+    """Return a builder that makes any number of copies of the robot.
 
     Raises
     ------
     RobotError
-        SAPIEN's loader refuses the description, or numbers its joints in another order than ours.
+        SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
-    loader = bare_scene().create_urdf_loader()
+    loader = headless_scene().create_urdf_loader()
     loader.fix_root_link = spec.fixed_base
     with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
         try:
@@ -57,27 +57,32 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
             raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
     if len(builders) != 1 or actors:
         raise RobotError("the URDF does not describe one articulated robot; it needs at least one moving joint")
-    _part(builders[0])
+    _ignore_contacts_within_bodies(builders[0])
     return builders[0]
 
 
-def _part(builder: ArticulationBuilder) -> None:
-    """Let links that fixed joints tie together not touch: they cannot move apart, and the solver would shake them.
-
-    PhysX leaves out a parent and its child only, not a hand whose flange is a link of its own. Shapes that share a bit
-    of the third word never touch; each such group is given one that no pair of the .srdf uses, while there are any.
-    """
-    body: dict[str, str] = {}
-    groups: dict[str, list[Any]] = {}
+def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
+    """Return the rigid body of each link: links joined by fixed joints are one, named after the first of them."""
+    bodies: dict[str, str] = {}
     for link in builder.link_builders:
-        tied = link.parent is not None and link.joint_record.joint_type == "fixed"
-        body[link.name] = body[link.parent.name] if tied else link.name
-        groups.setdefault(body[link.name], []).append(link)
+        fixed = link.parent is not None and link.joint_record.joint_type == "fixed"
+        bodies[link.name] = bodies[link.parent.name] if fixed else link.name
+    return bodies
+
+
+def _ignore_contacts_within_bodies(builder: ArticulationBuilder) -> None:
+    """Filter out contacts between links of one rigid body: they cannot move apart, and the solver would shake them.
+
+    PhysX filters a parent and its child only, not a hand whose flange is a separate link. Shapes that share a bit of
+    the third collision group never touch; each body gets one that no pair of the .srdf uses, as long as there are any.
+    """
+    bodies = rigid_bodies(builder)
     used = 0
     for link in builder.link_builders:
         used |= link.collision_groups[2]
     free = (1 << bit for bit in range(32) if not used >> bit & 1)
-    for links in groups.values():
+    for body in dict.fromkeys(bodies.values()):
+        links = [link for link in builder.link_builders if bodies[link.name] == body]
         solid = [link for link in links if link.collision_records]
         if len(links) > 2 and len(solid) > 1:
             bit = next(free, 0)
@@ -87,7 +92,10 @@ def _part(builder: ArticulationBuilder) -> None:
 
 @contextmanager
 def _in_memory(text: str | None) -> Iterator[str]:
-    """Path of a file that holds ``text``, for a loader that takes no text; whoever is killed leaves none behind."""
+    """Provide ``text`` under a path, which SAPIEN's loader requires; the file is in memory and ends with the process.
+
+    The path is empty where there is no text.
+    """
     if text is None:
         yield ""
         return
@@ -97,17 +105,17 @@ def _in_memory(text: str | None) -> Iterator[str]:
         yield f"/proc/self/fd/{file.fileno()}"
 
 
-def bare_scene(system: Any = None) -> Any:
-    """Return a new scene that needs no render device, of ``system`` or of a PhysX system under the present settings."""
+def headless_scene(system: Any = None) -> HeadlessScene:
+    """Return a scene without a render system, in ``system`` or in a new PhysX system under the present settings."""
     # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
     return HeadlessScene([physx.PhysxCpuSystem() if system is None else system])
 
 
 @contextmanager
 def engine_settings(spec: SceneSpec) -> Iterator[None]:
-    """SAPIEN's process-wide settings, ours while a pack is built, then the caller's again.
+    """Apply ``spec`` to SAPIEN's process-wide settings, and restore the caller's at the end.
 
-    Every setting is given, so that a result depends on nothing that the caller's process did before.
+    Every setting is given, so that a result does not depend on what the caller's process did before.
     """
     scene, body = physx.get_scene_config(), physx.get_body_config()
     shape, material = physx.get_shape_config(), physx.get_default_material()
@@ -137,8 +145,8 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
         physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
 
 
-def build_robot(builder: ArticulationBuilder, scene: Any, spec: SceneSpec) -> Any:
-    """Build the robot in ``scene``, with the dissipation that ``spec`` asks for.
+def build_robot(builder: ArticulationBuilder, scene: HeadlessScene, spec: SceneSpec) -> Any:
+    """Return the robot, built in ``scene`` with the dissipation that ``spec`` asks for.
 
     Raises
     ------
@@ -147,27 +155,26 @@ def build_robot(builder: ArticulationBuilder, scene: Any, spec: SceneSpec) -> An
     """
     builder.set_scene(scene)
     robot = builder.build()
-    names = [joint.name for joint in robot.active_joints]
-    if names != [joint.name for joint in spec.joints]:
-        raise RobotError(f"SAPIEN numbers the joints {names}, not {[joint.name for joint in spec.joints]}")
+    names, ours = [joint.name for joint in robot.active_joints], [joint.name for joint in spec.joints]
+    if names != ours:
+        raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}")
     robot.set_sleep_threshold(0.0)
     dissipation = DISSIPATION[spec.dissipation]
     for link in robot.links:
         link.set_linear_damping(dissipation.link_damping)
         link.set_angular_damping(dissipation.link_damping)
-    for joint, ours in zip(robot.active_joints, spec.joints, strict=True):
+    for built, joint in zip(robot.active_joints, spec.joints, strict=True):
         # SAPIEN parses <dynamics friction> and never applies it.
-        friction = dissipation.joint_friction
-        joint.set_friction(ours.friction if friction is None else friction)
+        built.set_friction(joint.friction if dissipation.joint_friction is None else dissipation.joint_friction)
     return robot
 
 
-def link_extents(robot: Any) -> list[Link]:
-    """Return the extents of a robot's links, parents first, for :mod:`sim.engine.contact_prediction`."""
-    links, dofs = robot.links, {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
-    places = {link: place for place, link in enumerate(links)}
+def link_extents(robot: Any) -> list[LinkExtent]:
+    """Return the extents of a robot's links, parents first."""
+    dofs = {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
+    numbers = {link: number for number, link in enumerate(robot.links)}
     extents = []
-    for link in links:
+    for link in robot.links:
         joint, slides = link.joint, link.joint.type == "prismatic"
         offset = np.linalg.norm(joint.pose_in_parent.p) + np.linalg.norm(joint.pose_in_child.p)
         if slides:
@@ -176,13 +183,13 @@ def link_extents(robot: Any) -> list[Link]:
         if link.collision_shapes:
             corners = np.abs(link.compute_global_aabb_tight() - link.entity_pose.p)
             radius = float(np.linalg.norm(corners.max(0)))
-        parent = None if link.parent is None else places[link.parent]
-        extents.append(Link(parent, dofs.get(joint.name), slides, float(offset), radius))
+        parent = None if link.parent is None else numbers[link.parent]
+        extents.append(LinkExtent(parent, dofs.get(joint.name), slides, float(offset), radius))
     return extents
 
 
-def separate(scene: Any, group: int) -> None:
-    """Give every shape of ``scene`` the collision group ``group``: shapes of different groups never touch.
+def set_collision_group(scene: HeadlessScene, group: int) -> None:
+    """Put every shape of ``scene`` into collision group ``group``: shapes of different groups never touch.
 
     PhysX's filter, as SAPIEN sets it up, compares the upper 16 bits of the fourth word.
     """

@@ -1,14 +1,14 @@
-"""When a robot needs a PhysX system of its own: before something touches it.
+"""Prediction of contact, from which it follows which robots get a PhysX system to themselves.
 
-Robots that share a system never meet, and each moves to the last bit as it would alone, as long as at most one contact
-acts on it. PhysX solves contacts one after another, each with what the one before left over (Gauss-Seidel), and their
+Robots that share a system never meet, and each moves bit-identically to a robot alone, as long as at most one contact
+acts on it. PhysX solves contacts in sequence, each with what the previous ones left over (Gauss-Seidel), and their
 order depends on what else the system holds: PGS sorts those of articulations by their index in a pool that all share
-(``ArticulationSortPredicate`` in ``DyDynamics.cpp`` of PhysX 5.3.1), TGS takes them as they began. Its flag for
-enhanced determinism changes neither. In a system of its own a robot's past alone decides the order.
+(``ArticulationSortPredicate`` in ``DyDynamics.cpp`` of PhysX 5.3.1), TGS takes them in the order in which they began.
+PhysX's flag for enhanced determinism changes neither. Alone in a system, a robot's past decides the order.
 
-It has to be there before a second contact acts, and had better be before the first: a robot that is built anew loses
-what the engine remembers of a contact, as where friction holds. The engine lists a pair of shapes from 0.02 m apart
-(twice the contact offset), long before they push each other.
+A robot has to move to such a system before a second contact acts on it, and better before the first: rebuilding a robot
+discards what the engine remembers of a contact, such as where friction holds. The engine lists a pair of shapes from
+0.02 m apart (twice the contact offset), long before they push each other.
 """
 
 from __future__ import annotations
@@ -19,30 +19,32 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SURGE = 3000.0
-"""Acceleration [m/s^2] of one link towards another that is foreseen: a light finger's under its full effort."""
-AHEAD = 3
-"""Time steps looked ahead: the listed distance is one step old, the next step acts on what closes within it."""
+MAX_ACCELERATION = 3000.0
+"""Largest acceleration [m/s^2] of one link towards another that is predicted: a light finger's under full effort."""
+LOOKAHEAD_STEPS = 3
+"""Time steps looked ahead: the listed distance is one step old, and the next step acts on what closes within it."""
 
 WORLD = -1
-"""Stands for the ground among the links of :class:`Gap`."""
+"""Link number of the ground."""
 
 
-class Link(NamedTuple):
-    """What counts of one link."""
+class LinkExtent(NamedTuple):
+    """Size of a link, and how the joint above it moves it."""
 
     parent: int | None
+    """Number of the parent link; None for the root."""
     dof: int | None
-    """Of the joint above it."""
+    """Number of the joint above it; None if that joint is fixed."""
     slides: bool
+    """Whether that joint is prismatic."""
     offset: float
-    """Farthest that its frame gets from its parent's [m]."""
+    """Largest distance of the link's frame from its parent's [m]."""
     radius: float
-    """Of its shapes, about its frame [m]."""
+    """Largest distance of a point of its shapes from its frame [m]."""
 
 
-class Gap(NamedTuple):
-    """A pair of shapes that are near each other: their links, or WORLD, and their distance [m]."""
+class NearPair(NamedTuple):
+    """Two shapes near each other: the numbers of their links, or WORLD, and their distance [m]."""
 
     first: int
     second: int
@@ -50,11 +52,14 @@ class Gap(NamedTuple):
 
 
 class ContactPredictor:
-    """Whether a robot made of ``links``, parents first, may be touched in the next time step."""
+    """Predictor of contact for a robot made of ``links``, parents first.
 
-    def __init__(self, links: Sequence[Link], dof: int, timestep: float) -> None:
-        # Of each link about each joint above it; the last row is the world's.
-        reach = np.zeros((len(links) + 1, dof))
+    ``reach`` (len(links) + 1, dof) is the largest speed of a point of each link per unit of each joint's speed: the
+    distance from the joint [m], or 1 for a joint that slides. The last row is the world's.
+    """
+
+    def __init__(self, links: Sequence[LinkExtent], dof: int, timestep: float) -> None:
+        self.reach = reach = np.zeros((len(links) + 1, dof))
         for row, link in zip(reach, links, strict=False):
             radius, at = link.radius, link
             while at.parent is not None:
@@ -65,19 +70,20 @@ class ContactPredictor:
         between = (reach[:, None] > 0) != (reach[None] > 0)
         # A joint above both links moves them alike.
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
-        self._ahead, self._surge = AHEAD * timestep, SURGE * timestep
+        self._lookahead, self._speed_gain = LOOKAHEAD_STEPS * timestep, MAX_ACCELERATION * timestep
 
-    def predicts_contact(self, gaps: Iterable[Gap], qvel: NDArray[np.floating]) -> bool:
-        """Whether one of ``gaps`` may close within AHEAD steps at joint velocities ``qvel`` (dof,), or two suddenly.
+    def predicts_contact(self, pairs: Iterable[NearPair], qvel: NDArray[np.floating]) -> bool:
+        """Return whether contact may act within LOOKAHEAD_STEPS, at joint velocities ``qvel`` (dof,).
 
-        A gap closes no faster than sum_j r_j |qvel_j|, over the joints between its links, with r_j the reach of the
-        links about joint j, or 1 where it slides; suddenly, than that and SURGE timestep. Fingers that rest a
-        millimetre apart and spring together touch at one place first, which has no order.
+        The distance of a pair shrinks no faster than sum_j r_j |qvel_j|, over the joints between its links, with r_j
+        the sum of their reach. Contact is predicted if one pair may close at that speed, or two at that speed plus
+        MAX_ACCELERATION * timestep: fingers at rest a millimetre apart that spring together touch at one place first,
+        and one contact has no order.
         """
-        speed, sudden = np.abs(qvel), 0
-        for gap in gaps:
-            closing = self._arm[gap.first, gap.second] @ speed
-            if gap.distance <= self._ahead * closing:
+        speed, accelerated = np.abs(qvel), 0
+        for pair in pairs:
+            closing = self._arm[pair.first, pair.second] @ speed
+            if pair.distance <= self._lookahead * closing:
                 return True
-            sudden += gap.distance <= self._ahead * (closing + self._surge)
-        return sudden > 1
+            accelerated += pair.distance <= self._lookahead * (closing + self._speed_gain)
+        return accelerated > 1

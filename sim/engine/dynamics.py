@@ -1,7 +1,8 @@
-"""One robot that stands still, asked about its poses: dynamics, and what it touches."""
+"""Dynamics of one robot and its contacts, at given poses."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -9,88 +10,86 @@ import numpy as np
 from numpy.typing import NDArray
 from sapien import physx
 
-from sim.engine.building import SceneSpec, bare_scene, build_robot, engine_settings, parse
-from sim.engine.contact_prediction import WORLD, Gap
+from sim.engine.building import SceneSpec, build_robot, engine_settings, headless_scene, parse, rigid_bodies
+from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
 from sim.robot.description import RobotDescription
 
-Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 
 class Dynamics:
-    """One robot by itself on a fixed base, asked about poses qpos (n, dof); nothing of it moves in time.
+    """Dynamics and contacts of one robot alone, at poses qpos (n, dof).
 
-    The dynamics are Pinocchio's, on the model that SAPIEN derives.
+    The dynamics are Pinocchio's, on the model that SAPIEN derives. Friction and damping are left out.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
+        builder = parse(spec)
         with engine_settings(spec):
             self._system = physx.PhysxCpuSystem()
             self._system.timestep = 1e-6
-            self._scene = bare_scene(self._system)
-            self._robot = build_robot(parse(spec), self._scene, spec)
+            self._scene = headless_scene(self._system)
+            self._robot = build_robot(builder, self._scene, spec)
             if spec.ground:
                 self._scene.add_ground(0.0, render=False)
-        self._dof = self._robot.dof
         self._model = self._robot.create_pinocchio_model()
-        self._links = {link: place for place, link in enumerate(self._robot.links)}
-        # Links that fixed joints tie together are one body; its number, per link name. The base and the ground are 0.
-        self._body: dict[str, int] = {}
-        for number, link in enumerate(self._robot.links):
-            tied = link.parent is not None and link.joint.type == "fixed"
-            self._body[link.name] = self._body[link.parent.name] if tied else number
+        self._links = {link: number for number, link in enumerate(self._robot.links)}
+        bodies = rigid_bodies(builder)
+        # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
+        self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
 
-    def mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
-        """Joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
-        matrices = np.empty((len(qpos), self._dof, self._dof))
+    def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
+        matrices = np.empty((*np.shape(qpos), self._robot.dof))
         for matrix, row in zip(matrices, np.asarray(qpos, np.float64), strict=True):
             matrix[...] = self._model.compute_generalized_mass_matrix(row)
         return matrices
 
-    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> NDArray[np.float64]:
-        """Efforts (n, dof) [N m or N] of a motion, gravity included, friction and damping left out."""
-        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, qacc)), strict=True)
-        return np.array([self._model.compute_inverse_dynamics(*row) for row in rows])
+    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
+        """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
+        return _rowwise(self._model.compute_inverse_dynamics, qpos, qvel, qacc)
 
-    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> NDArray[np.float64]:
-        """Accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included, damping left out."""
-        rows = zip(*(np.asarray(table, np.float64) for table in (qpos, qvel, effort)), strict=True)
-        return np.array([self._model.compute_forward_dynamics(*row) for row in rows])
+    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
+        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included."""
+        return _rowwise(self._model.compute_forward_dynamics, qpos, qvel, effort)
 
-    def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
-        """Whether links come nearer than ``clearance`` [m] to each other or to the ground (n,).
+    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
 
-        Links that fixed joints tie together do not count, nor the base and what is tied to it with the ground.
+        Links joined by fixed joints do not count, nor the base and the links fixed to it with the ground.
         """
-        return np.array([self._touches(row.astype(np.float32), clearance) for row in np.asarray(qpos)])
+        bodies = self._bodies
+        return np.array(
+            [
+                any(bodies[a] != bodies[b] and distance < clearance for a, b, distance in self.near_pairs(row))
+                for row in np.asarray(qpos)
+            ]
+        )
 
-    def gaps(self, qpos: NDArray[Any]) -> list[Gap]:
-        """Pairs of shapes that are near each other at one pose (dof,), as the engine lists them."""
-        self._look(qpos.astype(np.float32))
-        gaps = []
+    def near_pairs(self, qpos: NDArray[Any]) -> list[NearPair]:
+        """Return the pairs of shapes that the engine lists as near each other, at one pose (dof,)."""
+        self._robot.set_qpos(qpos.astype(np.float32))
+        self._robot.set_qvel(np.zeros(self._robot.dof, np.float32))
+        self._system.step()
+        pairs = []
         for contact in self._system.get_contacts():
             first, second = (self._links.get(body, WORLD) for body in contact.bodies)
-            gaps.append(Gap(first, second, min(point.separation for point in contact.points)))
-        return gaps
+            pairs.append(NearPair(first, second, min(point.separation for point in contact.points)))
+        return pairs
 
-    def _look(self, qpos: Float32) -> None:
-        self._robot.set_qpos(qpos)
-        self._robot.set_qvel(np.zeros_like(qpos))
-        self._system.step()
 
-    def _touches(self, qpos: Float32, clearance: float) -> bool:
-        self._look(qpos)
-        for contact in self._system.get_contacts():
-            if len({self._body.get(body.entity.name, 0) for body in contact.bodies}) == 1:
-                continue
-            if any(point.separation < clearance for point in contact.points):
-                return True
-        return False
+def _rowwise(compute: Any, *tables: NDArray[Any]) -> Float64:
+    return np.array([compute(*row) for row in zip(*(np.asarray(table, np.float64) for table in tables), strict=True)])
+
+
+def scene_dynamics(spec: SceneSpec) -> Dynamics:
+    """Return the dynamics of the robot of ``spec``, the same object for equal specs; ``spec.build`` is left out."""
+    return _cached_dynamics(replace(spec, build=None))
 
 
 @lru_cache(maxsize=8)
-def scene_dynamics(spec: SceneSpec) -> Dynamics:
-    """Return the probe of this scene, built at most once."""
+def _cached_dynamics(spec: SceneSpec) -> Dynamics:
     return Dynamics(spec)
 
 

@@ -1,7 +1,4 @@
-"""The user's own content of a scene: built headless, watched, and put back at a reset.
-
-Beside ``sim/engine/pack.py`` this is the one module that touches SAPIEN, which the user's function does too.
-"""
+"""Content that the user's ``build`` function adds to a scene: built without a render device, and reset with its env."""
 
 from __future__ import annotations
 
@@ -16,125 +13,101 @@ from sapien.physx import PhysxArticulationLinkComponent, PhysxRigidDynamicCompon
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
+from sim.engine.root_state import ROOT_SIZE, read_root, write_root
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds to the scene of env ``env``; returns the entities whose poses are wanted, or None."""
 
-_LIGHTS = (
-    "add_directional_light",
-    "add_point_light",
-    "add_spot_light",
-    "add_area_light_for_ray_tracing",
-    "set_ambient_light",
-    "set_environment_map",
-    "set_environment_map_from_files",
-)
-_VISUALS = tuple(name for name in dir(ActorBuilder) if name.startswith("add_") and "visual" in name)
-
 
 class _HeadlessBuilder(ActorBuilder):
-    """An actor builder that leaves visuals out: each of them would need a render device."""
-
-
-def _same_builder(self: _HeadlessBuilder, *_: Any, **__: Any) -> _HeadlessBuilder:
-    return self
+    """Actor builder whose ``add_*_visual`` methods do nothing: a visual would need a render device."""
 
 
 class HeadlessScene(sapien.Scene):
-    """A scene in which visuals and lights are left out, so that code written for a screen runs without one."""
+    """Scene whose visuals and lights are left out, so that code written for a screen runs without a render device."""
 
     def create_actor_builder(self) -> Any:
         """Return a builder of actors for this scene."""
         return _HeadlessBuilder().set_scene(self)
 
 
-def _nothing(self: HeadlessScene, *_: Any, **__: Any) -> None:
-    return None
+for _name in dir(ActorBuilder):
+    if _name.startswith("add_") and "visual" in _name:
+        setattr(_HeadlessBuilder, _name, lambda self, *_, **__: self)
+for _name in dir(sapien.Scene):
+    if _name.startswith(("add_", "set_")) and any(word in _name for word in ("light", "environment_map")):
+        setattr(HeadlessScene, _name, lambda self, *_, **__: None)
 
 
-for _name in _VISUALS:
-    setattr(_HeadlessBuilder, _name, _same_builder)
-for _name in _LIGHTS:
-    setattr(HeadlessScene, _name, _nothing)
+class SceneContent:
+    """Content that ``build`` added to the scene of env ``env``.
 
-
-class Content:
-    """What ``build`` added to the scene of one env, and where everything stood then."""
+    ``watched`` are the entities that ``build`` returned, ``size`` is the number of values in the state.
+    """
 
     def __init__(self, build: Build, scene: Any, env: int) -> None:
-        own = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
-        self.watched = _run(build, scene, env)
+        before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
+        self.watched = _call(build, scene, env)
         self._bodies, self._articulations = [], []
         for entity in scene.entities:
-            if entity.per_scene_id in own:
+            if entity.per_scene_id in before:
                 continue
             for component in entity.components:
                 if isinstance(component, PhysxRigidDynamicComponent):
-                    self._bodies.append((component, entity, entity.get_pose()))
+                    self._bodies.append((entity, component))
                 elif isinstance(component, PhysxArticulationLinkComponent) and component.is_root:
-                    robot = component.articulation
-                    self._articulations.append((robot, robot.get_pose(), robot.get_qpos()))
+                    self._articulations.append(component.articulation)
+        self._start = self._read(at_rest=True)
+        self.size = self._start.size
 
     def reset(self) -> None:
-        """Put everything that moves back to where ``build`` left it, at rest."""
-        for body, entity, pose in self._bodies:
-            entity.set_pose(pose)
-            if not body.kinematic:
-                body.set_linear_velocity([0.0, 0.0, 0.0])
-                body.set_angular_velocity([0.0, 0.0, 0.0])
-        for robot, pose, qpos in self._articulations:
-            robot.set_root_pose(pose)
-            robot.set_root_linear_velocity([0.0, 0.0, 0.0])
-            robot.set_root_angular_velocity([0.0, 0.0, 0.0])
-            robot.set_qpos(qpos)
-            robot.set_qvel(np.zeros_like(qpos))
-
-    @property
-    def size(self) -> int:
-        """How many numbers :meth:`read` gives."""
-        return 13 * len(self._bodies) + sum(13 + 3 * robot.dof for robot, *_ in self._articulations)
+        """Put everything that moves where ``build`` left it, at rest."""
+        self.write(self._start)
 
     def read(self) -> NDArray[np.float32]:
-        """State of everything that moves, in one row of numbers."""
-        parts: list[Any] = []
-        for body, entity, _ in self._bodies:
-            pose = entity.get_pose()
-            parts += [pose.p, pose.q, body.get_linear_velocity(), body.get_angular_velocity()]
-        for robot, *_ in self._articulations:
-            pose = robot.get_root_pose()
-            parts += [pose.p, pose.q, robot.get_root_linear_velocity(), robot.get_root_angular_velocity()]
-            parts += [robot.get_qpos(), robot.get_qvel(), robot.get_qf()]
-        return np.concatenate(parts, dtype=np.float32) if parts else np.zeros(0, np.float32)
+        """Return the state of everything that moves (size,)."""
+        return self._read()
 
-    def write(self, row: NDArray[np.float32]) -> None:
-        """Put everything that moves into the state that :meth:`read` gave."""
-        numbers = iter(np.asarray(row, np.float32))
+    def _read(self, at_rest: bool = False) -> NDArray[np.float32]:
+        def velocity(values: Any) -> Any:
+            return np.zeros_like(values) if at_rest else values
+
+        parts: list[Any] = [np.zeros(0, np.float32)]
+        for entity, body in self._bodies:
+            pose = entity.get_pose()
+            parts += [pose.p, pose.q, velocity(body.get_linear_velocity()), velocity(body.get_angular_velocity())]
+        for robot in self._articulations:
+            root = read_root(robot)
+            parts += [root[:7], velocity(root[7:]), robot.get_qpos(), velocity(robot.get_qvel()), robot.get_qf()]
+        return np.concatenate(parts, dtype=np.float32)
+
+    def write(self, state: NDArray[np.float32]) -> None:
+        """Put everything that moves into the state that :meth:`read` returned; values beyond ``size`` are ignored."""
+        values = iter(np.asarray(state, np.float32))
 
         def take(count: int) -> NDArray[np.float32]:
-            return np.fromiter(numbers, np.float32, count)
+            return np.fromiter(values, np.float32, count)
 
-        for body, entity, _ in self._bodies:
+        for entity, body in self._bodies:
             entity.set_pose(sapien.Pose(take(3), take(4)))
             linear, angular = take(3), take(3)
             if not body.kinematic:
                 body.set_linear_velocity(linear)
                 body.set_angular_velocity(angular)
-        for robot, *_ in self._articulations:
-            robot.set_root_pose(sapien.Pose(take(3), take(4)))
-            robot.set_root_linear_velocity(take(3))
-            robot.set_root_angular_velocity(take(3))
-            dof = robot.dof
-            robot.set_qpos(take(dof))
-            robot.set_qvel(take(dof))
-            robot.set_qf(take(dof))
+        for robot in self._articulations:
+            write_root(robot, take(ROOT_SIZE))
+            robot.set_qpos(take(robot.dof))
+            robot.set_qvel(take(robot.dof))
+            robot.set_qf(take(robot.dof))
 
     def poses(self) -> NDArray[np.float32]:
-        """Poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
+        """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
         rows = [np.concatenate([pose.p, pose.q]) for pose in (entity.get_pose() for entity in self.watched)]
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def _run(build: Build, scene: Any, env: int) -> list[Any]:
+def _call(build: Build, scene: Any, env: int) -> list[Any]:
+    """Return the entities that ``build`` returns; its errors become an InvalidArgumentError."""
     try:
         returned = build(scene, env)
     except Exception as error:
@@ -152,7 +125,7 @@ def _run(build: Build, scene: Any, env: int) -> list[Any]:
         if not isinstance(entity, sapien.Entity):
             raise InvalidArgumentError(
                 "build",
-                "returned something that is no entity",
+                "returned something other than entities",
                 env=env,
                 value=type(entity).__name__,
                 remedy="return the entities whose poses are wanted, or None",

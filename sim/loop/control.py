@@ -1,210 +1,209 @@
-"""What effort a tick's commands ask for, at each of its sim steps: one class for each kind of control."""
+"""Controls: joint efforts at each sim step, from the command of a tick and the state of the robots."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.choices import PerMassMatrix
-from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia
+from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
 from batchpid.errors import InvalidArgumentError
+from batchpid.validate import instance
 from sim.engine.building import SceneSpec
-from sim.engine.dynamics import scene_dynamics
+from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
+from sim.loop.arrays import Command
 from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 
-INERTIA_EVERY = 4
+MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick."""
 
 
-class Control:
-    """Base of the controls: the commands of a tick, the PID state, and which joints saturated.
+class Plant(Protocol):
+    """Robots under control; :class:`sim.engine.pack.Pack` is one. Arrays are (M, dof)."""
 
-    All arrays are (M, dof). ``reads_qpos_each_step``: whether :meth:`effort` needs qpos at every sim step.
+    def read_qpos(self) -> Float64:
+        """Return the joint positions [rad or m]."""
+
+    def read_qvel(self) -> Float64:
+        """Return the joint velocities [rad/s or m/s]."""
+
+
+class Control:
+    """Base of the controls, for the M envs of ``plant``; it owns the state of the law.
+
+    Attributes
+    ----------
+    saturated
+        Joints whose effort was limited in the last sim step of the last tick (M, dof).
+    reads_qpos_each_step
+        Whether :meth:`effort` needs qpos at every sim step; otherwise it is ignored.
     """
 
     reads_qpos_each_step = True
 
-    def __init__(self, scene: SceneSpec, params: bp.PIDParams, size: int) -> None:
-        self.size, self.dt = size, scene.timestep
-        self.saturated: NDArray[np.bool_] = np.zeros((size, len(scene.joints)), bool)
-        self.state: Any = None
-        self.params = params
-        self._scene = scene
-        self._setpoint: Float64 = np.zeros((size, len(scene.joints)))
-        self._setpoint_rate: Float64 | None = None
+    def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
+        self._scene, self._plant, self.params = scene, plant, params
+        qpos = plant.read_qpos()
+        self.saturated: NDArray[np.bool_] = np.zeros(qpos.shape, bool)
+        self._state = bp.init(params, qpos)
+        self._command, self._substeps = Command(qpos), 1
+        self.set_params(params)
 
-    def set_params(self, pack: Pack, params: bp.PIDParams) -> None:
-        """Change gains, limits and times; the state is kept."""
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Change gains, limits and times; the state carries on."""
+        self._state = self._state.matched_to(bp.init(params, self._plant.read_qpos()))
         self.params = params
 
     def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
-        """Start the envs of ``mask`` (M,) anew at ``qpos``."""
+        """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
         self.saturated[mask] = False
-        if self.state is None:
-            self.state = bp.init(self.params, qpos)
-        else:
-            self.state = bp.reset(self.params, self.state, qpos, mask)
+        self._state = bp.reset(self.params, self._state, qpos, mask)
 
-    def begin(self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None) -> None:
-        """Take the commands of a tick of so many sim steps."""
-        self._substeps, self._setpoint, self._setpoint_rate = substeps, setpoint, setpoint_rate
+    def begin(self, command: Command, substeps: int) -> None:
+        """Begin a tick of ``substeps`` sim steps under ``command``."""
+        self._command, self._substeps = command, substeps
 
-    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
-        """Joint efforts of sim step ``step`` of the tick, ``feedforward`` included; None to leave qf alone.
-
-        At the ``last`` one ``saturated`` is brought up to date.
-        """
+    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
+        """Return the joint efforts of sim step ``step`` of the tick, ``feedforward`` included; None for zero."""
         raise NotImplementedError
+
+    def read(self) -> dict[str, NDArray[Any]]:
+        """Return the state of the law by name, for :meth:`write`."""
+        return {name: leaf for name, leaf in self._state._asdict().items() if leaf is not None}
+
+    def write(self, state: dict[str, NDArray[Any]], saturated: NDArray[np.bool_]) -> None:
+        """Set the state of the law, and :attr:`saturated`."""
+        self._state, self.saturated = bp.PIDState(**state), saturated
 
 
 class PIDControl(Control):
-    """qf = sat(PID(setpoint, qpos) + feedforward)."""
+    """PID control: qf = sat(PID(setpoint, qpos) + feedforward).
 
-    def set_params(self, pack: Pack, params: bp.PIDParams) -> None:
-        """Change gains, limits and times; the state is kept."""
-        self.params = params
-        self._coefficients = bp.discretise(params, self.dt, self.size)
-
-    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
-        """Advance the law by one sim step."""
-        qvel = pack.read_qvel() if self.params.measurement_rate is not None else None
-        inputs = (self._setpoint, qpos, qvel, self._setpoint_rate, feedforward)
-        if not last:
-            self.state, effort = bp.advance(self._coefficients, self.state, *inputs)
-        else:
-            self.state, effort, terms = bp.advance(self._coefficients, self.state, *inputs, terms=True)
-            self.saturated = terms.saturated
-        return effort
-
-
-class InertiaPIDControl(PIDControl):
-    """As :class:`PIDControl`, with gains per unit of inertia; the mass matrix is kept for some sim steps.
-
-    With the whole matrix M the joints' own viscous damping B is made up for as well. The engine takes it
-    implicitly, (M + dt B) (v+ - v) = dt (u - B v), so u = (M + dt B) a + B v gives exactly v+ = v + dt a.
+    Gains per unit of inertia use a mass matrix that is kept for MASS_MATRIX_STEPS. With the whole matrix M, the joints'
+    viscous damping B is compensated as well: the engine integrates it implicitly, (M + dt B) (v+ - v) = dt (u - B v),
+    so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
     """
 
-    def set_params(self, pack: Pack, params: bp.PIDParams) -> None:
-        """Change gains, limits and times; the state is kept."""
-        super().set_params(pack, params)
-        self._mass_matrix = scene_dynamics(self._scene).mass_matrix
+    _dynamics: Dynamics | None = None
+
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Change gains, limits and times; the state carries on, with the integral in the unit of the new gains."""
         self._whole = isinstance(params.gain_units, PerMassMatrix)
         damping = np.array([joint.damping for joint in self._scene.joints])
+        if self._whole != isinstance(self.params.gain_units, PerMassMatrix):
+            matrix = self._mass_matrix(self._plant.read_qpos(), damping)
+            self._state = convert_integral(self._state, self.params, params, matrix)
+        super().set_params(params)
         self._damping = damping if self._whole and damping.any() else None
+        self._measures_rate = params.measurement_rate is not None
+        self._coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
 
-    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
+    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64:
         """Advance the law by one sim step."""
-        if step % INERTIA_EVERY == 0:
-            # Where the robot will be half-way through these steps, so that the error is zero on average: near upright,
-            # axes nearly in line, a jaco2 leaves its path by 18 mrad under matrices that are 0.3 steps ahead.
-            kept = min(INERTIA_EVERY, self._substeps - step)
-            self._matrix = self._mass_matrix(qpos + 0.5 * (kept - 1) * self.dt * pack.read_qvel())
-            if self._damping is not None:
-                self._matrix += self.dt * np.diag(self._damping)
-        qvel = pack.read_qvel() if self.params.measurement_rate is not None or self._damping is not None else None
+        if self.params.gain_units is not None and step % MASS_MATRIX_STEPS == 0:
+            self._update_mass_matrix(qpos, min(MASS_MATRIX_STEPS, self._substeps - step))
+        qvel = self._plant.read_qvel() if self._measures_rate or self._damping is not None else None
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel
             feedforward = viscous if feedforward is None else feedforward + viscous
-        rates = (qvel if self.params.measurement_rate is not None else None, self._setpoint_rate)
+        setpoint, setpoint_rate, _ = self._command
+        last = step + 1 == self._substeps
+        inputs = (qvel if self._measures_rate else None, setpoint_rate, feedforward, last)
         if self._whole:
-            self.state, effort, *terms = advance_with_mass_matrix(
-                self._coefficients,
-                self.state,
-                self._setpoint,
-                qpos,
-                self._matrix,
-                *rates,
-                feedforward,
-                terms=last,
-            )
+            new = advance_with_mass_matrix(self._coefficients, self._state, setpoint, qpos, self._matrix, *inputs)
         else:
-            diagonal = np.diagonal(self._matrix, axis1=1, axis2=2)
-            coefficients = per_inertia(self._coefficients, diagonal)
-            self.state, effort, *terms = bp.advance(
-                coefficients, self.state, self._setpoint, qpos, *rates, feedforward, terms=last
-            )
+            new = bp.advance(self._scaled, self._state, setpoint, qpos, *inputs)
         if last:
-            self.saturated = terms[0].saturated
+            self.saturated = new[2].saturated
+        self._state, effort = new[:2]
         return effort
+
+    def _update_mass_matrix(self, qpos: Float64, steps: int) -> None:
+        """Set the mass matrix, and the gains that depend on it, for so many sim steps from ``qpos``."""
+        # At the pose half-way through these steps, so that the error is zero on average: near upright, axes nearly in
+        # line, a jaco2 leaves its path by 18 mrad under matrices that are 0.3 steps ahead.
+        half_way = qpos + 0.5 * (steps - 1) * self._scene.timestep * self._plant.read_qvel()
+        self._matrix = self._mass_matrix(half_way, self._damping)
+        if not self._whole:
+            self._scaled = per_inertia(self._coefficients, np.diagonal(self._matrix, axis1=1, axis2=2))
+
+    def _mass_matrix(self, qpos: Float64, damping: Float64 | None) -> Float64:
+        """Return M + dt B (M, dof, dof), B being the viscous ``damping`` of the joints."""
+        if self._dynamics is None:
+            self._dynamics = scene_dynamics(self._scene)
+        matrix = self._dynamics.mass_matrix(qpos)
+        return matrix if damping is None else matrix + self._scene.timestep * np.diag(damping)
 
 
 class DriveControl(Control):
-    """PhysX's drive with stiffness kp and damping kd; qf = feedforward.
+    """PhysX's internal drive with stiffness kp and damping kd; qf = feedforward.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
     a PID whose P and D the engine integrates implicitly.
     """
 
-    reads_qpos_each_step = False
+    _plant: Pack
 
-    def set_params(self, pack: Pack, params: bp.PIDParams) -> None:
-        """Change gains, limits and times; the state is kept."""
-        self.params = params
-        self._integrates = params.ki is not None and bool(np.any(np.asarray(params.ki) > 0))
-        self.reads_qpos_each_step = self._integrates
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Change gains, limits and times; the state carries on."""
+        super().set_params(params)
+        self.reads_qpos_each_step = params.ki is not None and bool(np.any(params.ki > 0))
         damping = np.zeros_like(params.kp) if params.kd is None else params.kd
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
-        pack.write_drive(np.asarray(params.kp), np.asarray(damping), np.asarray(limit))
+        self._plant.write_drive(params.kp, damping, limit)
 
-    def begin(self, pack: Pack, substeps: int, setpoint: Float64, setpoint_rate: Float64 | None = None) -> None:
-        """Take a tick's commands, and give them to the drives."""
-        super().begin(pack, substeps, setpoint, setpoint_rate)
-        pack.write_drive_target(setpoint, np.zeros_like(setpoint) if setpoint_rate is None else setpoint_rate)
+    def begin(self, command: Command, substeps: int) -> None:
+        """Begin a tick: set the drives' targets."""
+        super().begin(command, substeps)
+        setpoint, rate, _ = command
+        self._plant.write_drive_target(setpoint, np.zeros_like(setpoint) if rate is None else rate)
 
-    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
-        """Leave the effort to the drive; its target moves where there is an integral."""
-        if self._integrates:
-            self.state, target = bp.drive_target(
-                self.params,
-                self.state,
-                self._setpoint,
-                qpos,
-                self.dt,
-                setpoint_rate=self._setpoint_rate,
-                feedforward=feedforward,
+    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
+        """Return ``feedforward``; move the drives' targets where there is an integral."""
+        if self.reads_qpos_each_step:
+            setpoint, rate, _ = self._command
+            rates = {"setpoint_rate": rate, "feedforward": feedforward}
+            self._state, target = bp.drive_target(
+                self.params, self._state, setpoint, qpos, self._scene.timestep, **rates
             )
-            pack.write_drive_target(target)
+            self._plant.write_drive_target(target)
         return feedforward
 
 
 class EffortControl(Control):
-    """qf = sat(the caller's effort + feedforward): the setpoint is the effort."""
+    """qf = sat(the caller's effort + feedforward); the setpoint is the effort."""
 
     reads_qpos_each_step = False
 
-    def effort(self, pack: Pack, qpos: Float64, feedforward: Float64 | None, step: int, last: bool) -> Float64 | None:
+    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
         """Add and saturate."""
-        low, high = self.params.effort_min, self.params.effort_max
-        total = self._setpoint if feedforward is None else self._setpoint + feedforward
+        setpoint, low, high = self._command.setpoint, self.params.effort_min, self.params.effort_max
+        total = setpoint if feedforward is None else setpoint + feedforward
         effort = total if low is None else np.maximum(total, low)
         effort = effort if high is None else np.minimum(effort, high)
-        if last:
+        if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort
 
 
-CONTROLS = ("pid", "drive", "effort")
+_CONTROLS = {"pid": PIDControl, "drive": DriveControl, "effort": EffortControl}
+CONTROLS = tuple(_CONTROLS)
+"""Names of the controls."""
 
 
-def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, size: int) -> Control:
-    """Build the control of that name for ``size`` envs, with ``params`` of one row or ``size``."""
-    inertia = params.gain_units is not None
-    kinds = {
-        "pid": InertiaPIDControl if inertia else PIDControl,
-        "drive": DriveControl,
-        "effort": EffortControl,
-    }
-    return kinds[name](scene, params, size)
+def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, pack: Pack) -> Control:
+    """Return the control of that name for ``pack``, with ``params`` of one row or one per env."""
+    return _CONTROLS[name](scene, params, pack)
 
 
 def default_params(robot: Robot, control: str) -> bp.PIDParams:
-    """Return what ``robot`` carries for that control: its drive's gains, its PID's, or just its effort limits."""
+    """Return the params that ``robot`` carries for a control: PID gains, drive gains, or its effort limits alone."""
     settings = robot.settings
     if control == "effort":
         return robot.params(kp=0.0, ki=0.0, kd=0.0)
@@ -221,13 +220,7 @@ def check_params(params: bp.PIDParams, robot: Robot, num_envs: int, control: str
     InvalidArgumentError
         They do not.
     """
-    if not isinstance(params, bp.PIDParams):
-        raise InvalidArgumentError(
-            "params",
-            "must be PIDParams",
-            value=params,
-            remedy="build them with robot.params() or make_params()",
-        )
+    instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
     if params.gain_units is not None and control != "pid":
         raise InvalidArgumentError(
             "gain_units",

@@ -1,9 +1,6 @@
-"""A group of the loop: the envs that advance together, and their closed loop."""
+"""Group of envs that advance together, and their closed loop."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +10,16 @@ from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.control import make_control
-from sim.loop.faults import Containment, finite
+from sim.loop.faults import FaultContainment, finite
 from sim.loop.snapshot import EnvStates
+
+Float64 = NDArray[np.float64]
 
 
 class EnvGroup:
-    """One pack and its controller: the sim steps of a tick, and what becomes of an env that fails.
+    """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
 
-    ``envs`` are its rows of the loop's arrays.
+    ``envs`` are its rows of the loop's arrays, ``compensate`` whether gravity and Coriolis forces are compensated.
     """
 
     def __init__(
@@ -33,68 +32,63 @@ class EnvGroup:
         control: str,
         compensate: tuple[bool, bool],
         on_fault: str,
-        speed_limit: NDArray[np.float64] | None,
+        speed_limit: Float64 | None,
     ) -> None:
         self.pack, self.envs = pack, envs
-        # The control asks about the robot alone, whatever else the scenes hold.
-        self._scene = replace(scene, build=None)
-        self._kind = control
+        self._scene, self._kind = scene, control
         self._gravity, self._coriolis = compensate
-        self._control = make_control(control, self._scene, params, pack.size)
+        self._control = make_control(control, scene, params, pack)
+        self._containment = FaultContainment(pack.size, pack.dof, on_fault, speed_limit)
         self._qpos = pack.read_qpos()
-        self._watch = Containment(pack.size, pack.dof, on_fault, speed_limit)
         self._steps = 0
 
     def set_params(self, params: bp.PIDParams) -> None:
-        """Change gains, limits and times in flight; the controller's state is kept."""
-        old = self._control
-        if (params.gain_units is None) != (old.params.gain_units is None):
-            self._control = make_control(self._kind, self._scene, params, self.pack.size)
-            self._control.state, self._control.saturated = old.state, old.saturated
-        self._control.set_params(self.pack, params)
-        if self._control.state is not None:
-            # The new params may need more of a state than the old ones, or less.
-            both = zip(bp.init(params, self._qpos), self._control.state, strict=True)
-            self._control.state = bp.PIDState(*(new if new is None or old is None else old for new, old in both))
+        """Change gains, limits and times in flight; the controller's state carries on."""
+        self._control.set_params(params)
 
-    def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], steps: int) -> None:
-        """Place the envs of ``mask`` (M,), with a fresh controller state; ``steps`` sim steps have been made."""
-        watch = self._watch
+    def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
+        """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
+
+        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite starts where it did last, and has failed.
+        """
+        containment = self._containment
+        containment.clear(mask)
         bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
-        lost = (bad["qpos"] | bad["qvel"]).any(1)
-        watch.start(mask, mask & ~lost, qpos, qvel)
-        self._place(mask, watch.home_qpos, watch.home_qvel)
+        good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
+        containment.start_qpos[good], containment.start_qvel[good] = qpos[good], qvel[good]
+        self._place(mask, containment.start_qpos, containment.start_qvel)
         for cause, entries in bad.items():
-            watch.fail(entries, cause, steps, watch.home_qpos)
-        self._put_back()
+            containment.fail(entries, cause, steps, containment.start_qpos)
+        self._place_failed()
 
     def run(self, steps: int, substeps: int, command: Command) -> None:
         """Run ``substeps`` sim steps under ``command``, after ``steps`` in the past."""
-        watch = self._watch
-        self._steps, watch.flagged = steps, watch.stopped.copy()
-        if watch.stopped.any() or not finite(*command):
-            command = self._admit(command)
-        with np.errstate(all="ignore"):  # what overflows or is not finite becomes a fault
-            self._run(substeps, command)
+        containment = self._containment
+        self._steps, containment.failed = steps, containment.suspended.copy()
+        if containment.suspended.any() or not finite(*command):
+            command = self._without_faults(command)
+        with np.errstate(all="ignore"):  # overflow and invalid values become faults
+            self._run_substeps(substeps, command)
             if not finite(self._qpos, self.pack.read_qvel()):
                 self._contain(self._qpos, substeps)
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
-        watch, seen = self._watch, rows.observation
-        seen.qpos[...] = self._qpos
-        seen.qvel[...] = self.pack.read_qvel(np.float32)
-        seen.effort[...] = self.pack.qf
-        seen.saturated[...] = self._control.saturated
-        seen.ok[...] = ~watch.flagged
-        rows.fault.step[...], rows.fault.joint[...], rows.fault.cause[...] = watch.step, watch.joint, watch.cause
-        if watch.stopped.any():
-            held = watch.stopped
-            seen.qpos[held] = watch.held_qpos[held]
-            seen.qvel[held] = seen.effort[held] = seen.saturated[held] = 0
+        containment, observation = self._containment, rows.observation
+        observation.qpos[...] = self._qpos
+        observation.qvel[...] = self.pack.read_qvel(np.float32)
+        observation.effort[...] = self.pack.qf
+        observation.saturated[...] = self._control.saturated
+        observation.ok[...] = ~containment.failed
+        for table, last in zip(rows.fault, (containment.step, containment.joint, containment.cause), strict=True):
+            table[...] = last
+        if containment.suspended.any():
+            envs = containment.suspended
+            observation.qpos[envs] = containment.suspended_qpos[envs]
+            observation.qvel[envs] = observation.effort[envs] = observation.saturated[envs] = 0
 
     def read(self) -> EnvStates:
-        """State of these envs, physics and controller."""
+        """Return the state of these envs, physics and controller."""
         pack = self.pack
         return EnvStates(
             qpos=pack.read_qpos(np.float32),
@@ -104,88 +98,36 @@ class EnvGroup:
             content=pack.read_content(),
             isolated=pack.isolated.copy(),
             saturated=self._control.saturated,
-            controller={name: leaf for name, leaf in self._control.state._asdict().items() if leaf is not None},
-            containment=self._watch.read(),
+            controller=self._control.read(),
+            containment=self._containment.read(),
         )
 
     def write(self, pack: Pack, states: EnvStates) -> None:
-        """Go on with ``pack``, which is new, in the given state."""
+        """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
-        self._control.set_params(pack, self._control.params)
+        self._control = make_control(self._kind, self._scene, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
         pack.isolate(np.flatnonzero(states.isolated).tolist())
-        self._watch.write(states.containment)
-        pack.suspend(self._watch.stopped)
+        self._containment.write(states.containment)
+        pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
-        self._control.saturated = states.saturated
-        self._control.state = bp.PIDState(**states.controller)
+        self._control.write(states.controller, states.saturated)
         self._qpos = pack.read_qpos()
 
-    # -- what becomes of an env that fails -----------------------------------------------------------------------------
+    # -- the closed loop ---------------------------------------------------------------------------------------
 
-    def _sound(self, probe: NDArray[Any] | None) -> bool:
-        """Whether no robot has failed, as far as ``probe``, some array that depends on all their states, tells."""
-        limit = self._watch.speed_limit
-        return finite(probe) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
-
-    def _contain(self, qpos: NDArray[np.float64], done: int) -> None:
-        """Put back the envs that failed, ``done`` substeps into a tick."""
-        watch, step = self._watch, self._steps + done
-        qvel = self.pack.read_qvel()
-        bad = ~(np.isfinite(qpos) & np.isfinite(qvel))
-        # One step after a joint's effort was NaN all joints are, so the effort tells better where it began.
-        source = ~np.isfinite(self.pack.qf) & bad.any(1, keepdims=True)
-        watch.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
-        if watch.speed_limit is not None:
-            watch.fail((np.abs(qvel) > watch.speed_limit) & ~bad.any(1, keepdims=True), "speed", step, self._qpos)
-        self._qpos = np.where(bad, self._qpos, qpos)
-        self._put_back()
-
-    def _admit(self, command: Command) -> Command:
-        """Stop the envs whose commands are not finite; return the commands, harmless for all that are stopped."""
-        watch = self._watch
-        for cause, rows in command._asdict().items():
-            if rows is not None:
-                watch.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
-        self._put_back()
-        harmless = (0.0 if self._kind == "effort" else self._qpos, 0.0, 0.0)
-        return Command._make(
-            None if rows is None else np.where(watch.flagged[:, None], value, rows)
-            for rows, value in zip(command, harmless, strict=True)
-        )
-
-    def _put_back(self) -> None:
-        """Place the envs that failed where they are held, or where they start over."""
-        watch = self._watch
-        failed = watch.take_failed()
-        if failed.any():
-            if watch.holds:
-                self._place(failed, watch.held_qpos, np.zeros_like(watch.held_qpos))
-            else:
-                self._place(failed, watch.home_qpos, watch.home_qvel)
-
-    def _place(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        rows = np.flatnonzero(mask)
-        self.pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
-        self.pack.suspend(self._watch.stopped)
-        self._qpos = self.pack.read_qpos()
-        self._control.reset(self._qpos, mask)
-
-    # -- the closed loop --------------------------------------------------------------------------------------
-
-    def _run(self, substeps: int, command: Command) -> None:
+    def _run_substeps(self, substeps: int, command: Command) -> None:
         """At every sim step: compensate, control, write, step, read."""
         pack, control = self.pack, self._control
-        control.begin(pack, substeps, command.setpoint, command.setpoint_rate)
+        control.begin(command, substeps)
         for step in range(substeps):
-            last = step == substeps - 1
-            forward = self._feedforward(command.feedforward)
+            forward = self._feedforward(command)
             if not control.reads_qpos_each_step and not self._sound(forward):
-                # Without a look at qpos, the passive force is what tells of a state that has failed.
+                # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
                 self._contain(pack.read_qpos(), step)
-                forward = self._feedforward(command.feedforward)
-            effort = control.effort(pack, self._qpos, forward, step, last)
+                forward = self._feedforward(command)
+            effort = control.effort(self._qpos, forward, step)
             if effort is not None:
                 pack.write_qf(effort)
             pack.step()
@@ -198,9 +140,60 @@ class EnvGroup:
         if not control.reads_qpos_each_step:
             self._qpos = pack.read_qpos()
 
-    def _feedforward(self, extra: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        """Passive force as compensated, and the caller's effort on top."""
+    def _feedforward(self, command: Command) -> Float64 | None:
+        """Return the compensation plus the caller's feedforward; None for zero."""
+        extra = command.feedforward
         if not self._gravity:
             return extra
         passive = self.pack.passive_force(self._gravity, self._coriolis)
         return passive if extra is None else passive + extra
+
+    # -- envs that fail ----------------------------------------------------------------------------------------
+
+    def _sound(self, state: Float64 | None) -> bool:
+        """Return whether no robot has failed, judged by ``state``, an array that depends on all their positions."""
+        limit = self._containment.speed_limit
+        return finite(state) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
+
+    def _contain(self, qpos: Float64, done: int) -> None:
+        """Suspend or reset the envs that failed, ``done`` substeps into a tick."""
+        containment, step = self._containment, self._steps + done
+        qvel = self.pack.read_qvel()
+        bad = ~(np.isfinite(qpos) & np.isfinite(qvel))
+        # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
+        source = ~np.isfinite(self.pack.qf) & bad.any(1, keepdims=True)
+        containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
+        if containment.speed_limit is not None:
+            fast = (np.abs(qvel) > containment.speed_limit) & ~bad.any(1, keepdims=True)
+            containment.fail(fast, "speed", step, self._qpos)
+        self._qpos = np.where(bad, self._qpos, qpos)
+        self._place_failed()
+
+    def _without_faults(self, command: Command) -> Command:
+        """Fail the envs whose commands are not finite; return commands that keep all failed envs where they are."""
+        containment = self._containment
+        for cause, rows in command._asdict().items():
+            if rows is not None:
+                containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
+        self._place_failed()
+        neutral, failed = (0.0 if self._kind == "effort" else self._qpos, 0.0, 0.0), containment.failed[:, None]
+        both = zip(command, neutral, strict=True)
+        return Command._make(None if rows is None else np.where(failed, value, rows) for rows, value in both)
+
+    def _place_failed(self) -> None:
+        """Place the envs that have failed since the last call: suspended, or at their start."""
+        containment = self._containment
+        failed = containment.pop_unplaced()
+        if not failed.any():
+            return
+        if containment.suspends:
+            self._place(failed, containment.suspended_qpos, np.zeros_like(containment.suspended_qpos))
+        else:
+            self._place(failed, containment.start_qpos, containment.start_qvel)
+
+    def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
+        rows = np.flatnonzero(mask)
+        self.pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
+        self.pack.suspend(self._containment.suspended)
+        self._qpos = self.pack.read_qpos()
+        self._control.reset(self._qpos, mask)

@@ -1,7 +1,7 @@
-"""Divergence is contained: an env that fails is stopped, flagged and held or reset; the others never notice.
+"""Faults of single envs: detected, reported, and contained, while the other envs are bit-identical to a run without.
 
-Envs that share a pack stay bit-identical beside one whose state is NaN, so that all there is to do is to see it in
-time and to put that env back to where it can be simulated.
+Envs that share a pack are not influenced by one whose state is NaN. So containment is to notice a fault in time, and to
+put that env into a state from which it can be simulated.
 """
 
 from __future__ import annotations
@@ -18,35 +18,36 @@ from numpy.typing import NDArray
 from sim.loop.arrays import Arrays
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel")
-"""What can fail: the state is not finite, a joint is too fast, or what the caller gave is not finite."""
+"""Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite."""
 
 ACTIONS = ("hold", "reset")
+"""Actions on a fault: suspend the env in its last good pose, or reset it to its last start."""
 
 Bool = NDArray[np.bool_]
 
 
 class Fault(NamedTuple):
-    """One env that was stopped."""
+    """Fault of one env."""
 
     env: int
     step: int
-    """Sim steps from the start of the runner up to the one that failed, that one included."""
+    """Sim steps from the start of the runner up to and including the one that failed."""
     time: float
-    """The same in seconds."""
+    """Time of that step [s]."""
     joint: str
-    """The first joint that failed."""
+    """First joint that failed."""
     cause: str
     """One of :data:`CAUSES`."""
     action: str
-    """What was done: ``"hold"`` or ``"reset"``."""
+    """One of :data:`ACTIONS`."""
 
     def __str__(self) -> str:
-        what = {
+        cause = {
             "state": "its state is no longer finite",
             "speed": "it is faster than speed_limit",
         }.get(self.cause, f"the {self.cause} given for it is not finite")
-        done = "held until it is reset" if self.action == "hold" else "reset"
-        return f"env {self.env}, joint {self.joint!r}: {what}, at step {self.step} ({self.time:g} s); {done}"
+        action = "held until it is reset" if self.action == "hold" else "reset"
+        return f"env {self.env}, joint {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
 
 
 class FaultWarning(UserWarning):
@@ -54,7 +55,7 @@ class FaultWarning(UserWarning):
 
 
 class FaultLog:
-    """The faults of a runner's envs, as they are seen tick by tick; the first is worth a warning."""
+    """Faults of a runner's envs, the last 10 000; the first one is also a warning."""
 
     def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
         self.faults: deque[Fault] = deque(maxlen=10_000)
@@ -63,15 +64,15 @@ class FaultLog:
         self._warned = False
 
     def forget(self, mask: Bool) -> None:
-        """Envs ``mask`` (envs,) start over."""
+        """Forget the last fault of the envs of ``mask`` (envs,), which were reset."""
         self._steps[mask] = -1
 
     def restore(self, steps: NDArray[Any]) -> None:
-        """Take these steps (envs,) of the envs' last faults as known."""
+        """Set the steps of the envs' last faults (envs,), which are known."""
         self._steps = steps.copy()
 
     def note(self, arrays: Arrays, stacklevel: int = 4) -> None:
-        """Add what failed since the last look."""
+        """Append the faults of ``arrays`` that are not known yet."""
         fault = arrays.fault
         if arrays.observation.ok.all():
             return
@@ -90,59 +91,65 @@ class FaultLog:
             )
 
 
-class Containment:
-    """Which of the M envs of a pack have failed, where they are held, and where each starts over.
+class FaultContainment:
+    """Last fault of each of M envs, and the state in which a failed env goes on.
 
-    ``flagged`` (M,) are the envs that failed in this tick or are stopped; ``step`` (-1: none), ``joint`` and ``cause``
-    tell of each env's last fault; positions and velocities are (M, dof).
+    Attributes
+    ----------
+    suspends
+        Whether failed envs are suspended; otherwise they are reset.
+    suspended, failed
+        Envs that are suspended, and those that failed in this tick or are suspended (M,).
+    start_qpos, start_qvel, suspended_qpos
+        State to which each env is reset, and pose in which it is suspended (M, dof).
+    step, joint, cause
+        Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
     """
 
+    _STATE = ("suspended", "failed", "start_qpos", "start_qvel", "suspended_qpos", "step", "joint", "cause")
+
     def __init__(self, size: int, dof: int, action: str, speed_limit: NDArray[np.float64] | None) -> None:
-        self.holds, self.speed_limit = action == "hold", speed_limit
-        self.stopped: Bool = np.zeros(size, bool)
-        self.flagged: Bool = np.zeros(size, bool)
-        self.home_qpos, self.home_qvel, self.held_qpos = (np.zeros((size, dof)) for _ in range(3))
+        self.suspends, self.speed_limit = action == "hold", speed_limit
+        self.suspended: Bool = np.zeros(size, bool)
+        self.failed: Bool = np.zeros(size, bool)
+        self.start_qpos, self.start_qvel, self.suspended_qpos = (np.zeros((size, dof)) for _ in range(3))
         self.step = np.full(size, -1)
         self.joint, self.cause = np.zeros(size, int), np.zeros(size, int)
-        self._failed: Bool = np.zeros(size, bool)
+        self._unplaced: Bool = np.zeros(size, bool)
 
-    def start(self, mask: Bool, sound: Bool, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Envs ``mask`` start over; those of ``sound`` at ``qpos``, ``qvel``, the others where they did last."""
-        self.home_qpos[sound], self.home_qvel[sound] = qpos[sound], qvel[sound]
-        self.stopped[mask] = self.flagged[mask] = False
+    def clear(self, mask: Bool) -> None:
+        """Clear the faults of the envs of ``mask`` (M,), which are reset."""
+        self.suspended[mask] = self.failed[mask] = False
         self.step[mask] = -1
 
-    def fail(self, bad: Bool, cause: str, step: int, held: NDArray[np.float64]) -> None:
-        """Envs with a True entry in ``bad`` (M, dof) failed; where envs are held, they are at ``held``."""
+    def fail(self, bad: Bool, cause: str, step: int, qpos: NDArray[np.float64]) -> None:
+        """Note a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at ``qpos`` (M, dof)."""
         failed = bad.any(1)
         if not failed.any():
             return
-        new = failed & ~self.flagged
+        new = failed & ~self.failed
         self.step[new], self.joint[new], self.cause[new] = step, bad.argmax(1)[new], CAUSES.index(cause)
-        self.flagged |= failed
-        self._failed |= failed
-        if self.holds:
-            self.held_qpos[new] = np.where(np.isfinite(held), held, self.home_qpos)[new]
-            self.stopped |= failed
+        self.failed |= failed
+        self._unplaced |= failed
+        if self.suspends:
+            self.suspended_qpos[new] = np.where(np.isfinite(qpos), qpos, self.start_qpos)[new]
+            self.suspended |= failed
 
-    def take_failed(self) -> Bool:
-        """The envs that failed since this was last asked."""
-        failed, self._failed = self._failed, np.zeros_like(self._failed)
-        return failed
+    def pop_unplaced(self) -> Bool:
+        """Return the envs that failed since the last call (M,), which are to be placed."""
+        unplaced, self._unplaced = self._unplaced, np.zeros_like(self._unplaced)
+        return unplaced
 
     def read(self) -> dict[str, NDArray[Any]]:
-        """All that is to be kept, one row per env."""
-        return {name: getattr(self, name).copy() for name in _KEPT}
+        """Return the state by name, one row per env, for :meth:`write`."""
+        return {name: getattr(self, name).copy() for name in self._STATE}
 
-    def write(self, tables: dict[str, NDArray[Any]]) -> None:
-        """Take what :meth:`read` gave."""
-        for name in _KEPT:
-            getattr(self, name)[...] = tables[name]
-
-
-_KEPT = ("stopped", "flagged", "home_qpos", "home_qvel", "held_qpos", "step", "joint", "cause")
+    def write(self, state: dict[str, NDArray[Any]]) -> None:
+        """Set the state that :meth:`read` returned."""
+        for name in self._STATE:
+            getattr(self, name)[...] = state[name]
 
 
 def finite(*arrays: NDArray[Any] | None) -> bool:
-    """Whether all entries are finite, and not huge, in one pass: a sum of squares is NaN or inf if one is not."""
+    """Return whether all entries are finite and below 1e150, in one pass: otherwise a sum of squares is inf or NaN."""
     return all(array is None or math.isfinite(np.vdot(array, array)) for array in arrays)

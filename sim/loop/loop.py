@@ -7,14 +7,13 @@ group, so that its working set stays in the cache; nothing depends on how envs a
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
 from sim.engine.building import SceneSpec, parse
-from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.engine.variation import Variation, VariedPack
 from sim.loop.arrays import Arrays, Command
@@ -74,14 +73,12 @@ class Loop:
             )
             for envs in slices
         ]
-        self.set_params(spec.params)
 
     def _build(self, envs: slice) -> Pack:
         spec, size = self.spec, envs.stop - envs.start
         if spec.variation is not None:
-            varied, model = spec.variation.for_envs(envs), scene_dynamics(replace(spec.scene, build=None))
-            first = spec.first_env + envs.start
-            return VariedPack(self._builder, spec.scene, size, first, spec.pack_size, varied, model)
+            first, variation = spec.first_env + envs.start, spec.variation.for_envs(envs)
+            return VariedPack(self._builder, spec.scene, size, first, spec.pack_size, variation)
         return Pack(self._builder, spec.scene, size, spec.first_env + envs.start, spec.pack_size)
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:

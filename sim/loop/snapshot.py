@@ -22,9 +22,9 @@ import batchpid as bp
 from batchpid.choices import CHOICE_TYPES
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
-from sim.loop.faults import CAUSES, Containment
+from sim.loop.faults import CAUSES, FaultContainment
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class EnvStates:
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
     containment: dict[str, NDArray[Any]]
-    """See :class:`sim.loop.faults.Containment`."""
+    """See :class:`sim.loop.faults.FaultContainment`."""
 
     def for_envs(self, envs: slice) -> EnvStates:
         """The state of some of the envs, as copies."""
@@ -66,7 +66,7 @@ class EnvStates:
             "saturated": table > 0,
             "content": self.content[:num_envs],
         }
-        known = Containment(num_envs, dof, "hold", None).read()
+        known = FaultContainment(num_envs, dof, "hold", None).read()
         wanted |= {f"containment.{name}": rows for name, rows in known.items()}
         found = dict(_flatten(self))
         remembered = bp.init(params, table)._asdict()

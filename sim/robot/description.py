@@ -102,8 +102,8 @@ class Dynamics(Protocol):
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort``, gravity included."""
 
-    def touches(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
-        """Return whether links come nearer than ``clearance`` [m] to each other or to the ground (n,)."""
+    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 
 
 _make_dynamics: list[Callable[[RobotDescription, bool], Dynamics]] = []

@@ -121,7 +121,7 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
             "SAPIEN's passive force does not compensate gravity on a floating base",
             "load with fixed_base=True, or expect no compensation",
         )
-    if robot.dynamics().touches(start[None])[0]:
+    if robot.dynamics().in_contact(start[None])[0]:
         yield Finding(
             "warning",
             "touching",

@@ -114,7 +114,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
         start, target = _with_mimics(robot, start), _with_mimics(robot, target)
-        return None if dynamics.touches(start + line * (target - start)).any() else (start, target, kind)
+        return None if dynamics.in_contact(start + line * (target - start)).any() else (start, target, kind)
 
     return draw_moves(robot, count, draw)
 

@@ -55,15 +55,15 @@ def test_passive_force_holds_still(panda):
 
 def test_contact_moves_begin_free_and_end_in_contact(panda):
     moves, dynamics = contact_moves(panda, 4, seed=1), panda.dynamics()
-    assert not dynamics.touches(moves.start).any()
-    assert dynamics.touches(moves.target).all()
+    assert not dynamics.in_contact(moves.start).any()
+    assert dynamics.in_contact(moves.target).all()
 
 
 def test_limit_moves_leave_the_limits_of_one_joint(panda):
     moves = limit_moves(panda, 4, seed=1)
     assert not panda.limit_violations(moves.start)
     assert [env for env, _, _ in panda.limit_violations(moves.target)] == [0, 1, 2, 3]
-    assert not panda.dynamics().touches(moves.target).any()
+    assert not panda.dynamics().in_contact(moves.target).any()
 
 
 def test_free_motion_hardly_depends_on_the_solver(panda):

@@ -1,4 +1,4 @@
-"""Which robots get a PhysX system of their own: those that may be touched in the next time step."""
+"""Contact prediction: which robots get a PhysX system to themselves, and what they keep."""
 
 from __future__ import annotations
 
@@ -6,46 +6,54 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from robots import load_bundled
 
-from sim import Robot
-from sim.benchmark.accuracy import contact_moves, follow
-from sim.engine.building import SceneSpec, link_extents, parse
-from sim.engine.contact_prediction import AHEAD, SURGE, WORLD, ContactPredictor, Gap, Link
+from sim import Runner
+from sim.benchmark.accuracy import contact_moves
+from sim.engine.building import SceneSpec, build_robot, engine_settings, headless_scene, link_extents, parse
+from sim.engine.contact_prediction import (
+    LOOKAHEAD_STEPS,
+    MAX_ACCELERATION,
+    WORLD,
+    ContactPredictor,
+    LinkExtent,
+    NearPair,
+)
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
 from sim.robot.kinematics import Kinematics
 
 DT = 1 / 2000
 # A base, an arm that turns, and on it two fingers that slide and one that turns.
-HAND = [
-    Link(None, None, False, 0.0, 0.1),
-    Link(0, 0, False, 0.3, 0.2),
-    Link(1, 1, True, 0.1, 0.05),
-    Link(1, 2, True, 0.1, 0.05),
-    Link(1, 3, False, 0.1, 0.04),
+LINKS = [
+    LinkExtent(None, None, False, 0.0, 0.1),
+    LinkExtent(0, 0, False, 0.3, 0.2),
+    LinkExtent(1, 1, True, 0.1, 0.05),
+    LinkExtent(1, 2, True, 0.1, 0.05),
+    LinkExtent(1, 3, False, 0.1, 0.04),
 ]
-STILL = SURGE * DT * AHEAD * DT
-"""What may close from rest [m]."""
+FROM_REST = MAX_ACCELERATION * DT * LOOKAHEAD_STEPS * DT
+"""Distance that may close from rest [m]."""
 
 
-def crowding(timestep=DT):
-    return ContactPredictor(HAND, 4, timestep)
+def predicts_contact(pairs, qvel, timestep=DT):
+    return ContactPredictor(LINKS, 4, timestep).predicts_contact([NearPair(*pair) for pair in pairs], np.array(qvel))
 
 
 @pytest.mark.parametrize(("far", "expected"), [(0.9, True), (1.1, False)])
-def test_from_rest_two_gaps_count(far, expected):
-    gaps = [Gap(2, 3, 0.5 * STILL), Gap(2, WORLD, far * STILL)]
-    assert crowding().predicts_contact(gaps, np.zeros(4)) == expected
-    assert not crowding().predicts_contact(gaps[:1], np.zeros(4))
+def test_from_rest_two_near_pairs_predict_contact(far, expected):
+    pairs = [(2, 3, 0.5 * FROM_REST), (2, WORLD, far * FROM_REST)]
+    assert predicts_contact(pairs, np.zeros(4)) == expected
+    assert not predicts_contact(pairs[:1], np.zeros(4))
 
 
-def test_what_touches_already_counts():
-    assert crowding().predicts_contact([Gap(2, 3, 0.0)], np.zeros(4))
-    assert not crowding().predicts_contact([], np.full(4, 1e3))
+def test_a_pair_in_contact_predicts_contact():
+    assert predicts_contact([(2, 3, 0.0)], np.zeros(4))
+    assert not predicts_contact([], np.full(4, 1e3))
 
 
 @pytest.mark.parametrize(
-    ("pair", "arms"),
+    ("links", "reach"),
     [
         ((2, 3), (0.0, 1.0, 1.0, 0.0)),  # the joint above both moves them alike
         ((2, WORLD), (0.3 + 0.05 - 0.2, 1.0, 0.0, 0.0)),
@@ -53,15 +61,13 @@ def test_what_touches_already_counts():
         ((0, 1), (0.2, 0.0, 0.0, 0.0)),
     ],
 )
-def test_a_gap_closes_as_fast_as_the_joints_between_its_links_move(pair, arms):
-    """A link turns about a joint with its farthest point, a sliding joint's full travel apart."""
+def test_a_pair_closes_as_fast_as_the_joints_between_its_links_move(links, reach):
+    """A link turns about a joint with its farthest point, a sliding joint's full travel away."""
     qvel = np.array([1.0, -2.0, 3.0, -4.0])
-    speed = float(np.abs(qvel) @ arms)
-    closes = AHEAD * DT * speed
-    assert crowding().predicts_contact([Gap(*pair, closes * 0.999)], qvel)
-    assert not crowding().predicts_contact([Gap(*pair, closes * 1.001)], qvel)
-    two = Gap(*pair, closes + 0.99 * STILL)
-    assert crowding().predicts_contact([two, two], qvel)
+    closes = LOOKAHEAD_STEPS * DT * float(np.abs(qvel) @ reach)
+    assert predicts_contact([(*links, closes * 0.999)], qvel)
+    assert not predicts_contact([(*links, closes * 1.001)], qvel)
+    assert predicts_contact([(*links, closes + 0.99 * FROM_REST)] * 2, qvel)
 
 
 @given(
@@ -69,42 +75,41 @@ def test_a_gap_closes_as_fast_as_the_joints_between_its_links_move(pair, arms):
     st.lists(st.floats(-50, 50), min_size=4, max_size=4),
     st.randoms(use_true_random=False),
 )
-def test_foresight_has_no_order_and_faster_is_never_safer(pairs, speeds, random):
-    gaps, qvel = [Gap(*pair) for pair in pairs], np.array(speeds)
-    found = crowding().predicts_contact(gaps, qvel)
-    random.shuffle(gaps)
-    assert crowding().predicts_contact(gaps, -qvel) is found
-    assert crowding().predicts_contact([Gap(b, a, d) for a, b, d in gaps], qvel) is found
+def test_prediction_has_no_order_and_more_speed_predicts_no_less(pairs, qvel, random):
+    qvel = np.array(qvel)
+    found = predicts_contact(pairs, qvel)
+    random.shuffle(pairs)
+    assert predicts_contact(pairs, -qvel) is found
+    assert predicts_contact([(b, a, distance) for a, b, distance in pairs], qvel) is found
     if found:
-        assert crowding().predicts_contact(gaps, 2 * qvel)
-        assert crowding(2 * DT).predicts_contact(gaps, qvel)
+        assert predicts_contact(pairs, 2 * qvel)
+        assert predicts_contact(pairs, qvel, 2 * DT)
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_no_link_outruns_its_reach(name):
-    """Every link's origin moves at most as fast as the reach about each joint allows."""
-    robot = Robot.load(name)
+def test_no_link_is_faster_than_its_reach_allows(name):
+    robot = load_bundled(name)
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS["fast"])
-    pack = Pack(parse(spec), spec, 1)
-    links = link_extents(pack._robots[0])
-    arm = ContactPredictor(links, robot.dof, DT)._arm[:-1, WORLD]
+    scene = headless_scene()
+    with engine_settings(spec):
+        built = build_robot(parse(spec), scene, spec)
+    reach = ContactPredictor(link_extents(built), robot.dof, DT).reach[:-1]
     body = Kinematics(robot)
-    order = [body.index(link.name) for link in pack._robots[0].links]
-    pack.close()
+    order = [body.index(link.name) for link in built.links]
     rng = np.random.default_rng(0)
     qpos, qvel = robot.sample(50, seed=0), rng.normal(size=(50, robot.dof))
     tiny = 1e-6
     there, here = body.poses(qpos + tiny * qvel).position, body.poses(qpos).position
     speed = np.linalg.norm(there - here, axis=-1)[:, order] / tiny
-    bound = np.abs(qvel) @ arm.T
+    bound = np.abs(qvel) @ reach.T
     assert (speed <= bound * (1 + 1e-4) + 1e-6).all()
-    assert (bound[:, 1:].max(1) < 20 * speed.max(1)).all()  # not a bound that says nothing
+    assert (bound[:, 1:].max(1) < 20 * speed.max(1)).all()  # the bound is of the order of the speed
 
 
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
-def test_a_system_of_its_own_is_like_the_shared_one(physics):
-    """Solver, gravity and time step; and what is set on the robot: friction, damping, drive, qf, weightlessness."""
-    robot = Robot.load("jaco2")
+def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
+    """Solver, gravity and time step of the system; friction, damping, drives, qf and suspension of the robot."""
+    robot = jaco2
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0))
     pack = Pack(parse(spec), spec, 4, system_size=4)
     pack.write_state(range(4), np.tile(robot.start, (4, 1)), np.full((4, robot.dof), 0.1))
@@ -114,16 +119,16 @@ def test_a_system_of_its_own_is_like_the_shared_one(physics):
     pack.suspend(np.array([False, True, False, False]))
     pack.isolate([0, 1])
     assert pack.isolated.tolist() == [True, True, False, False]
-    home, own = pack._systems[2], pack._systems[0]
-    assert own is not home
-    assert own.timestep == home.timestep == pytest.approx(DT)
-    settings = [name for name in dir(home.config) if not name.startswith("_")]
+    shared, own = pack.systems[2], pack.systems[0]
+    assert own is not shared
+    assert own.timestep == shared.timestep == pytest.approx(DT)
+    settings = [name for name in dir(shared.config) if not name.startswith("_")]
     assert "enable_tgs" in settings
     for name in settings:
-        assert np.all(getattr(own.config, name) == getattr(home.config, name)), name
+        assert np.all(getattr(own.config, name) == getattr(shared.config, name)), name
     assert own.config.enable_tgs == (physics == "accurate")
     for row, other in ((0, 2), (1, 3)):
-        ours, theirs = pack._robots[row], pack._robots[other]
+        ours, theirs = pack.robots[row], pack.robots[other]
         for name in ("qpos", "qvel", "qf") if row == 0 else ("qpos", "qvel"):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
         for joint, like in zip(ours.active_joints, theirs.active_joints, strict=True):
@@ -143,15 +148,13 @@ def test_a_system_of_its_own_is_like_the_shared_one(physics):
     pack.close()
 
 
-def test_leaving_before_the_touch_changes_no_path(monkeypatch):
-    """What the engine remembers of a contact would be lost with it; so robots leave before there is one."""
-    robot, left = Robot.load("panda"), []
-    moves = contact_moves(robot, 2)
-    move = Pack._move
-    monkeypatch.setattr(Pack, "_move", lambda pack, systems: (left.extend(systems), move(pack, systems)))
-    ours = follow(robot, moves, 1500, PHYSICS["fast"])
-    assert sorted(left) == [0, 1]
-    monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *_: False)
-    theirs = follow(robot, moves, 1500, PHYSICS["fast"])
-    assert len(left) == 2
-    np.testing.assert_allclose(ours, theirs, atol=2e-3)
+def test_isolation_before_contact_does_not_change_the_path(panda, packs, monkeypatch):
+    """A robot that is rebuilt in contact would lose what the engine remembers of it."""
+    moves, runs = contact_moves(panda, 2), []
+    for isolated in (2, 0):
+        with Runner(panda, 2, workers=0, params=panda.tuned(), physics="fast", pack_size=2) as runner:
+            runner.reset(moves.start)
+            runs.append(runner.rollout(np.broadcast_to(moves.target, (75, *moves.target.shape))))
+            assert packs.isolated() == isolated
+        monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *_: False)
+    np.testing.assert_allclose(runs[0].qpos, runs[1].qpos, atol=2e-3)

@@ -1,20 +1,21 @@
-"""The user's own content of a scene: built anywhere, separate from env to env, and put back at a reset."""
+"""User content of a scene: built in any process, separate from env to env, and reset with its env."""
 
 import threading
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner
+from sim import Runner
 from sim.engine.user_content import sapien
 
-ROBOT = Robot.load("panda")
+ROBOT = load_bundled("panda")
 DROP = 0.5 * 9.81 * 0.2**2
 
 
 def box_beside_the_robot(scene, env):
-    """As in SAPIEN's tutorial, visual and lights included; each env's box falls from higher."""
+    """Add a box as SAPIEN's tutorial does, visual and lights included; each env's falls from higher."""
     builder = scene.create_actor_builder()
     builder.add_box_collision(half_size=[0.5, 0.5, 0.5])
     builder.add_box_visual(half_size=[0.5, 0.5, 0.5], material=[1.0, 0.0, 0.0])
@@ -26,7 +27,7 @@ def box_beside_the_robot(scene, env):
 
 
 def balls_on_the_arm(scene, env):
-    """Content that robots and each other touch: balls of another size in each env, on the arm and in a heap."""
+    """Add balls that touch the robot and each other, of another size in each env."""
     balls = []
     for k in range(3):
         builder = scene.create_actor_builder()
@@ -43,7 +44,7 @@ def run(build, num_envs=4, ticks=30, **options):
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_box_falls_and_a_reset_puts_it_back(workers):
+def test_content_falls_and_a_reset_puts_it_back(workers):
     with Runner(ROBOT, 2, workers=workers, build=box_beside_the_robot) as runner:
         before = runner.poses()
         np.testing.assert_allclose(before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6)
@@ -62,7 +63,7 @@ def test_a_box_falls_and_a_reset_puts_it_back(workers):
         assert runner.poses()[1, 0, 2] > 1.09  # it starts at rest
 
 
-def test_content_meets_the_robot_and_no_other_env():
+def test_content_touches_the_robot_and_no_other_env():
     lonely, _ = run(box_beside_the_robot, num_envs=1, workers=0)
     touched, balls = run(balls_on_the_arm, num_envs=4, workers=0)
     assert np.abs(touched.qpos[:, 0] - lonely.qpos[:, 0]).max() > 1e-6
@@ -74,7 +75,7 @@ def test_content_meets_the_robot_and_no_other_env():
 @pytest.mark.parametrize(
     "options", [{"pack_size": 1}, {"pack_size": 3}, {"workers": 2}, {"workers": 2, "pack_size": 4}]
 )
-def test_the_same_bits_for_any_packing_and_any_workers(options):
+def test_content_is_bit_identical_for_any_packing_and_workers(options):
     expected, poses = run(balls_on_the_arm, num_envs=5, ticks=40, workers=0)
     found, others = run(balls_on_the_arm, num_envs=5, ticks=40, **({"workers": 0} | options))
     np.testing.assert_array_equal(found.qpos, expected.qpos)
@@ -82,7 +83,7 @@ def test_the_same_bits_for_any_packing_and_any_workers(options):
     assert np.ptp(poses[:, :, 2], axis=0).max() > 1e-3  # the envs differ
 
 
-def test_a_function_from_anywhere_travels():
+def test_a_function_that_no_worker_can_import_is_sent_to_the_workers():
     scope = {"sapien": sapien}
     exec(  # as in a script's __main__ or a notebook: no worker can import it
         "def build(scene, env):\n"
@@ -97,7 +98,7 @@ def test_a_function_from_anywhere_travels():
     np.testing.assert_array_equal(poses[:, 0, 1], [0, 1, 2])
 
 
-def test_errors_name_build_and_the_env():
+def test_errors_of_build_name_it_and_the_env():
     def wrong(scene, env):
         if env == 2:
             raise KeyError("no such thing")
@@ -107,7 +108,7 @@ def test_errors_name_build_and_the_env():
             InvalidArgumentError, match=r"build, env 2: raised KeyError: 'no such thing'.*test_user_content"
         ):
             run(wrong, workers=workers)
-    with pytest.raises(InvalidArgumentError, match="no entity"):
+    with pytest.raises(InvalidArgumentError, match="other than entities"):
         run(lambda scene, env: [3], workers=0)
     with pytest.raises(InvalidArgumentError, match="must be a function"):
         run("build", workers=0)

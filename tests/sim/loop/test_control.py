@@ -1,4 +1,4 @@
-"""The three kinds of control, and what changes in flight."""
+"""Controls "pid", "drive" and "effort", and changes of params in flight."""
 
 import numpy as np
 
@@ -8,8 +8,8 @@ POSE = np.array([0.3, 0.4, -0.2, -1.8, 0.5, 1.9, 0.7, 0.02, 0.02])
 ARM = slice(0, 7)
 
 
-def left_after(runner, seconds):
-    """Largest error of the arm's joints at the end."""
+def error_after(runner, seconds):
+    """Return the largest error of the arm's joints at the end."""
     runner.reset(POSE)
     for _ in range(round(seconds * 100)):
         obs = runner.step(POSE)
@@ -17,29 +17,29 @@ def left_after(runner, seconds):
     return np.abs(obs.qpos - POSE)[:, ARM].max()
 
 
-def test_uncompensated_drive_sags_and_its_integral_lifts_it(panda):
+def test_the_integral_of_a_drive_removes_the_error_of_gravity(panda):
     options = {"effort_limit": None, "anti_windup": "none"}
     sagging = panda.params(kp=400.0, ki=0.0, kd=80.0, **options)
     lifting = panda.params(kp=400.0, ki=800.0, kd=80.0, **options)
     with Runner(panda, 1, workers=0, control="drive", compensate="none", params=sagging) as runner:
-        sag = left_after(runner, 3.0)
+        sag = error_after(runner, 3.0)
     with Runner(panda, 1, workers=0, control="drive", compensate="none", params=lifting) as runner:
-        left = left_after(runner, 3.0)
+        left = error_after(runner, 3.0)
     assert sag > 0.03
     assert left < 0.1 * sag
 
 
-def test_pid_integral_removes_the_error_of_gravity(panda):
+def test_the_integral_of_the_pid_removes_the_error_of_gravity(panda):
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
     with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=0.0, **gains)) as runner:
-        sag = left_after(runner, 3.0)
+        sag = error_after(runner, 3.0)
     with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=800.0, **gains)) as runner:
-        left = left_after(runner, 3.0)
+        left = error_after(runner, 3.0)
     assert sag > 0.03
     assert left < 0.1 * sag
 
 
-def test_effort_is_passed_on_within_the_limits(panda):
+def test_efforts_are_applied_within_the_limits(panda):
     wanted = np.zeros((2, 9))
     wanted[1, 0] = 1000.0
     with Runner(panda, 2, workers=0, control="effort", compensate="none", substeps=1) as runner:
@@ -50,7 +50,7 @@ def test_effort_is_passed_on_within_the_limits(panda):
     assert obs.saturated[1, 0]
 
 
-def test_total_effort_is_saturated_passive_force_included(panda):
+def test_the_limit_holds_for_the_effort_with_compensation_and_feedforward(panda):
     with Runner(panda, 1, workers=0, params=panda.params(kp=1e5, ki=0.0, kd=0.0), substeps=1) as runner:
         runner.reset(POSE)
         obs = runner.step(POSE + np.r_[np.full(7, 0.3), 0, 0], feedforward=np.full(9, 5.0))
@@ -58,7 +58,7 @@ def test_total_effort_is_saturated_passive_force_included(panda):
     assert obs.saturated[0, ARM].all()
 
 
-def test_feedforward_is_an_effort(panda):
+def test_feedforward_is_added_to_the_effort(panda):
     with Runner(panda, 1, workers=0, control="effort", substeps=1) as runner:
         runner.reset(POSE)
         passive = runner.step(np.zeros(9)).effort.astype(float)
@@ -67,8 +67,7 @@ def test_feedforward_is_an_effort(panda):
     np.testing.assert_allclose(pushed - passive, [np.arange(9.0)], atol=1e-4)
 
 
-def test_setpoint_rate_damps_the_velocity_error(panda):
-    """A drive whose target moves lags behind unless it knows the target's rate."""
+def test_setpoint_rate_removes_the_lag_behind_a_moving_setpoint(panda):
     lag = {}
     for known in (True, False):
         with Runner(panda, 1, workers=0, params=panda.params(kp=100.0, ki=0.0, kd=20.0)) as runner:
@@ -82,7 +81,7 @@ def test_setpoint_rate_damps_the_velocity_error(panda):
 
 
 def test_gains_change_in_flight_without_a_bump(panda):
-    """With an integral that carries the load, a change of ki leaves the effort as it is."""
+    """An integral that carries the load carries on when ki changes."""
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
     with Runner(panda, 1, workers=1, compensate="none", substeps=20, params=panda.params(ki=800.0, **gains)) as runner:
         runner.reset(POSE)

@@ -1,14 +1,16 @@
-"""Gains per unit of inertia on real robots: alike on every joint, the same bytes for any number of workers."""
+"""Gains per unit of inertia on real robots."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from identical import assert_identical
+from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import step_metrics
-from sim import Robot, Runner
+from sim import Runner
 
 OMEGA = 9.0
 
@@ -27,8 +29,8 @@ def acceleration_params(robot, units, **options):
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_one_set_of_gains_settles_every_arm_joint_of_every_robot_on_its_tutorials_move(name):
-    robot = Robot.load(name)
+def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
+    robot = load_bundled(name)
     with Runner(robot, 1, params=acceleration_params(robot, "mass_matrix"), workers=0, substeps=10) as runner:
         runner.reset(robot.settings.start)
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (400, robot.dof)))
@@ -40,8 +42,8 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot_on_its_tutorial
 
 
 @pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
-def test_same_bytes_for_any_number_of_workers_and_any_packing(units):
-    robot = Robot.load("panda")
+def test_any_packing_and_workers_are_bit_identical(units, panda):
+    robot = panda
     rng = np.random.default_rng(0)
     start = robot.start + rng.uniform(-0.2, 0.0, (5, robot.dof)) * [1, 1, 1, 1, 1, 0, 1, 0, 0]
     goal = np.clip(start + rng.uniform(-0.5, 0.5, start.shape), robot.lower, robot.upper)
@@ -52,14 +54,13 @@ def test_same_bytes_for_any_number_of_workers_and_any_packing(units):
             runner.reset(start)
             outcome.append(runner.rollout(np.broadcast_to(goal, (10, 5, robot.dof))))
     assert np.abs(outcome[0].qpos[-1] - start).max() > 0.05
-    for other in outcome[1:]:
-        for field in ("qpos", "qvel", "effort", "saturated"):
-            assert getattr(other, field).tobytes() == getattr(outcome[0], field).tobytes(), field
+    assert_identical(outcome[1], outcome[0])
+    assert_identical(outcome[2], outcome[0])
 
 
-def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix():
-    """For one substep, the effort is that of plain gains multiplied by hand."""
-    robot = Robot.load("jaco2")
+def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
+    """In the first sim step the effort is that of gains per effort, multiplied by hand."""
+    robot = jaco2
     diagonal = robot.mass_matrix(robot.start)[0].diagonal()
     efforts = []
     for units, inertia in (("inertia", 1.0), ("effort", diagonal)):
@@ -69,15 +70,31 @@ def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix():
     np.testing.assert_allclose(*efforts, rtol=1e-6)
 
 
-def test_gain_units_are_for_pid_control_only():
-    robot = Robot.load("panda")
+@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
+def test_gain_units_change_in_flight_without_a_bump(units, panda):
+    """Integrals that carry the robot's weight carry on in the unit of the new gains, back and forth."""
+    gains = {"kp": 400.0, "ki": 800.0, "kd": 40.0, "derivative_filter_time": 2e-3}
+    per_effort = panda.params(**gains, effort_limit=None)
+    per_inertia = panda.params(**gains, effort_limit=None, gain_units=units)
+    setpoint = panda.settings.target * [[1.0], [0.9]]
+    with Runner(panda, 2, workers=0, compensate="none", params=per_effort) as runner:
+        runner.reset(setpoint)
+        before = runner.rollout(np.broadcast_to(setpoint, (600, 2, 9))).effort[-1]
+        assert np.abs(before).max() > 10.0
+        for params in (per_inertia, per_effort):
+            runner.params = params
+            after = runner.step(setpoint, substeps=1).effort
+            np.testing.assert_allclose(after, before, atol=0.1)
+
+
+def test_gain_units_are_for_pid_control_only(panda):
     with pytest.raises(InvalidArgumentError, match="gain_units"):
-        Runner(robot, 1, params=acceleration_params(robot, "inertia"), control="drive", workers=0)
+        Runner(panda, 1, params=acceleration_params(panda, "inertia"), control="drive", workers=0)
 
 
-def test_mass_matrix_is_what_the_engine_accelerates():
-    """One free step under a small effort: M times the acceleration is the effort."""
-    robot = Robot.load("jaco2")
+def test_mass_matrix_is_that_of_the_engine(jaco2):
+    """In one free step under a small effort, M times the acceleration is the effort."""
+    robot = jaco2
     rng = np.random.default_rng(1)
     start = robot.start + 0.1 + 0.2 * rng.random(robot.dof)
     matrix = robot.mass_matrix(start)[0]
@@ -89,9 +106,9 @@ def test_mass_matrix_is_what_the_engine_accelerates():
 
 
 @pytest.mark.parametrize("substeps", [5, 20])
-def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps):
-    """Down from upright, jaco2's mass matrix changes fast: matrices that are ahead on average put it 18 mrad off."""
-    robot = Robot.load("jaco2")
+def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps, jaco2):
+    """Near upright jaco2's mass matrix changes fast: matrices that are ahead on average put it 18 mrad off."""
+    robot = jaco2
     start = robot.settings.start + np.array([0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25])
     move = robot.settings.target - start
     with Runner(robot, 1, params=robot.designed(), workers=0, substeps=substeps) as runner:

@@ -1,4 +1,4 @@
-"""With friction and link damping as the URDF says, efforts alone must hold a robot where it is."""
+"""Robots at rest, with the friction and damping of the URDF: efforts alone hold them in their pose."""
 
 import numpy as np
 
@@ -16,16 +16,16 @@ def drift(runner, seconds=10.0):
     return far
 
 
-def test_passive_force_alone_holds(panda):
+def test_passive_force_alone_holds_the_pose(panda):
     with Runner(panda, 1, control="effort", workers=0) as runner:
         assert drift(runner) < 1e-3
 
 
-def test_pid_holds(panda):
+def test_pid_holds_the_pose(panda):
     with Runner(panda, 1, workers=0) as runner:
         assert drift(runner) < 1e-5
 
 
-def test_without_compensation_it_falls(panda):
+def test_without_compensation_the_robot_falls(panda):
     with Runner(panda, 1, control="effort", compensate="none", workers=0) as runner:
         assert drift(runner, 0.5) > 0.1

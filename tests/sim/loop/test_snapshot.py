@@ -178,7 +178,7 @@ BROKEN = {
     "steps": (lambda head, tables: head.update(steps=-1), "cannot be read"),
     "a marker": (lambda head, tables: head.update(markers={"anti_windup": "Evil"}), "cannot be read"),
     "no integral": (lambda head, tables: tables.pop("controller.integral"), "no controller.integral"),
-    "no home": (lambda head, tables: tables.pop("containment.home_qvel"), "no containment.home_qvel"),
+    "no start": (lambda head, tables: tables.pop("containment.start_qvel"), "no containment.start_qvel"),
     "more": (lambda head, tables: tables.update(more=np.zeros(1)), "cannot be read"),
     "an unknown leaf": (
         lambda head, tables: tables.update({"containment.x": np.zeros(2)}),

@@ -210,7 +210,7 @@ def test_links_tied_by_fixed_joints_do_not_push_each_other(tmp_path):
         runner.reset(np.array([0.3, 0.0]))
         still = runner.step(np.zeros(2))
     np.testing.assert_allclose(still.qpos, [[0.3, 0.0]], atol=1e-5)
-    assert arm.dynamics().touches(np.array([[0.3, 0.0]])).tolist() == [False]
+    assert arm.dynamics().in_contact(np.array([[0.3, 0.0]])).tolist() == [False]
 
 
 def test_building_writes_no_file(tmp_path, monkeypatch):

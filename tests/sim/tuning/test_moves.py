@@ -25,7 +25,7 @@ def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
         assert ((poses >= panda.lower) & (poses <= panda.upper)).all()
     for start, target in zip(moves.start, moves.target, strict=True):
         line = start + np.linspace(0, 1.05, 50)[:, None] * (target - start)
-        assert not panda.dynamics().touches(line).any()
+        assert not panda.dynamics().in_contact(line).any()
     assert sum("alone" in name for name in moves.names) == 2
     np.testing.assert_array_equal(random_moves(panda, 3, 3).start, moves.start[:3])
 
@@ -70,4 +70,4 @@ def test_smooth_variation_of_a_joint_at_rest_is_a_thousandth_of_its_limit(panda)
 def test_poses_in_contact_are_recognised(panda):
     folded = panda.start.copy()
     folded[[1, 3]] = 1.7, -2.9
-    assert panda.dynamics().touches(np.array([folded, panda.start])).tolist() == [True, False]
+    assert panda.dynamics().in_contact(np.array([folded, panda.start])).tolist() == [True, False]
