@@ -45,10 +45,10 @@ class PlotCommand:
         rollout = _read(self.recording, every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)
-            figure = plots.comparison(rollout, _read(self.versus, every), labels=labels, joints=self.joints or None)
+            figure = plots.comparison(rollout, _read(self.versus, every), labels=labels, joints=self.joints)
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
-            figure = draw(rollout, joints=self.joints or None)
+            figure = draw(rollout, joints=self.joints)
         named_alike = self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png")
         print(f"picture: {plots.save(figure, picture or named_alike)}")
 

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from numpy.typing import NDArray
 
-from sim.observation import OBSERVED, Rollout
+from sim.observation import OBSERVED, Rollout, RunInfo
 
 ENV = "#4c78a8"
 MEDIAN = "#16324f"
@@ -23,6 +23,7 @@ SETPOINT = "#2f8f4e"
 LIMIT = "#b23a48"
 SMALL = 7.0
 """Font size of ticks and units."""
+_NOTE: Any = {"fontsize": 6.5, "color": "#444444", "bbox": {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6}}
 
 
 def draw_fan(axes: Axes, time: NDArray[Any], values: NDArray[Any], mark: int | None) -> None:
@@ -79,7 +80,7 @@ def draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None
         colours = LinearSegmentedColormap.from_list("saturation", [to_rgba(LIMIT, 0.0), to_rgba(LIMIT, 0.9)])
         strip.imshow(share[None], aspect="auto", cmap=colours, vmin=0, vmax=1, interpolation="nearest")
         strip.set_axis_off()
-    peak, unit = np.max(np.abs(values), initial=0.0, where=np.isfinite(values)), _effort_unit(run, joint)
+    peak, unit = np.max(np.abs(values), initial=0.0, where=np.isfinite(values)), _effort_unit(run.info, joint)
     note = f"peak {peak:.3g} {unit}, no limit"
     if math.isfinite(limit):
         note = f"peak {peak / limit:.0%} of ±{limit:g} {unit}"
@@ -87,17 +88,8 @@ def draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None
     low, high = axes.get_ylim()
     ends = values[2 * len(values) // 3 :]
     above = np.mean(ends, where=np.isfinite(ends)) < (low + high) / 2 if np.isfinite(ends).any() else False
-    axes.text(
-        0.99,
-        0.86 if above else 0.1,
-        note,
-        transform=axes.transAxes,
-        ha="right",
-        va="top" if above else "bottom",
-        fontsize=6.5,
-        color="#444444",
-        bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6},
-    )
+    height, anchor = (0.86, "top") if above else (0.1, "bottom")
+    axes.text(0.99, height, note, transform=axes.transAxes, ha="right", va=anchor, **_NOTE)
 
 
 def set_position_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
@@ -120,10 +112,11 @@ def set_position_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
 
 def set_effort_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     """Show all efforts, and the limit of the first run unless it is more than five times as far."""
-    limit, efforts = float(runs[0].info.effort_limit[joint]), _joint_values(runs, "effort", joint)
+    info, efforts = runs[0].info, _joint_values(runs, "effort", joint)
+    limit = float(info.effort_limit[joint])
     near = math.isfinite(limit) and np.abs(efforts).max(initial=0.0) > 0.2 * limit
     _set_range(axes, np.append(efforts, [0.0, limit, -limit] if near else [0.0]))
-    axes.set_ylabel(_effort_unit(runs[0], joint), fontsize=SMALL)
+    axes.set_ylabel(_effort_unit(info, joint), fontsize=SMALL)
 
 
 def quantiles(values: NDArray[Any], *at: float) -> NDArray[Any]:
@@ -141,8 +134,8 @@ def _joint_values(runs: Sequence[Rollout], name: str, joint: int) -> NDArray[Any
     return values[np.isfinite(values)]
 
 
-def _effort_unit(run: Rollout, joint: int) -> str:
-    return OBSERVED["effort"].unit_for(run.info.units[joint])
+def _effort_unit(info: RunInfo, joint: int) -> str:
+    return OBSERVED["effort"].unit_for(info.units[joint])
 
 
 def _set_range(axes: Axes, values: NDArray[Any]) -> None:

@@ -6,10 +6,10 @@ Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,6 +26,8 @@ from sim.observation import Rollout
 from sim.plots import drawing
 
 FORMATS = (".png", ".svg")
+Joints: TypeAlias = Sequence[int | str] | None
+"""Joints to draw, by index or name; None or empty for all."""
 _MEDIAN = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")
 _SETPOINT = Line2D([], [], color=drawing.SETPOINT, lw=1.2, ls="--", label="setpoint")
 _BEYOND = Patch(fc="none", ec=drawing.LIMIT, hatch="////", lw=0, label="beyond the limits")
@@ -33,12 +35,7 @@ _SATURATION = Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs i
 
 
 def step_responses(
-    rollout: Rollout,
-    *,
-    joints: Sequence[int | str] | None = None,
-    band: float = 0.02,
-    mark: int | None = None,
-    title: str = "",
+    rollout: Rollout, *, joints: Joints = None, band: float = 0.02, mark: int | None = None, title: str = ""
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
 
@@ -71,9 +68,7 @@ def step_responses(
     return figure
 
 
-def efforts(
-    rollout: Rollout, *, joints: Sequence[int | str] | None = None, mark: int | None = None, title: str = ""
-) -> Figure:
+def efforts(rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = "") -> Figure:
     """Draw, for each joint, efforts against their limit, and the share of envs in saturation.
 
     Parameters as in :func:`step_responses`.
@@ -92,7 +87,7 @@ def comparison(
     second: Rollout,
     *,
     labels: tuple[str, str] = ("first", "second"),
-    joints: Sequence[int | str] | None = None,
+    joints: Joints = None,
     title: str = "",
 ) -> Figure:
     """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above efforts.
@@ -109,9 +104,8 @@ def comparison(
             f"has the joints {', '.join(theirs)}, the first run {', '.join(ours)}",
             remedy="compare runs of the same robot",
         )
-    runs = [_blank_failed(run) for run in (first, second)]
+    runs, info = [_blank_failed(first), _blank_failed(second)], first.info
     colours = (drawing.ENV, drawing.SECOND)
-    info = first.info
     figure, blocks = _figure(runs[0], joints, rows=2, title=title)
     for joint, (above, below) in blocks:
         drawing.draw_limits(above, info.lower[joint], info.upper[joint])
@@ -162,18 +156,16 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     return replace(rollout, setpoint=np.where(position, rollout.setpoint, np.nan), observation=blank)
 
 
-def _joint_indices(run: Rollout, joints: Sequence[int | str] | None) -> list[int]:
+def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
     names = run.info.joint_names
     known: dict[int | str, int] = {key: index for index, name in enumerate(names) for key in (name, index)}
     for joint in joints or ():
         if joint not in known:
             raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}")
-    return list(range(len(names))) if joints is None else [known[joint] for joint in joints]
+    return [known[joint] for joint in joints or names]
 
 
-def _figure(
-    run: Rollout, joints: Sequence[int | str] | None, *, rows: int, title: str
-) -> tuple[Figure, Iterator[tuple[int, list[Axes]]]]:
+def _figure(run: Rollout, joints: Joints, *, rows: int, title: str) -> tuple[Figure, list[tuple[int, list[Axes]]]]:
     """Return a figure with ``rows`` axes for each joint, in a grid; and (joint, axes) pairs."""
     chosen = _joint_indices(run, joints)
     # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty cells.
@@ -188,24 +180,21 @@ def _figure(
         figure.suptitle(title, fontsize=11)
     # One flat grid, so that the axes of a column are aligned.
     grid = figure.add_gridspec(lines * (rows + 1), columns, height_ratios=(*heights, between) * lines)
-
-    def blocks() -> Iterator[tuple[int, list[Axes]]]:
-        for place, joint in enumerate(chosen):
-            line, column = divmod(place, columns)
-            block = [figure.add_subplot(grid[line * (rows + 1) + row, column]) for row in range(rows)]
-            last = place + columns >= len(chosen)
-            for axes in block:
-                axes.tick_params(labelsize=drawing.SMALL, length=2)
-                axes.spines[["top", "right"]].set_visible(False)
-                axes.set_xlim(0, run.time[-1])
-                axes.yaxis.set_major_locator(MaxNLocator(4))
-                axes.tick_params(labelbottom=axes is block[-1] and last)
-            if last:
-                block[-1].set_xlabel("time [s]", fontsize=drawing.SMALL)
-            block[0].set_title(run.info.joint_names[joint], fontsize=8, loc="left", pad=3, fontweight="bold")
-            yield joint, block
-
-    return figure, blocks()
+    blocks = []
+    for place, joint in enumerate(chosen):
+        line, column = divmod(place, columns)
+        block = [figure.add_subplot(grid[line * (rows + 1) + row, column]) for row in range(rows)]
+        last = place + columns >= len(chosen)
+        for axes in block:
+            axes.tick_params(labelsize=drawing.SMALL, length=2, labelbottom=axes is block[-1] and last)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.set_xlim(0, run.time[-1])
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+        if last:
+            block[-1].set_xlabel("time [s]", fontsize=drawing.SMALL)
+        block[0].set_title(run.info.joint_names[joint], fontsize=8, loc="left", pad=3, fontweight="bold")
+        blocks.append((joint, block))
+    return figure, blocks
 
 
 def _fan_entries(run: Rollout, mark: int | None) -> list[Line2D]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -107,7 +107,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
         with _open(path) as (arrays, attributes):
             info = _info(attributes)
-            tick = attributes["tick"] if "tick" in attributes else attributes["timestep"] * attributes["substeps"]
+            tick = attributes.get("tick")  # older files may lack it
+            tick = float(attributes["timestep"] * attributes["substeps"] if tick is None else tick)
             time = arrays["time"][:]
             ticks = slice(0, int(np.isfinite(time).sum()), every)  # times that are not written yet are NaN
             tables = {name: arrays[name][ticks] for name in RECORDED}
@@ -117,7 +118,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
         raise
     except Exception as error:  # a damaged file can make the libraries raise anything
         raise RecordingError(f"{path}: cannot be read as a recording: {error}") from error
-    return Rollout(time[ticks], setpoint, Observation(*seen), float(tick) * every, info)
+    return Rollout(time[ticks], setpoint, Observation(*seen), tick * every, info)
 
 
 def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overwrite: bool) -> Path:
@@ -137,13 +138,7 @@ def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overw
 
 
 def load_h5py() -> Any:
-    """Return the package h5py.
-
-    Raises
-    ------
-    MissingDependencyError
-        It is not installed.
-    """
+    """Return the package h5py; raise MissingDependencyError if it is not installed."""
     try:
         import h5py
     except ImportError:
@@ -178,7 +173,7 @@ def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArr
         dataset.flush()
 
 
-def faults_text(faults: tuple[Fault, ...]) -> str:
+def faults_text(faults: Iterable[Fault]) -> str:
     """Return ``faults`` as the JSON text that a recording holds."""
     return json.dumps([fault._asdict() for fault in faults])
 
@@ -207,25 +202,21 @@ def _open(path: Path) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     except OSError:
         file = h5py.File(path, "r", swmr=True, libver="latest")  # it is being written, or its writer was killed
     with file:
-        if file.attrs.get("format") != FORMAT:
-            raise ValueError(f"its format is {file.attrs.get('format')!r}, not {FORMAT!r}")
         yield file, file.attrs
 
 
 def _info(attributes: Mapping[str, Any]) -> RunInfo:
     """Return what the attributes of a recording say of its run."""
+    if (found := str(attributes.get("format", FORMAT))) != FORMAT:
+        raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
     known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}
     lacking = [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]
     if lacking:
         raise ValueError(f"it does not say its {', '.join(lacking)}")
     names = tuple(map(str, known["joint_names"]))
     decode: dict[str, Callable[[Any], Any]] = {
-        "joint_names": lambda _: names,
-        "units": lambda value: tuple(map(str, value)),
-        "lower": np.asarray,
-        "upper": np.asarray,
-        "effort_limit": np.asarray,
-        "start": np.asarray,
+        **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
+        **dict.fromkeys(("lower", "upper", "effort_limit", "start"), np.asarray),
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
         "versions": lambda text: json.loads(str(text)),

@@ -16,25 +16,16 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ClosedError, InvalidArgumentError
-from batchpid.validate import flag, integer
+from batchpid.validate import flag, instance, integer
 from sim.observation import RECORDED, Observation
-from sim.recording.files import (
-    CHUNK_BYTES,
-    HDF5,
-    RecordingError,
-    append_rows,
-    check_path,
-    create_datasets,
-    faults_text,
-    load_h5py,
-)
+from sim.recording import files
+from sim.recording.files import RecordingError
 
 if TYPE_CHECKING:
     import h5py
@@ -76,25 +67,18 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        runner: Runner,
-        *,
-        seed: int | None = None,
-        overwrite: bool = False,
+        self, path: str | os.PathLike[str], runner: Runner, *, seed: int | None = None, overwrite: bool = False
     ) -> None:
-        if not hasattr(runner, "recorder"):
-            raise InvalidArgumentError(
-                "runner", "must be a Runner", value=type(runner).__name__, remedy="pass the runner to record"
-            )
-        if runner.closed:
+        from sim.runner import Runner  # loads SAPIEN, as the runner has done already
+
+        if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")
         if runner.recorder is not None:
             raise InvalidArgumentError(
                 "runner", f"is being recorded already, to {runner.recorder.path}", remedy="close that Recorder first"
             )
         self._overwrite, self._runner = flag("overwrite", overwrite), runner
-        self.path: Path = check_path(path, HDF5, overwrite=overwrite)
+        self.path: Path = files.check_path(path, files.HDF5, overwrite=overwrite)
         self.partial: Path = _free_name(self.path)
         self._wake = threading.Condition()
         self._rows: list[tuple[Any, ...]] = []  # time, setpoint, observation: not handed to the disk yet
@@ -127,25 +111,22 @@ class Recorder:
         """
         if self._runner.recorder is self:
             self._runner.recorder = None
-        if not self._writer.is_alive() and self._file is None:
-            return
         with self._wake:
             self._closing = True
             self._wake.notify_all()
         self._writer.join()
+        if self._file is None:
+            return
+        file, self._file = self._file, None
         with contextlib.suppress(Exception):  # the writer's error, if any, is the one to raise
-            if self._file is not None:
-                self._file.close()
-        self._file = None
+            file.close()
         self._check()
         self._finish(complete)
 
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close(complete=kind is None)
 
     def _check(self) -> None:
@@ -155,21 +136,21 @@ class Recorder:
             ) from self._error
 
     def _create(self, seed: int | None) -> tuple[h5py.File | None, dict[str, h5py.Dataset]]:
-        h5py, runner = load_h5py(), self._runner
+        h5py, runner = files.load_h5py(), self._runner
         info = replace(runner.info, seed=seed, complete=False)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=CHUNK_BYTES, rdcc_w0=1.0)
-        except OSError as error:
-            raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
-        try:
-            datasets = create_datasets(file, info, runner.num_envs, runner.timestep * runner.substeps)
-            file.flush()
-            file.swmr_mode = True
+            file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=files.CHUNK_BYTES, rdcc_w0=1.0)
+            try:
+                datasets = files.create_datasets(file, info, runner.num_envs, runner.timestep * runner.substeps)
+                file.flush()
+                file.swmr_mode = True
+            except BaseException:
+                _redirect_to_memory(file)
+                file.close()
+                self.partial.unlink()
+                raise
         except (OSError, RuntimeError) as error:
-            _redirect_to_memory(file)
-            file.close()
-            self.partial.unlink()
             raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
         return file, datasets
 
@@ -185,26 +166,23 @@ class Recorder:
             try:
                 if rows:
                     columns = map(np.array, zip(*rows, strict=True))
-                    append_rows(self._datasets, dict(zip(("time", *RECORDED), columns, strict=True)))
+                    files.append_rows(self._datasets, dict(zip(("time", *RECORDED), columns, strict=True)))
             except Exception as error:
                 _redirect_to_memory(self._file)
-                with self._wake:
-                    self._error = error
-                    self._wake.notify_all()
-                return
+                self._error = error
             with self._wake:
                 self._oldest = taken if self._rows else math.inf
                 self._wake.notify_all()
-            if closing:
+            if closing or self._error is not None:
                 return
 
     def _finish(self, complete: bool) -> None:
         try:
-            # Without a lock, because a reader may hold one; there is no other writer.
-            with load_h5py().File(self.partial, "r+", locking=False) as file:
+            # Without a lock, because a reader may hold one.
+            with files.load_h5py().File(self.partial, "r+", locking=False) as file:
                 try:
                     file.attrs["complete"] = complete
-                    file.attrs["faults"] = faults_text(tuple(self._runner.faults))
+                    file.attrs["faults"] = files.faults_text(self._runner.faults)
                     file.flush()
                 except BaseException:
                     _redirect_to_memory(file)
@@ -245,9 +223,6 @@ def _redirect_to_memory(file: h5py.File | None) -> None:
 
 
 def _free_name(path: Path) -> Path:
-    """Return a ``NAME.partial`` in the folder of ``path`` that no file has: that of an earlier run is kept."""
-    partial, number = path.with_name(path.name + ".partial"), 1
-    while partial.exists():
-        number += 1
-        partial = path.with_name(f"{path.name}.partial{number}")
-    return partial
+    """Return the first of ``NAME.partial``, ``NAME.partial2``, ... that does not exist."""
+    names = (path.with_name(f"{path.name}.partial{number}") for number in ("", *range(2, 10**6)))
+    return next(name for name in names if not name.exists())
