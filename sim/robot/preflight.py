@@ -20,8 +20,8 @@ from sim.robot.description import DISSIPATION, Joint, RobotDescription
 from sim.robot.stability import stability_report
 from sim.robot.urdf import mimic_works
 
-SEVERITIES = ("error", "warning", "note")
-"""Does not do what is asked; probably does something else than meant; good to know."""
+SEVERITIES = ("warning", "note")
+"""Probably not what is meant; good to know."""
 
 NEAR_BOUND = 0.5
 """Share of the stability range above which gains are reported: the range is smaller in poses of less inertia."""

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -149,17 +150,15 @@ class Robot(RobotDescription):
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
         choice("gain_units", gain_units, CHOICES["gain_units"])
+        options: dict[str, Any] = {"gain_units": gain_units, "measurement_rate": "measured"}
         if gain_units != "mass_matrix":
-            return bp.design_gains(self, 2.25, gain_units=gain_units, measurement_rate="measured")
-        integral_time = 4.5 / (2 * np.pi * DESIGN_HZ)
-        return bp.design_gains(
-            self, DESIGN_HZ, 0.82, integral_time=integral_time, gain_units=gain_units, measurement_rate="measured"
-        )
+            return bp.design_gains(self, 2.25, **options)
+        return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)
 
     @property
     def has_tuned(self) -> bool:
-        """Whether tuned params ship with the robot: :meth:`tuned`."""
-        return self.settings is not None and self._tuned_path.is_file()
+        """True if tuned params ship with the robot, for :meth:`tuned`."""
+        return self.settings is not None and self.path.with_suffix(".tuned.yaml").is_file()
 
     def tuned(self) -> bp.PIDParams:
         """Return the tuned params of a bundled robot; see docs/choosing-gains.md.
@@ -170,16 +169,9 @@ class Robot(RobotDescription):
             The robot is not bundled.
         """
         if not self.has_tuned:
-            raise InvalidArgumentError(
-                "robot",
-                f"{self.name!r} has no tuned gains",
-                remedy="use robot.designed(), or search for gains with: batchpid tune",
-            )
-        return bp.load_params(self._tuned_path, self.joint_names)[0]
-
-    @property
-    def _tuned_path(self) -> Path:
-        return self.path.with_name(f"{self.path.stem}.tuned.yaml")
+            remedy = "use robot.designed(), or search for gains with: batchpid tune"
+            raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)
+        return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
 
 
 def _find(name_or_path: str | Path) -> Path:

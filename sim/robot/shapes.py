@@ -111,7 +111,7 @@ def _mesh(element: etree._Element, urdf: Path, deviation: float, where: str) -> 
     elif kind in ("cylinder", "capsule", "sphere"):
         (radius,), (length,) = numbers(shape, "radius", "0", where), numbers(shape, "length", "0", where)
         segments = segments_of(radius, deviation)
-        # Of radius 1 and scaled after: trimesh drops triangles that are smaller than 1e-8.
+        # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
         if kind == "cylinder":
             mesh = creation.revolve(_CYLINDER, sections=segments, process=False)
             mesh.vertices *= (radius, radius, length)
@@ -136,4 +136,4 @@ def _colour(element: etree._Element, colours: dict[str | None, Rgba], link: str,
 
 
 def _rgba(color: etree._Element, where: str) -> Rgba:
-    return tuple(numbers(color, "rgba", "0.6 0.6 0.6 1", where).tolist())
+    return numbers(color, "rgba", "0.6 0.6 0.6 1", where)

@@ -107,7 +107,7 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     fields: dict[str, Any] = _origin(element, where)
     axis = element.find("axis")
     if kind != "fixed" and axis is not None:
-        fields["axis"] = tuple(numbers(axis, "xyz", "1 0 0", where).tolist())
+        fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
         if math.hypot(*fields["axis"]) < 1e-3:
             raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
     limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
@@ -194,7 +194,7 @@ def _read_link(element: etree._Element, path: Path) -> Link:
         _origin(part, where)
     for shape in element.iterfind("collision/geometry/*"):
         for key, default in _SIZES.get(shape.tag, {}).items():
-            if numbers(shape, key, default, where).min() <= 0:
+            if min(numbers(shape, key, default, where)) <= 0:
                 raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF")
     return Link(name, value, len(element.findall("collision")), bool(value) and bool(tensor.any()))
 
@@ -202,27 +202,23 @@ def _read_link(element: etree._Element, path: Path) -> Link:
 def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
     """Return the position [m] and the roll, pitch and yaw [rad] of an element's ``<origin>``."""
     origin = element.find("origin")
-    return {
-        field: tuple(numbers(origin, key, "0 0 0", where).tolist())
-        for field, key in (("origin", "xyz"), ("rpy", "rpy"))
-    }
+    return {"origin": numbers(origin, "xyz", "0 0 0", where), "rpy": numbers(origin, "rpy", "0 0 0", where)}
 
 
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
     """Return the joints level by level from the root, siblings in file order, if they form one tree."""
-    for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise RobotError(f"{path}: {kind} name used twice: {', '.join(sorted(twice))}; names must be unique")
-    known = {link.name for link in links}
+    known, children = [link.name for link in links], [joint.child_link for joint in joints]
     for joint in joints:
-        for link in (joint.parent_link, joint.child_link):
-            if link not in known:
-                raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
-    children = [joint.child_link for joint in joints]
-    if twice := {name for name in children if children.count(name) > 1}:
-        raise RobotError(f"{path}: link with two parents: {', '.join(sorted(twice))}; a robot must be a tree")
-    roots = [link.name for link in links if link.name not in set(children)]
+        for link in {joint.parent_link, joint.child_link} - set(known):
+            raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
+    for problem, names, remedy in (
+        ("link name used twice", known, "names must be unique"),
+        ("joint name used twice", [joint.name for joint in joints], "names must be unique"),
+        ("link with two parents", children, "a robot must be a tree"),
+    ):
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise RobotError(f"{path}: {problem}: {', '.join(sorted(twice))}; {remedy}")
+    roots = [name for name in known if name not in set(children)]
     if len(roots) != 1:
         raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
     ordered: list[Joint] = []

@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 from lxml import etree
-from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
 
@@ -45,14 +43,14 @@ def number(element: etree._Element, key: str, default: float, where: str) -> flo
         raise RobotError(f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF") from None
 
 
-def numbers(element: etree._Element | None, key: str, default: str, where: str) -> NDArray[np.float64]:
+def numbers(element: etree._Element | None, key: str, default: str, where: str) -> tuple[float, ...]:
     """Return the finite numbers in an attribute, as many as there are in ``default``, which replaces a missing one."""
     text, count = default if element is None else element.get(key, default), len(default.split())
     try:
-        values = [float(word) for word in text.split()]
+        values = tuple(float(word) for word in text.split())
     except ValueError:
-        values = []
+        values = ()
     if element is not None and (len(values) != count or not all(map(math.isfinite, values))):
         need = "one finite number" if count == 1 else f"{count} finite numbers"
         raise RobotError(f"{where}: <{element.tag} {key}={text!r}> needs {need}; correct the URDF")
-    return np.array(values)
+    return values
