@@ -1,7 +1,7 @@
 """The command line: each command is a frozen dataclass whose fields are its flags.
 
-To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. Heavy imports belong inside
-``run``, so that ``--help`` answers at once.
+To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. Its ``run()`` returns the exit
+status (None: 0) and imports what loads SAPIEN, Matplotlib or JAX, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import tyro
 
@@ -27,15 +27,7 @@ from sim.cli.rollout import RolloutCommand
 from sim.cli.tune import TuneCommand
 from sim.cli.view import ViewCommand
 
-
-class Command(Protocol):
-    """A command line, parsed."""
-
-    def run(self) -> int | None:
-        """Run the command and return its exit status (None: 0)."""
-
-
-COMMANDS: dict[str, type[Command]] = {
+COMMANDS: dict[str, type[Any]] = {
     "demo": DemoCommand,
     "rollout": RolloutCommand,
     "bench": BenchCommand,
@@ -76,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status or 0
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str]) -> Any:
     """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
     app = tyro.extras.SubcommandApp()
     named = bool(arguments) and arguments[0] in COMMANDS
@@ -90,8 +82,7 @@ def parse(arguments: Sequence[str]) -> Command:
         tyro.conf.PositionalMetavarFromFieldName,
     )
     about = "Joint-level PID control for many robots at once, in SAPIEN."
-    parsed: Command = app.cli(prog="batchpid", description=about, args=arguments, config=options)
-    return parsed
+    return app.cli(prog="batchpid", description=about, args=arguments, config=options)
 
 
 def _version() -> str:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import os
+import platform
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from batchpid.files import write_atomically
+from batchpid.validate import integer
+from batchpid.versions import package_versions
+from sim import Robot
 from sim.cli import flags
-
-if TYPE_CHECKING:
-    from sim.benchmark.benchmark import Result
-    from sim.benchmark.workload import Workload
 
 
 @dataclass(frozen=True)
@@ -39,17 +45,11 @@ class BenchCommand:
 
     def run(self) -> None:
         """Run the command."""
-        import json
-        import os
-
-        from batchpid.files import write_atomically
-        from batchpid.validate import integer
-        from sim import Robot
         from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
         from sim.benchmark.peers import PEERS, installed_peers
         from sim.benchmark.workload import Workload
-        from sim.cli import report
-        from sim.cli.progress import bar
+        from sim.cli.report import table
+        from sim.cli.run import bar
 
         out = flags.output_path("out", self.out, (".json",))
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
@@ -67,67 +67,49 @@ class BenchCommand:
         advance = iter(bar("bench")(range(workload.rounds * len(descriptions))))
         results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers)
         next(advance, None)  # close the bar
-        spent = measure_phases(workload)
+        phases = measure_phases(workload)
 
         print(
             f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, "
             f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds\n"
         )
+        ours = results["closed loop"].rates
+        ratios = {case: float(np.median(np.divide(ours, result.rates))) for case, result in results.items()}
         rows = [
-            [case, f"{result.rate / 1e3:,.1f}", f"{ratio(results, case):.2f}", descriptions[case]]
+            [case, f"{result.rate / 1e3:,.1f}", f"{ratios[case]:.2f}", descriptions[case]]
             for case, result in results.items()
         ]
-        print(report.table(rows, ["case", "thousand env-steps/s", "closed loop / case", "description"], "lrrl"))
+        print(table(rows, ["case", "thousand env-steps/s", "closed loop / case", "description"], "lrrl"))
         print("\nclosed loop, microseconds per env step in a worker:")
-        print(report.table([[f"{value:.2f}" for value in spent.values()]], list(spent), "r" * len(spent)))
+        print(table([[f"{value:.2f}" for value in phases.values()]], list(phases), "r" * len(phases)))
         absent = sorted({peer.package for name, peer in PEERS.items() if self.peers and name not in peers})
         if absent:
             print(f"\nnot installed: {', '.join(absent)} (pip install 'batchpid[peers]')")
         if out is not None:
-            write_atomically(out, json.dumps(figures(workload, results, spent), indent=2) + "\n")
-            print(f"\nwritten: {out}")
-
-
-def ratio(results: dict[str, Result], case: str) -> float:
-    """Return the rate of the closed loop over that of ``case``: the median of the rounds' ratios."""
-    import numpy as np
-
-    return float(np.median(np.divide(results["closed loop"].rates, results[case].rates)))
-
-
-def figures(workload: Workload, results: dict[str, Result], spent: dict[str, float]) -> dict[str, Any]:
-    """Return all that was measured, and on which machine, for JSON."""
-    return {
-        "setup": vars(workload) | {"robot": workload.robot.name},
-        "machine": machine(),
-        "cases": {
-            case: {
-                "env_steps_per_second": result.rates,
-                "median": result.rate,
-                "closed_loop_over_case": ratio(results, case),
-                "final_qpos": result.final.tolist(),
+            cases = {
+                case: {
+                    "env_steps_per_second": result.rates,
+                    "median": result.rate,
+                    "closed_loop_over_case": ratios[case],
+                    "final_qpos": result.final.tolist(),
+                }
+                for case, result in results.items()
             }
-            for case, result in results.items()
-        },
-        "microseconds_per_env_step": spent,
-    }
+            figures = {
+                "setup": vars(workload) | {"robot": workload.robot.name},
+                "machine": machine(),
+                "cases": cases,
+                "microseconds_per_env_step": phases,
+            }
+            write_atomically(out, json.dumps(figures, indent=2) + "\n")
+            print(f"\nwritten: {out}")
 
 
 def machine() -> dict[str, Any]:
     """Return the hardware and the versions that figures depend on."""
-    import os
-    import platform
-    import re
-    from contextlib import suppress
-
-    from batchpid.versions import package_versions
-
-    processor = platform.processor() or platform.machine()
-    with suppress(OSError):
-        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-        processor = found[1] if found else processor
+    model = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     return {
-        "processor": processor,
+        "processor": model[1] if model else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "system": platform.platform(),
         **package_versions(),

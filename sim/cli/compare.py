@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from batchpid.errors import InvalidArgumentError
+from sim import Robot
 from sim.cli import flags
-
-if TYPE_CHECKING:
-    from sim import Robot
-    from sim.tuning.evaluation import Evaluation
-    from sim.tuning.gain_sets import GainSet
+from sim.tuning.gain_sets import gain_set
 
 
 @dataclass(frozen=True)
@@ -37,13 +32,11 @@ class CompareCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.errors import InvalidArgumentError
-        from sim import Robot
-        from sim.cli.report import evaluation_table
-        from sim.plots.figures import FORMATS
-        from sim.tuning.gain_sets import gain_set
+        from sim import plots
+        from sim.cli.report import draw_first_move, evaluation_table
+        from sim.cli.run import evaluate_sets
 
-        picture = flags.output_path("picture", self.picture, FORMATS)
+        picture = flags.output_path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]
@@ -63,39 +56,3 @@ class CompareCommand:
         print(evaluation_table(robot, evaluations))
         if picture is not None:
             print(f"\npicture: {draw_first_move(robot, evaluations, picture)}")
-
-
-def evaluate_sets(
-    robot: Robot, sets: Sequence[GainSet], *, moves: int, seed: int, variation: dict[str, Any] | None, **options: Any
-) -> list[Evaluation]:
-    """Evaluate ``sets`` on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
-
-    ``variation`` has options of :func:`sim.tuning.randomization.draw_variation`; ``options`` go to
-    :func:`sim.tuning.evaluation.evaluate_gains`.
-    """
-    from sim.cli.progress import bar
-    from sim.tuning.evaluation import evaluate_gains
-    from sim.tuning.moves import random_moves, tutorial_move
-    from sim.tuning.randomization import draw_variation
-
-    seed += 1
-    unseen = tutorial_move(robot) + random_moves(robot, moves, seed)
-    drawn = None if variation is None else draw_variation(robot, len(unseen.start), seed, **variation)
-    return [
-        evaluate_gains(robot, each.params, unseen, name=each.name, control=each.control, variation=drawn, **options)
-        for each in bar("comparing", unit="set")(sets)
-    ]
-
-
-def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Draw the first two ``evaluations`` on their first move to ``path``, and return it."""
-    from sim import plots
-
-    first, second = evaluations[:2]
-    figure = plots.comparison(
-        first.rollout.for_envs(slice(0, 1)),
-        second.rollout.for_envs(slice(0, 1)),
-        labels=(first.name, second.name),
-        title=f"{robot.name}, {first.moves.names[0]} move",
-    )
-    return plots.save(figure, path)

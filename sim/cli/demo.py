@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import number
+from sim import Robot
 from sim.cli import flags
+from sim.tuning.gain_sets import gain_set
 
 SUBSTEPS = 10
 """Sim steps between two samples of the picture."""
@@ -36,15 +40,11 @@ class DemoCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.errors import InvalidArgumentError
-        from batchpid.validate import number
-        from sim import Robot, Runner, plots
-        from sim.cli import report
+        from sim import Runner, plots
+        from sim.cli.report import run_report
         from sim.cli.run import hold_setpoint, start_poses
-        from sim.plots.figures import FORMATS
-        from sim.tuning.gain_sets import gain_set
 
-        picture = flags.output_path("picture", self.picture, FORMATS)
+        picture = flags.output_path("picture", self.picture, plots.FORMATS)
         if self.viewer:
             from sim.view.film import check_renderer, show_window
 
@@ -76,7 +76,7 @@ class DemoCommand:
             )
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes", flush=True)
             rollout, wall = hold_setpoint(runner, start, settings.target, seconds)
-        print(report.run_report(runner, rollout, start, wall))
+        print(run_report(runner, rollout, start, wall))
         for note in settings.notes:
             print(f"Note: {note}")
         figure = plots.step_responses(rollout, mark=0, title=f"{title}; env 0 from the tutorial's pose")

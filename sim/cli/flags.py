@@ -24,21 +24,15 @@ def _flag(help: str | None = None, **options: Any) -> Any:
     return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
 
 
-OptionalStr = Annotated[str | None, _flag()]
-OptionalFloat = Annotated[float | None, _flag()]
 OptionalPath = Annotated[Path | None, _flag()]
 OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
-Names = Annotated[tuple[str, ...], _flag(metavar="NAME [NAME ...]")]
 Switch = Annotated[bool, _flag()]
 
 RobotName = Annotated[str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF.")]
 RecordedRobot = Annotated[
-    str | None, tyro.conf.Positional, _flag("Bundled robot, or path of a URDF. Default: the recorded robot.")
-]
-ViewedRobot = Annotated[
     str | None,
     tyro.conf.Positional,
-    _flag("Bundled robot (panda or jaco2), or path of a URDF. Default: panda, or the recorded robot."),
+    _flag("Bundled robot, or path of a URDF. Default: that of the recording, or panda."),
 ]
 MissingMeshes = Annotated[
     Literal["error", "skip"], _flag("Raise an error for collision meshes that are missing, or skip their shapes.")

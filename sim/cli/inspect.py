@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from sim import Robot
 from sim.cli import flags
-
-if TYPE_CHECKING:
-    from sim import Robot
 
 HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
 
@@ -27,8 +24,6 @@ class InspectCommand:
 
     def run(self) -> int:
         """Run the command and return its exit status."""
-        from sim import Robot
-
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
         print(joint_table(robot, fixed_too=self.all) + "\n")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import integer
+from sim import Rollout, read_recording
 from sim.cli import flags
-
-if TYPE_CHECKING:
-    from sim import Rollout
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PlotCommand:
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
     """Step responses, or efforts against their limits, of one recording."""
-    joints: flags.Names = ()
+    joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")] = ()
     """Names of joints to draw. Default: all."""
     every: int = 1
     """Draw only every n-th tick, for long recordings."""
@@ -36,12 +36,10 @@ class PlotCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.validate import integer
         from sim import plots
-        from sim.plots.figures import FORMATS
 
         every = integer("every", self.every, 1, 10**9)
-        picture = flags.output_path("picture", self.picture, FORMATS)
+        picture = flags.output_path("picture", self.picture, plots.FORMATS)
         rollout = _read(self.recording, every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)
@@ -55,9 +53,6 @@ class PlotCommand:
 
 def _read(path: Path, every: int) -> Rollout:
     """Return the run in a file, unless it is empty, and print a line about it."""
-    from batchpid.errors import InvalidArgumentError
-    from sim import read_recording
-
     rollout = read_recording(path, every=every)
     print(f"{path}{'' if rollout.info.complete else ' (cut short)'}: {rollout.info.robot}, {rollout!r}")
     if not len(rollout.time):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from batchpid.validate import integer
 from sim.cli import flags
 
 
@@ -33,15 +34,12 @@ class RenderCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.validate import integer
-        from sim import Robot, read_recording
-        from sim.cli.progress import bar
+        from sim.cli.run import bar, read_run
         from sim.view.film import FORMATS, write_film
         from sim.view.layout import MAX_ROBOTS
 
         out = flags.output_path("out", self.out, FORMATS)
-        rollout = read_recording(self.recording)
-        robot = Robot.load(self.robot or rollout.info.robot, missing_meshes=self.missing_meshes)
+        rollout, robot = read_run(self.recording, self.robot, self.missing_meshes)
         rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")
         path = write_film(

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tabulate import tabulate
 
 from batchpid.metrics import StepMetrics
-
-if TYPE_CHECKING:
-    from sim import Robot, Rollout, Runner
-    from sim.tuning.evaluation import Evaluation
+from sim import Robot, Rollout, Runner
+from sim.tuning.evaluation import Evaluation, arm_joints, step_response_metrics
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
     """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or "r"."""
-    from tabulate import tabulate
-
     sides = tuple("left" if side == "l" else "right" for side in align)
     return tabulate(rows, headers, disable_numparse=True, colalign=sides)
 
 
 def run_report(runner: Runner, rollout: Rollout, start: NDArray[np.float64], wall: float) -> str:
     """Return the report of a ``rollout`` of ``runner`` from ``start`` (envs, dof) that took ``wall`` seconds."""
-    from sim.tuning.evaluation import step_response_metrics
-
     robot = runner.robot
     metrics = step_response_metrics(robot, rollout, start)
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
@@ -107,8 +103,6 @@ def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
 
 def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
     """Return a table with one row per evaluation: median and worst over the arm's joints and all moves."""
-    from sim.tuning.evaluation import arm_joints
-
     arm = arm_joints(robot)
     rows = []
     for evaluation in evaluations:
@@ -133,6 +127,16 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
         "\nand within a second or 1.2 times the shortest that the effort limits allow. chatter: variation of the effort"
         "\nover that of the smooth move."
     )
+
+
+def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path) -> Path:
+    """Draw the first two ``evaluations`` on their first move to ``path``, and return it."""
+    from sim import plots
+
+    first, second = evaluations[:2]
+    runs = [evaluation.rollout.for_envs(slice(0, 1)) for evaluation in (first, second)]
+    title = f"{robot.name}, {first.moves.names[0]} move"
+    return plots.save(plots.comparison(*runs, labels=(first.name, second.name), title=title), path)
 
 
 def _median_and_worst(figure: NDArray[Any], style: str, unit: str = "") -> str:

@@ -6,7 +6,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from batchpid.validate import array, number
+from sim import Recorder, Robot, write_recording
 from sim.cli import flags
+from sim.tuning.gain_sets import gain_set
 
 FORMATS = (".npz", ".h5", ".hdf5")
 
@@ -48,15 +51,12 @@ class RolloutCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.validate import array, number
-        from sim import Recorder, Robot, Runner, plots, write_recording
-        from sim.cli import report
+        from sim import Runner, plots
+        from sim.cli.report import run_report
         from sim.cli.run import hold_setpoint, start_poses
-        from sim.plots.figures import FORMATS as PICTURES
-        from sim.tuning.gain_sets import gain_set
 
         out = flags.output_path("out", self.out, FORMATS)
-        picture = flags.output_path("picture", self.picture, PICTURES)
+        picture = flags.output_path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, dissipation=self.dissipation)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
@@ -79,7 +79,7 @@ class RolloutCommand:
             streamed = out is not None and out.suffix != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():
                 rollout, wall = hold_setpoint(runner, start, setpoint, seconds)
-        print(report.run_report(runner, rollout, start, wall))
+        print(run_report(runner, rollout, start, wall))
         if out:
             if not streamed:
                 write_recording(rollout, out, seed=self.seed, overwrite=True)

@@ -1,17 +1,32 @@
-"""Runs of ``demo`` and ``rollout``: every env moves from a seeded pose to one setpoint."""
+"""Runs of the commands: to a setpoint, over the moves that gains are compared on, or read from a recording."""
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
+from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer, number
-from sim import Robot, Rollout, Runner, SetpointWarning
-from sim.cli.progress import bar
+from sim import Robot, Rollout, Runner, SetpointWarning, read_recording
+from sim.tuning.evaluation import Evaluation, evaluate_gains
+from sim.tuning.gain_sets import GainSet
+from sim.tuning.moves import random_moves, tutorial_move
+from sim.tuning.randomization import draw_variation
+
+
+def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
+    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options`` go to tqdm."""
+    # A log file keeps every state of the bar, so it gets few.
+    options |= {"delay": 1.0, "mininterval": 0.1 if sys.stderr.isatty() else 5.0, "leave": False, "dynamic_ncols": True}
+    return lambda items: tqdm(items, desc=label, **options)
 
 
 def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArray[np.float64]:
@@ -42,3 +57,35 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
         began = time.perf_counter()
         rollout = runner.rollout(setpoints, progress=bar("simulating", unit="tick"))
         return rollout, time.perf_counter() - began
+
+
+def evaluate_sets(
+    robot: Robot, sets: Sequence[GainSet], *, moves: int, seed: int, variation: dict[str, Any] | None, **options: Any
+) -> list[Evaluation]:
+    """Evaluate ``sets`` on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
+
+    ``variation`` has options of :func:`sim.tuning.randomization.draw_variation`; ``options`` go to
+    :func:`sim.tuning.evaluation.evaluate_gains`.
+    """
+    unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
+    drawn = None if variation is None else draw_variation(robot, len(unseen.start), seed + 1, **variation)
+    return [
+        evaluate_gains(robot, each.params, unseen, name=each.name, control=each.control, variation=drawn, **options)
+        for each in bar("comparing", unit="set")(sets)
+    ]
+
+
+def read_run(path: Path, robot: str | None, missing_meshes: str) -> tuple[Rollout, Robot]:
+    """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The file cannot be read, or no robot is named and the recorded one is not bundled.
+    """
+    rollout = read_recording(path)
+    if robot is None and rollout.info.robot not in Robot.bundled():
+        raise InvalidArgumentError(
+            "robot", f"{rollout.info.robot!r} of the recording is not bundled", remedy="give the path of its URDF"
+        )
+    return rollout, Robot.load(robot or rollout.info.robot, missing_meshes=missing_meshes)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+import tyro
+
+from batchpid import save_params
+from sim import Robot
 from sim.cli import flags
+from sim.tuning.gain_sets import GainSet
+from sim.tuning.weights import Weights
 
 
 @dataclass(frozen=True)
@@ -29,18 +35,7 @@ class TuneCommand:
     """Gains per mass matrix (all joints respond alike), per joint inertia, or as efforts (for any controller)."""
     per_joint: flags.Switch = False
     """Search for a factor of each joint too; needs more generations."""
-    itae: float = 1.0
-    """Weight of the time-weighted error."""
-    settling: float = 1.0
-    """Weight of the settling time."""
-    overshoot: float = 1.0
-    """Weight of the overshoot."""
-    final: float = 2.0
-    """Weight of the final error."""
-    chatter: float = 0.3
-    """Weight of the effort's variation beyond that of the smooth move."""
-    saturation: float = 3.0
-    """Weight of the time in saturation."""
+    weights: Annotated[Weights, tyro.conf.arg(name="")] = field(default_factory=Weights)
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
@@ -57,20 +52,16 @@ class TuneCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid import save_params
-        from sim import Robot
-        from sim.cli.compare import draw_first_move, evaluate_sets
-        from sim.cli.progress import bar
-        from sim.cli.report import evaluation_table
-        from sim.plots.figures import FORMATS
+        from sim import plots
+        from sim.cli.report import draw_first_move, evaluation_table
+        from sim.cli.run import bar, evaluate_sets
         from sim.tuning.evaluation import arm_joints
-        from sim.tuning.gain_sets import GainSet
-        from sim.tuning.search import Weights, tune
+        from sim.tuning.search import tune
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = self.out or Path(f"out/{robot.path.stem}.tuned.yaml")
         out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
-        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), FORMATS)
+        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)
         history = out.with_suffix(".search.json")
         if not self.resume:
             history.unlink(missing_ok=True)
@@ -83,7 +74,7 @@ class TuneCommand:
             seconds=self.search_seconds,
             gain_units=self.gain_units,
             per_joint=self.per_joint,
-            weights=Weights(self.itae, self.settling, self.overshoot, self.final, self.chatter, self.saturation),
+            weights=self.weights,
             variation=variation,
             workers=self.workers,
             time_limit=self.time_limit,

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import integer, number
+from sim import Robot
 from sim.cli import flags
+from sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
     from sim.view import LiveSimulation, Playback
@@ -23,7 +28,7 @@ class ViewCommand:
     ``--play`` it shows a recorded run.
     """
 
-    robot: flags.ViewedRobot = None
+    robot: flags.RecordedRobot = None
     num_envs: int = 16
     """Number of robots in each group; 64 in all at most."""
     control: tuple[Literal["pid", "drive"], ...] = ("pid",)
@@ -44,9 +49,6 @@ class ViewCommand:
 
     def run(self) -> None:
         """Run the command."""
-        import sys
-
-        from batchpid.validate import integer, number
         from sim.view import View
 
         port = integer("port", self.port, 1, 65535)
@@ -63,17 +65,12 @@ class ViewCommand:
 
     def _live(self) -> LiveSimulation:
         """Return the running robots."""
-        from batchpid.errors import InvalidArgumentError
-        from sim import Robot
-        from sim.tuning.gain_sets import gain_set
         from sim.view import LiveSimulation
 
         robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes)
-        gains = gain_set(robot, self.gains)
-        if gains.control != "pid":
-            raise InvalidArgumentError(
-                "gains", "are the PID's", value=self.gains, remedy="use --control drive for a drive"
-            )
+        gains = None if self.gains is None else gain_set(robot, self.gains)
+        if gains and gains.control != "pid":
+            raise InvalidArgumentError("gains", "are those of the PID", value=self.gains, remedy="use --control drive")
         live = LiveSimulation(
             robot,
             self.num_envs,
@@ -82,7 +79,7 @@ class ViewCommand:
             compensate=self.compensate,
             physics=self.physics,
             workers=self.workers,
-            params=gains.params,
+            params=gains and gains.params,
         )
         if robot.settings is not None:
             live.set_setpoints(robot.settings.target)
@@ -90,23 +87,11 @@ class ViewCommand:
 
     def _recorded(self, path: Path) -> Playback:
         """Return the run in the file; of many envs those that fit on the page."""
-        from batchpid.errors import InvalidArgumentError, RobotNotFoundError
-        from sim import Robot, read_recording
+        from sim.cli.run import read_run
         from sim.view import Playback
         from sim.view.layout import MAX_ROBOTS
 
-        rollout = read_recording(path)
-        try:
-            robot = Robot.load(self.robot or rollout.info.robot, missing_meshes=self.missing_meshes)
-        except RobotNotFoundError as error:
-            if self.robot is not None:
-                raise
-            raise InvalidArgumentError(
-                "play",
-                f"is a run of {rollout.info.robot!r}, which is not bundled",
-                value=str(path),
-                remedy=f"pass its URDF too: batchpid view path/to/{rollout.info.robot}.urdf --play {path}",
-            ) from error
+        rollout, robot = read_run(path, self.robot, self.missing_meshes)
         if rollout.num_envs > MAX_ROBOTS:
             print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
         return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=1 / self.fps)

@@ -23,7 +23,6 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +41,7 @@ from sim.runner import Runner
 from sim.tuning.evaluation import SUBSTEPS, absolute_band, step_response_metrics
 from sim.tuning.moves import Moves, search_moves, smooth_variation
 from sim.tuning.randomization import draw_variation
+from sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
 FACTORS = {
@@ -64,24 +64,6 @@ PENALTY_RATIO = 0.8
 """Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
 DIVERGED_COST = 1e3
 """Cost of a candidate that diverges; up to twice that, the sooner it does."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the terms of the cost."""
-
-    itae: float = 1.0
-    """Of the normalised ITAE."""
-    settling: float = 1.0
-    """Of the settling time in seconds."""
-    overshoot: float = 1.0
-    """Of the overshoot, as log(1 + overshoot / 5 %): one move beyond reach must not outweigh all others."""
-    final: float = 2.0
-    """Of the error left at the end, as log(1 + error / settling band's least width)."""
-    chatter: float = 0.3
-    """Of the effort's variation beyond that of the smooth motion."""
-    saturation: float = 3.0
-    """Of the share of time in saturation."""
 
 
 class Tuning(NamedTuple):

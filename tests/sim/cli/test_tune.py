@@ -7,8 +7,8 @@ import pytest
 
 import batchpid as bp
 from sim import Robot
-from sim.cli.tune import TuneCommand
-from sim.tuning.search import Weights
+from sim.cli import parse
+from sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
@@ -39,7 +39,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("sim.tuning.evaluation.evaluate_gains", interrupt)  # after the search, before the judging
+        patched.setattr("sim.cli.run.evaluate_gains", interrupt)  # after the search
         status, _, complaint = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 130
     assert "interrupted" in complaint
@@ -67,11 +67,11 @@ def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     assert picture.stat().st_size > 10_000
 
 
-def test_the_weights_of_the_flags_are_those_of_the_search():
-    flags, weights = TuneCommand(), Weights()
-    assert {field.name: getattr(flags, field.name) for field in dataclasses.fields(weights)} == (
-        dataclasses.asdict(weights)
-    )
+def test_each_weight_of_the_search_has_a_flag():
+    names = [field.name for field in dataclasses.fields(Weights)]
+    flags = [word for index, name in enumerate(names) for word in (f"--{name}", str(index))]
+    assert parse(["tune", *flags]).weights == Weights(*range(len(names)))
+    assert parse(["tune"]).weights == Weights()
 
 
 @pytest.mark.parametrize(

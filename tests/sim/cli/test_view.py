@@ -65,7 +65,7 @@ def test_bad_flags_are_named(flags, message, batchpid):
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
     run = write(tmp_path / "run.npz", robot="arm")
-    assert "batchpid view path/to/arm.urdf --play" in batchpid("view", *SHORT, "--play", run)[2]
+    assert "robot: 'arm' of the recording is not bundled; give the path" in batchpid("view", "--play", run)[2]
     path = tmp_path / "arm.urdf"
     path.write_text(Robot.load("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

@@ -1,0 +1,23 @@
+"""Weights of the terms of a search's cost; :mod:`sim.tuning.search` defines the cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the terms of the cost; the command line has a flag for each."""
+
+    itae: float = 1.0
+    """Weight of the normalised ITAE, the time-weighted absolute error."""
+    settling: float = 1.0
+    """Weight of the settling time [1/s]."""
+    overshoot: float = 1.0
+    """Weight of log(1 + overshoot / 5 %): one move out of reach must not outweigh all others."""
+    final: float = 2.0
+    """Weight of log(1 + final error / least half width of the settling band)."""
+    chatter: float = 0.3
+    """Weight of the effort's variation beyond that of the smooth move."""
+    saturation: float = 3.0
+    """Weight of the share of time in saturation."""
