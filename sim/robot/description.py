@@ -256,26 +256,14 @@ class RobotDescription(Urdf):
         if self.settings is not None:
             known |= {gain: getattr(self.settings, gain) for gain in ("kp", "ki", "kd")}
         elif "kp" not in options:
-            raise InvalidArgumentError(
-                "kp",
-                f"robot {self.name!r} has no gains",
-                remedy="pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()",
-            )
+            remedy = "pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()"
+            raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
         return bp.make_params(joints=self.dof, **(known | options))
 
     def run_info(self, **options: Any) -> RunInfo:
         """Return the info of a run of this robot; ``options`` are further fields of :class:`sim.RunInfo`."""
-        return RunInfo(
-            robot=self.name,
-            joint_names=self.joint_names,
-            units=self.units,
-            lower=self.lower,
-            upper=self.upper,
-            effort_limit=self.effort_limit,
-            urdf=self.urdf,
-            dissipation=self.dissipation,
-            **options,
-        )
+        shared = ("joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation")
+        return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""

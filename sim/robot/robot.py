@@ -69,12 +69,10 @@ class Robot(RobotDescription):
         choice("dissipation", dissipation, DISSIPATION)
         fixed_base = flag("fixed_base", fixed_base)
         if not isinstance(package_dirs, list | tuple):
-            raise InvalidArgumentError(
-                "package_dirs", "must be a list of folders", value=package_dirs, remedy="pass a list of paths"
-            )
-        folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
+            problem = "must be a list of folders"
+            raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
         path = _find(name_or_path)
-        urdf = read_urdf(path, folders, missing_meshes)
+        urdf = read_urdf(path, tuple(file_path("package_dirs", each) for each in package_dirs), missing_meshes)
         joints = tuple(joint for joint in urdf.all_joints if joint.moves)
         if not joints:
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")

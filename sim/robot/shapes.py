@@ -43,7 +43,7 @@ class Surface(NamedTuple):
 
 
 def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour, their chords within ``deviation`` [m] of the arc.
+    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] is that of :func:`segments_of`.
 
     Vertices are not shared across sharp edges, so that averaged normals shade correctly.
 
@@ -83,7 +83,7 @@ def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surf
 
 
 def segments_of(radius: float, deviation: float) -> int:
-    """Return how many chords a circle [m] needs for none to be farther than ``deviation`` [m] from its arc.
+    """Return how many chords, within FEWEST and MOST, keep a circle within ``deviation`` [m] of its arc.
 
     A chord over the angle 2a is r (1 - cos a) away from the arc.
     """
