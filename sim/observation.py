@@ -69,10 +69,13 @@ def empty_observation(*shape: int) -> Observation:
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """Robot, options and origin of a run; ``robot.run_info()`` gives that of a robot. None where it is not known."""
+    """Robot, options and origin of a run; what is not known is None.
+
+    :meth:`sim.Runner.rollout` and :func:`sim.read_recording` fill it; ``robot.run_info()`` makes one by hand.
+    """
 
     robot: str
-    """Name."""
+    """Name of the robot."""
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
     """Unit of each joint's position: "rad" or "m"."""
@@ -81,31 +84,35 @@ class RunInfo:
     upper: Float64
     """Upper position limits (joints,) [rad or m]."""
     effort_limit: Float64
-    """(joints,) [N m or N]."""
+    """Effort limits (joints,) [N m or N]."""
     urdf: str | None = None
     """Text of the robot description."""
     dissipation: str | None = None
+    """Source of joint friction and damping: "urdf" or "sapien"."""
     timestep: float | None = None
-    """Of simulation and control [s]."""
+    """Time step of simulation and control [s]."""
     substeps: int | None = None
     """Sim steps of a tick."""
     control: str | None = None
+    """One of "pid", "drive", "effort"."""
     compensate: str | None = None
+    """Passive force, one of "gravity+coriolis", "gravity", "none"."""
     physics: str | None = None
-    """Name of a preset, or the solver settings in words."""
+    """Solver settings: "accurate", "fast", or the text of a :class:`sim.Physics`."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     start: NDArray[Any] | None = None
     """Positions before the first tick (envs, joints) [rad or m]."""
     seed: int | None = None
+    """Seed of the run."""
     versions: Mapping[str, str] | None = None
-    """Of the packages that results depend on, by name."""
+    """Versions of the packages that results depend on, by name."""
     begun: str | None = None
     """Local date and time of the start, ISO 8601."""
     complete: bool = True
     """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
-    """Each :class:`sim.Fault` of the runner up to the end of the run."""
+    """Faults (:class:`sim.Fault`) of the runner up to the end of the run."""
 
     def quantity(self, name: str) -> Quantity:
         """Return the quantity ``name`` of :data:`RECORDED`; under control "effort" the setpoint is an effort."""

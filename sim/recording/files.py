@@ -154,10 +154,9 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
     datasets["time"].attrs["unit"] = ["s"]
     for name, quantity in RECORDED.items():
         row = (num_envs, len(info.joint_names)) if quantity.per_joint else (num_envs,)
-        rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * np.dtype(quantity.dtype).itemsize))
-        datasets[name] = file.create_dataset(
-            name, (0, *row), quantity.dtype, maxshape=(None, *row), chunks=(rows, *row)
-        )
+        dtype = np.dtype(quantity.dtype)
+        rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * dtype.itemsize))
+        datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
         if quantity.per_joint:
             datasets[name].attrs["unit"] = [info.quantity(name).unit_for(unit) for unit in info.units]
     return datasets
@@ -210,8 +209,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     if (found := str(attributes.get("format", FORMAT))) != FORMAT:
         raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
     known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}
-    lacking = [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]
-    if lacking:
+    if lacking := [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]:
         raise ValueError(f"it does not say its {', '.join(lacking)}")
     names = tuple(map(str, known["joint_names"]))
     decode: dict[str, Callable[[Any], Any]] = {

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim.observation import RunInfo
+from sim.observation import OBSERVED, RunInfo
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -74,7 +74,7 @@ class Joint:
     @property
     def effort_unit(self) -> str:
         """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
-        return "N" if self.type == "prismatic" else "N m"
+        return OBSERVED["effort"].unit_for(self.unit)
 
 
 @dataclass(frozen=True)

@@ -72,12 +72,6 @@ def test_rollouts_made_by_hand_and_empty_ones_can_be_written(suffix, tmp_path, r
     assert_same_info(read.info, bare.info)
 
 
-def test_info_of_some_envs(rollout):
-    part = rollout.for_envs([2, 0]).info
-    np.testing.assert_array_equal(part.start, rollout.info.start[[2, 0]])
-    np.testing.assert_array_equal(part.params.kp[:, 0], [50.0, 30.0])
-
-
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_existing_files_are_replaced_only_when_asked(suffix, tmp_path, rollout):
     skip_without_h5py(suffix)
@@ -123,12 +117,15 @@ def test_h5_files_of_earlier_versions_are_read(tmp_path, rollout, panda):
         for name in ("tick", "start", "physics"):
             del file.attrs[name]
         file.attrs["seed"] = "none"
+        fault = {"env": 1, "step": 10, "time": 0.005, "joint": "panda_joint4", "cause": "setpoint", "action": "hold"}
+        file.attrs["faults"] = json.dumps([fault])
         file.attrs["complete"] = False
         del file["saturated"].attrs["unit"]
     read = read_recording(path)
     assert_identical(read, rollout)
     assert read.tick == rollout.tick
     assert (read.info.seed, read.info.physics, read.info.complete) == (None, None, False)
+    assert [fault.joint for fault in read.info.faults] == ["panda_joint4"]
 
 
 @pytest.mark.parametrize("path", ["run.csv", "run", 3, None, "a\0b.npz"])
