@@ -1,7 +1,7 @@
 """Draw the figures of docs/performance.md, and write its tables: ``python bench/draw.py [FOLDER]``.
 
-FOLDER holds what ``make figures`` measured; its figures go into docs/performance.json first. Without it everything is
-drawn from that file as it is.
+FOLDER holds the measurements of ``make figures``; they go into docs/performance.json first. Without it everything is
+drawn from that file.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SCALING = {
     "substeps (64 envs, 2 workers)": ("substeps", "sim steps in a tick (64 envs, 2 workers)"),
 }
 RESOURCES = {
-    # name in extra_info: (what it is, format)
+    # name in extra_info: (meaning, format)
     "MB_per_env": ("memory of one env more (64 to 1024 envs)", "{:.2f} MB"),
     "build_ms_per_env": ("building one env more (64 to 1024 envs, two workers)", "{:.2f} ms"),
     "start_seconds": ("from `Runner(...)` to the first step, 64 envs", "{:.2f} s"),
@@ -55,11 +55,11 @@ class Options:
     """Draw the figures of docs/performance.md, and write its tables."""
 
     folder: tyro.conf.Positional[Path | None] = None
-    """What was measured; default: nothing new."""
+    """Folder of new measurements; default: none."""
 
 
 def main(options: Options) -> None:
-    """Take in new figures, if any; draw; write."""
+    """Merge new figures, if any; draw the pictures; write the tables."""
     path = DOCS / "performance.json"
     figures = json.loads(path.read_text()) if path.is_file() else {}
     if options.folder is not None:
@@ -79,7 +79,7 @@ def main(options: Options) -> None:
 
 
 def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
-    """Figures from the files in ``folder``; what it lacks stays as it is in ``old``."""
+    """Return the figures of the files in ``folder``; the "cases" that it lacks are kept from ``old``."""
     new: dict[str, Any] = {"cases": dict(old.get("cases", {}))}
     for name in SETUPS:
         if (path := folder / f"{name}.json").is_file():
@@ -114,7 +114,7 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
 
 
 def draw_speed(figures: dict[str, Any]) -> Figure:
-    """Bars of the cases, where the time goes, and how it scales."""
+    """Draw the cases as bars, the phases of a step, and the scaling."""
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
     draw_cases(figure.add_subplot(grid[0, :4]), figures["cases"])
@@ -132,13 +132,13 @@ def draw_speed(figures: dict[str, Any]) -> Figure:
 
 
 def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
-    """Thousand env-steps per second of every case: the panda, both presets."""
+    """Draw thousand env-steps per second of every case: the panda, both presets."""
     accurate, fast = cases["panda-accurate"]["rates"], cases["panda-fast"]["rates"]
     names = list(accurate)[::-1]
     for row, name in enumerate(names):
         colour = OURS if "closed loop" in name else ENGINE if "bare engine" in name else OTHER
         for rates, up, alpha in ((accurate, 0.2, 1.0), (fast, -0.2, 0.55)):
-            # A peer has physics of its own, and one bar.
+            # A peer does not use the presets, and has one bar.
             if name in rates and (name in fast or up > 0):
                 rate = rates[name] / 1e3
                 place = row + up if name in fast else row
@@ -154,7 +154,7 @@ def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
 
 
 def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
-    """Microseconds per env step of each phase, stacked."""
+    """Draw the microseconds per env step of each phase, stacked."""
     for row, (name, label) in enumerate(reversed(SETUPS.items())):
         left = 0.0
         for phase, colour in PHASES.items():
@@ -170,7 +170,7 @@ def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
 
 
 def draw_scaling(axes: Axes, rates: dict[str, float], label: str) -> None:
-    """Thousand env-steps per second over a parameter."""
+    """Draw thousand env-steps per second over a parameter."""
     at = [int(value) for value in rates]
     if max(at) > 10:
         axes.set_xscale("log", base=2)
@@ -186,7 +186,7 @@ def draw_scaling(axes: Axes, rates: dict[str, float], label: str) -> None:
 
 
 def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
-    """The largest error over time, for each robot and kind of motion."""
+    """Draw the largest error over time, for each robot and kind of motion."""
     robots = list(dict.fromkeys(row["robot"] for row in rows))
     motions = list(dict.fromkeys(row["motion"] for row in rows))
     figure = Figure(figsize=(11, 5), layout="constrained")
@@ -216,7 +216,7 @@ def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
 
 
 def tidy(axes: Axes, grid: str) -> None:
-    """Small ticks, a faint grid behind, no frame on top and at the right."""
+    """Style ``axes``: small ticks, a faint grid behind, no frame on top and at the right."""
     axes.tick_params(labelsize=7.5)
     axes.grid(axis=grid, color="#e6e6e6", lw=0.6)  # type: ignore[arg-type]
     axes.set_axisbelow(True)
@@ -227,7 +227,7 @@ def tidy(axes: Axes, grid: str) -> None:
 
 
 def tables(figures: dict[str, Any]) -> dict[str, str]:
-    """Markdown of every table of the page, by its marker."""
+    """Return the Markdown of every table of the page, by its marker."""
     return {
         "machine": machine(figures["machine"]),
         "cases": cases_table(figures["cases"]),
@@ -238,7 +238,7 @@ def tables(figures: dict[str, Any]) -> dict[str, str]:
 
 
 def machine(about: dict[str, Any]) -> str:
-    """The machine and the versions, in a line."""
+    """Return the machine and the versions, in a line."""
     packages = ", ".join(
         f"{name} {about[name]}" for name in ("sapien", "numpy", "mujoco", "gymnasium") if name in about
     )
@@ -246,7 +246,7 @@ def machine(about: dict[str, Any]) -> str:
 
 
 def cases_table(cases: dict[str, Any]) -> str:
-    """Rates, and the closed loop over each."""
+    """Return the table of rates, and of the closed loop over each."""
     rows = [
         [case]
         + [
@@ -261,13 +261,13 @@ def cases_table(cases: dict[str, Any]) -> str:
 
 
 def phases_table(cases: dict[str, Any]) -> str:
-    """Microseconds per env step of each phase."""
+    """Return the table of microseconds per env step of each phase."""
     rows = [[label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)] for name, label in SETUPS.items()]
     return markdown(["µs per env step in a worker", *PHASES], rows)
 
 
 def presets_table(figures: dict[str, Any]) -> str:
-    """Cost and errors of each preset."""
+    """Return the table of cost and errors of each preset."""
     rows = []
     for name, label in SETUPS.items():
         phases = figures["cases"][name]["phases"]
@@ -283,15 +283,16 @@ def presets_table(figures: dict[str, Any]) -> str:
 
 
 def resources_table(resources: dict[str, dict[str, float]]) -> str:
-    """Memory, building, starting."""
+    """Return the table of memory and of the times to build and to start."""
     rows = [
-        [what, *(form.format(robot[name]) for robot in resources.values())] for name, (what, form) in RESOURCES.items()
+        [meaning, *(style.format(robot[name]) for robot in resources.values())]
+        for name, (meaning, style) in RESOURCES.items()
     ]
     return markdown(["", *resources], rows)
 
 
 def markdown(headers: list[str], rows: list[list[str]]) -> str:
-    """A table."""
+    """Return a Markdown table."""
     from tabulate import tabulate
 
     return str(tabulate(rows, headers, tablefmt="github", disable_numparse=True))

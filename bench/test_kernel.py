@@ -1,12 +1,13 @@
-"""The law as a kernel: envs from 1 to 2^20 by 9 joints, beside what it must beat and the machine's own bandwidth.
+"""Speed of the law alone, for 1 to 2^20 envs of 9 joints, against other kernels and the machine's bandwidth.
 
-The typical law: P, I, filtered D, feedforward, effort limits, back-calculation, float32. A step's necessary bytes are
-each input read once and each output written once: setpoint, measurement, feedforward, integral, last measurement and
-filtered rate in, and effort, integral, measurement and filtered rate out, 10 arrays of envs x joints. Bandwidth is
-that over the best time of a step; ``of triad`` is its share of a[i] = b[i] + s c[i] over arrays of the same size,
-counted as 3 arrays, measured next to it on all cores (numba), or of a copy on the GPU where JAX has one. Compilation
-is never timed. "jax" is :class:`batchpid.BatchPID`; "jax in blocks" is :func:`batchpid.blocks.advance_in_blocks` under
-shard_map with a device for each core, whose efforts are written over those of the step before last.
+The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32. The necessary bytes of a step
+are each input read once and each output written once: setpoint, measurement, feedforward, integral, last measurement
+and filtered rate in; effort, integral, measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is
+that over the best time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays of the
+same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy on the GPU where JAX has
+one. Compilation is never timed. "jax" is :class:`batchpid.BatchPID`; "jax in blocks" is
+:func:`batchpid.blocks.advance_in_blocks` under shard_map with a device for each core, whose efforts are written over
+those of the step before last.
 """
 
 import os
@@ -40,10 +41,10 @@ SIZES = [1, 64, 4096, 2**16, 2**20]
 ON_GPU = jax.default_backend() != "cpu"
 
 
-def inputs(envs):
-    """Setpoint, two measurements to alternate between, and feedforward."""
+def inputs(num_envs):
+    """Return setpoint, two measurements to alternate between, and feedforward."""
     rng = np.random.default_rng(0)
-    return [rng.normal(size=(envs, JOINTS)).astype(np.float32) for _ in range(4)]
+    return [rng.normal(size=(num_envs, JOINTS)).astype(np.float32) for _ in range(4)]
 
 
 def best(call, seconds=0.6, least=5):
@@ -63,9 +64,9 @@ def _triad(a, b, c, s):
         a[i] = b[i] + s * c[i]
 
 
-def machine_bandwidth(envs):
+def machine_bandwidth(num_envs):
     """Return bytes per second of the triad (CPU, all cores) or of a copy (GPU)."""
-    size = envs * JOINTS
+    size = num_envs * JOINTS
     if ON_GPU:
         copy, source = jax.jit(lambda x: x + 1, donate_argnums=0), [jnp.ones(size, jnp.float32)]
 
@@ -90,9 +91,9 @@ def _by_hand(kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, i
             last[i, j], rate[i, j], effort[i, j] = y[i, j], v, s
 
 
-def numpy_step(envs):
-    r, y0, y1, ff = inputs(envs)
-    pid, turn = bp.BatchPID(PARAMS, envs, DT), [y0, y1]
+def numpy_step(num_envs):
+    r, y0, y1, ff = inputs(num_envs)
+    pid, turn = bp.BatchPID(PARAMS, num_envs, DT), [y0, y1]
 
     def call():
         turn.reverse()
@@ -101,10 +102,10 @@ def numpy_step(envs):
     return call
 
 
-def jax_step(envs):
-    """BatchPID on device arrays; waits for the effort."""
-    r, y0, y1, ff = (jnp.asarray(x) for x in inputs(envs))
-    pid, turn = bp.BatchPID(PARAMS, envs, DT, "jax"), [y0, y1]
+def jax_step(num_envs):
+    """Return a call of BatchPID on device arrays that waits for the effort."""
+    r, y0, y1, ff = (jnp.asarray(x) for x in inputs(num_envs))
+    pid, turn = bp.BatchPID(PARAMS, num_envs, DT, "jax"), [y0, y1]
 
     def call():
         turn.reverse()
@@ -113,11 +114,11 @@ def jax_step(envs):
     return call
 
 
-def jax_step_in_blocks(envs):
-    """Each device has its own envs; the state and the effort are written over those before the last."""
+def jax_step_in_blocks(num_envs):
+    """Return a call with a share of the envs on each device; outputs are written over those of the call before last."""
     mesh = jax.make_mesh((jax.device_count(),), ("envs",), axis_types=(jax.sharding.AxisType.Auto,))
     by_env = jax.P("envs")
-    r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(envs))
+    r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(num_envs))
     k = jax.tree.map(jnp.asarray, bp.discretise(PARAMS, DT))
 
     def step(out, k, state, r, y, ff):
@@ -141,8 +142,8 @@ def jax_step_in_blocks(envs):
     return call
 
 
-def numba_step(envs):
-    r, y0, y1, ff = inputs(envs)
+def numba_step(num_envs):
+    r, y0, y1, ff = inputs(num_envs)
     k = bp.discretise(PARAMS, DT)
     rows = [
         np.asarray(x, np.float32).ravel()
@@ -161,10 +162,10 @@ def numba_step(envs):
 
 
 def scalar_step(make):
-    """One Python object per joint, one call after another, as the tutorial has it."""
+    """Return a loop over one Python object per joint, as in SAPIEN's tutorial."""
 
-    def build(envs):
-        r, y0, y1, ff = (x.astype(float).ravel().tolist() for x in inputs(envs))
+    def build(num_envs):
+        r, y0, y1, ff = (x.astype(float).ravel().tolist() for x in inputs(num_envs))
         compute, turn = [make() for _ in r], [y0, y1]
 
         def call():
@@ -200,22 +201,22 @@ KERNELS = {
 SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
 
 
-@pytest.mark.parametrize("envs", SIZES)
+@pytest.mark.parametrize("num_envs", SIZES)
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_step(benchmark, kernel, envs):
-    if kernel == "jax in blocks" and envs < 2**16:
+def test_step(benchmark, kernel, num_envs):
+    if kernel == "jax in blocks" and num_envs < 2**16:
         pytest.skip("for large batches")
-    call = KERNELS[kernel](envs)
+    call = KERNELS[kernel](num_envs)
     first = np.array(call())
     assert np.isfinite(first).all()
     assert not np.array_equal(first, call()), "the efforts follow the measurements"
     rounds = max(5, min(5000, int(0.5 / best(call, 0.1))))
     benchmark.pedantic(call, rounds=rounds, warmup_rounds=2)
-    bandwidth, least = machine_bandwidth(envs), benchmark.stats.stats.min
-    moved = ARRAYS * 4 * envs * JOINTS
+    bandwidth, least = machine_bandwidth(num_envs), benchmark.stats.stats.min
+    moved = ARRAYS * 4 * num_envs * JOINTS
     benchmark.extra_info |= {
         "us per step": round(1e6 * least, 2),
-        "ns per env": round(1e9 * least / envs, 2),
+        "ns per env": round(1e9 * least / num_envs, 2),
         "necessary MB": round(moved / 1e6, 3),
         "GB/s": round(moved / least / 1e9, 2),
         "of triad": round(moved / least / bandwidth, 3),
@@ -225,17 +226,17 @@ def test_step(benchmark, kernel, envs):
 
 
 @pytest.mark.parametrize("kernel", SCALARS)
-@pytest.mark.parametrize("envs", [1, 64, 4096])
-def test_scalar_loop(benchmark, kernel, envs):
-    """Its time is proportional to the envs, so the ns per env hold for 2^20 too."""
-    call = SCALARS[kernel](envs)
-    benchmark.pedantic(call, rounds=max(3, 4096 // envs), warmup_rounds=1)
-    benchmark.extra_info["ns per env"] = round(1e9 * benchmark.stats.stats.min / envs, 1)
+@pytest.mark.parametrize("num_envs", [1, 64, 4096])
+def test_scalar_loop(benchmark, kernel, num_envs):
+    """The time is proportional to the envs, so that the ns per env hold for 2^20 too."""
+    call = SCALARS[kernel](num_envs)
+    benchmark.pedantic(call, rounds=max(3, 4096 // num_envs), warmup_rounds=1)
+    benchmark.extra_info["ns per env"] = round(1e9 * benchmark.stats.stats.min / num_envs, 1)
 
 
 @pytest.mark.parametrize("kernel", ["jax", "jax in blocks"])
 def test_against_the_scalar_loop_in_one_run(benchmark, kernel):
-    """The JAX step at 2^20 x 9 against the tutorial's scalar loop, per env."""
+    """JAX at 2^20 x 9 takes less than a tenth of the time of the tutorial's scalar loop, per env."""
     slow = best(SCALARS["tutorial"](4096)) / 4096
     call = KERNELS[kernel](2**20)
     benchmark.pedantic(call, rounds=5, warmup_rounds=2)
@@ -244,11 +245,11 @@ def test_against_the_scalar_loop_in_one_run(benchmark, kernel):
     assert ratio > 10
 
 
-@pytest.mark.parametrize("envs", [64, 4096])
-def test_scan(benchmark, envs):
-    """jax.lax.scan of a closed loop: the law on a double integrator; time per step."""
+@pytest.mark.parametrize("num_envs", [64, 4096])
+def test_scan(benchmark, num_envs):
+    """Time per step of jax.lax.scan over a closed loop: the law on a double integrator."""
     steps, params = 2000, jax.tree.map(jnp.asarray, PARAMS)
-    r, y, _, ff = (jnp.asarray(x) for x in inputs(envs))
+    r, y, _, ff = (jnp.asarray(x) for x in inputs(num_envs))
 
     @jax.jit
     def run(params, y):
@@ -267,7 +268,7 @@ def test_scan(benchmark, envs):
 
 @pytest.mark.parametrize("kernel", ["numpy", "jax"])
 def test_settled_filters_cost_the_same(benchmark, kernel):
-    """After 10,000 steps at rest the filters have decayed; fresh and settled steps alternate in blocks."""
+    """Steps after 10,000 at rest, with decayed filters, cost no more than fresh ones; blocks of both alternate."""
     y = np.zeros((64, JOINTS), np.float32)
     r = np.zeros_like(y)
     pids = {name: bp.BatchPID(PARAMS, 64, DT, kernel) for name in ("moving", "settled")}

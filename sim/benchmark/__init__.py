@@ -1,1 +1,1 @@
-"""What ``batchpid bench`` measures, and the baselines beside it."""
+"""Speed and accuracy of the runner, against baselines: ``batchpid bench``."""

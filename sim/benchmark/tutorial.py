@@ -1,4 +1,4 @@
-"""SAPIEN's tutorial "Drive Robot with PID Controller", as it is written there: the oracle and the baseline.
+"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: oracle of the tests, baseline of the benchmark.
 
 One robot in one scene, one Python object per joint, one call after another. Only what needs a display is left out. The
 objects are SAPIEN's own, with its default settings; the Runner uses none of this.

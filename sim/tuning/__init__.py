@@ -1,1 +1,1 @@
-"""Gains: the moves to judge them by, their evaluation, the search."""
+"""Gains: moves to evaluate them on, their evaluation, and the search for them."""

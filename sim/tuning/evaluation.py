@@ -1,4 +1,4 @@
-"""Evaluation of gains: a set of moves, run at once, each in an env of its own, with metrics of every joint."""
+"""Evaluation of gains: a set of moves, each run in its own env, all at once, with metrics of every joint."""
 
 from __future__ import annotations
 

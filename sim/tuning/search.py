@@ -1,8 +1,8 @@
 r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
 
-Every candidate runs every move in an env of its own, so a generation is one rollout, with a share of the effort limits
-reserved for moves that are harder than those searched. The cost of a candidate is the mean over joints, taken as the
-mean over moves plus the worst move, of::
+Each env runs one move of one candidate, so that a generation is one rollout. A share of the effort limits is reserved
+for moves that are harder than those searched. The cost of a candidate is the mean over joints, taken as the mean over
+moves plus the worst move, of::
 
     w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
         + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S

@@ -1,4 +1,4 @@
-"""The Runner against SAPIEN's tutorial as it is written: one scene, one Python object a joint, float64."""
+"""The Runner follows SAPIEN's tutorial as written: one scene, one Python object a joint, float64."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def test_runner_follows_the_tutorials_loop():
     assert difference.max() < 1e-4
 
 
-def test_internal_drive_follows_the_tutorials():
+def test_internal_drive_follows_the_tutorials_internal_drive():
     robot = Robot.load("panda", dissipation="sapien")
     target = robot.settings.target
     expected = TutorialLoop(robot, target, external_pid=False, internal_drive=True).run(1000)
