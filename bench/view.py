@@ -63,7 +63,7 @@ def main(options: Options) -> None:
     robot = Robot.load(options.robot)
     live = LiveSimulation(robot, options.num_envs, controls=options.control, physics=options.physics)
     target = robot.settings.target if robot.settings is not None else robot.start
-    live.set_setpoints(target)
+    live.set_setpoint(target)
     first = live.frame().qpos
     with View(live, port=18200) as view, tempfile.TemporaryDirectory() as profile:
         thread = threading.Thread(target=view.run)
@@ -113,9 +113,9 @@ def _picture(page: webdriver.Chrome, live: LiveSimulation, target: np.ndarray, p
     """Save a picture of the page 2 s after a step from the start pose to the target."""
     for toast in page.find_elements("css selector", ".mantine-Notification-closeButton"):
         toast.click()  # the notice that WebGL runs in software
-    live.set_setpoints(live.robot.start)
+    live.set_setpoint(live.robot.start)
     _until(live, 4.0)
-    live.set_setpoints(target)
+    live.set_setpoint(target)
     _until(live, 2.0)
     with Image.open(io.BytesIO(page.get_screenshot_as_png())) as image:
         image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)

@@ -82,7 +82,7 @@ class ViewCommand:
             params=gains and gains.params,
         )
         if robot.settings is not None:
-            live.set_setpoints(robot.settings.target)
+            live.set_setpoint(robot.settings.target)
         return live
 
     def _recorded(self, path: Path) -> Playback:

@@ -9,22 +9,17 @@ import numpy as np
 from sim.view.data import ViewData
 from sim.view.playback import HISTORY_SECONDS
 
-_COLOURS = ("#15803d", "#d97706", "#7c3aed")
-"""Curve colour of each group."""
+_COLOURS = ("#15803d", "#d97706")
+"""Colour of each group's curves."""
 _LIMIT_RATIO = 4.0
 """A limit is drawn where it is less than this many times the largest effort."""
-_MIN_RANGE = 0.012
-"""Smallest end of every axis, up and down [rad, m, N m or N]: noise alone should not fill a chart."""
+_MIN_RANGE = {"min": -0.012, "max": 0.012}
+"""Smallest range of a vertical axis [rad, m, N m or N]: noise alone should not fill a chart."""
 _DECIMALS = 4
 """Positions are rounded to 1e-4 rad or m: smaller differences make a flat line jitter."""
 _SCALES = {
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},  # without a fixed range the axis drifts in viser 1.1
-    "y": {
-        "range": {
-            "min": {"pad": 0.1, "soft": -_MIN_RANGE, "mode": 1},
-            "max": {"pad": 0.1, "soft": _MIN_RANGE, "mode": 1},
-        }
-    },
+    "y": {"range": {end: {"pad": 0.1, "soft": soft, "mode": 1} for end, soft in _MIN_RANGE.items()}},
 }
 
 
@@ -54,8 +49,9 @@ class Charts:
                 for name, colour in zip(names, _COLOURS, strict=False)
             ]
 
-        limits = (_dashed_line(f"{end} limit", "#b6bcc6") for end in ("lower", "upper"))
-        self._position = chart("position", *curves("qpos"), _dashed_line("setpoint", "#4a82ff"))
+        dashed = {"width": 1, "dash": [6, 4]}
+        limits = ({"label": f"{end} limit", "stroke": "#b6bcc6", **dashed} for end in ("lower", "upper"))
+        self._position = chart("position", *curves("qpos"), {"label": "setpoint", "stroke": "#4a82ff", **dashed})
         self._error = chart("error", *curves("error"))
         self._effort = chart("effort", *limits, *curves("effort"))
 
@@ -66,10 +62,8 @@ class Charts:
             return
         past = history.time - history.time[-1]
         robots = env + data.per_group * np.arange(len(data.groups))
-        qpos, setpoint, effort = (
-            np.asarray(array[:, robots, joint].T, np.float64)
-            for array in (history.qpos, history.setpoint, history.effort)
-        )
+        arrays = (history.qpos, history.setpoint, history.effort)
+        qpos, setpoint, effort = (array[:, robots, joint].T.astype(np.float64) for array in arrays)
         # A far limit would flatten the curve, and a gap (NaN) would empty the chart: such a limit repeats the curve.
         largest = np.abs(effort).max()
         limits = [
@@ -78,18 +72,10 @@ class Charts:
         ]
         described = data.robot.joints[joint]
         for chart, title, curves in (
-            (
-                self._position,
-                f"{described.name} [{described.unit}]",
-                np.round([*qpos, setpoint[0]], _DECIMALS),
-            ),
+            (self._position, f"{described.name} [{described.unit}]", np.round([*qpos, setpoint[0]], _DECIMALS)),
             (self._error, f"setpoint - qpos [{described.unit}]", setpoint - qpos),
             (self._effort, f"effort [{described.effort_unit}]", [*limits, *effort]),
         ):
             if chart.title != title:
                 chart.title = title
             chart.data = (past, *curves)
-
-
-def _dashed_line(label: str, colour: str) -> dict[str, Any]:
-    return {"label": label, "stroke": colour, "width": 1, "dash": [6, 4]}

@@ -1,7 +1,4 @@
-"""Films of recorded runs and SAPIEN's window, by SAPIEN's own renderer, which needs a Vulkan device.
-
-Robots are only placed here; no scene is stepped.
-"""
+"""Films of recorded runs and SAPIEN's window, drawn by SAPIEN's renderer, which needs a Vulkan device."""
 
 from __future__ import annotations
 
@@ -28,8 +25,6 @@ from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, arrange_robots
 from sim.view.playback import rows_at
 
 FORMATS = (".mp4", ".gif")
-PAUSE = 1.0
-"""Rest between two repetitions in the window [s]."""
 _CLOSER = 0.72
 """Distance of the camera as a share of that in the browser, where panels cover the sides of the picture."""
 
@@ -102,12 +97,10 @@ def write_film(
 
     Raises
     ------
-    InvalidArgumentError
-        An argument is out of range.
+    InvalidArgumentError, RobotNotFoundError
+        An argument is out of range, or the robot of the run is not bundled.
     MissingDependencyError
         The packages imageio and imageio-ffmpeg are missing.
-    RobotNotFoundError
-        The robot of the run is not bundled.
     RenderError
         SAPIEN cannot render on this machine.
     """
@@ -139,8 +132,7 @@ def write_film(
 
 def film_rows(rollout: Rollout, fps: float) -> NDArray[np.int64]:
     """Return the rows of ``rollout`` that a film shows at ``fps`` frames per second, (frames,)."""
-    duration = rollout.time[-1] - rollout.time[0]
-    return rows_at(rollout, np.arange(0.0, duration + 0.5 / fps, 1 / fps))
+    return rows_at(rollout, np.arange(0.0, rollout.time[-1] - rollout.time[0] + 0.5 / fps, 1 / fps))
 
 
 def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float | None = None) -> None:
@@ -164,7 +156,7 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     viewer.window.set_camera_parameters(near=0.05, far=100.0, fovy=FIELD_OF_VIEW)
     began, duration = time.monotonic(), float(rollout.time[-1] - rollout.time[0])
     while not viewer.closed and (seconds is None or time.monotonic() - began < seconds):
-        elapsed = (time.monotonic() - began) % (duration + PAUSE)
+        elapsed = (time.monotonic() - began) % (duration + 1.0)  # a pause of 1 s
         scene.place(rollout.qpos[rows_at(rollout, elapsed)])
         viewer.render()
     viewer.close()

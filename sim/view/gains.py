@@ -34,39 +34,41 @@ _MAX_EFFORT = 1e3
 
 
 class GroupGains:
-    """Gains of one group, the same on each of its robots.
-
-    ``sets`` are params by name, of one row and in the same gain units. The group starts with the first.
-    """
+    """Gains of one group: ``sets`` of one row each and the same gain units, by name. It starts with the first."""
 
     def __init__(self, robot: Robot, sets: dict[str, bp.PIDParams]) -> None:
-        self._robot, self._base = robot, next(iter(sets.values()))
-        if self._base.setpoint_weight is None:  # without effect as long as the weight is 1
-            self._base = self._base.replace(weight_origin="start")
-        self._sets = {name: _values(params) for name, params in sets.items()}
+        self._robot, base = robot, next(iter(sets.values()))
+        if base.setpoint_weight is None:  # without effect as long as the weight is 1
+            base = base.replace(weight_origin="start")
+        self._sets = {name: base.replace(**_values(params)) for name, params in sets.items()}
         self.set_names = tuple(sets)
         """Names that :meth:`apply_set` takes."""
-        self.apply_set(self.set_names[0])
+        self.params = self._sets[self.set_names[0]]
+        """Params in force."""
+
+    @property
+    def values(self) -> dict[str, Float64]:
+        """Gains in force as options of make_params, (dof,) each."""
+        return _values(self.params)
 
     def apply_set(self, name: str) -> None:
         """Give every joint the gains of a named set; the other options stay those of the first set."""
-        self._apply(self._sets[choice("name", name, self._sets)])
+        self.params = self._sets[choice("name", name, self._sets)]
 
     def set(self, gain: str, joint: int, value: float) -> None:
         """Set one of :data:`GAINS` of a joint."""
-        changes = {choice("gain", gain, GAINS): value}
-        if gain == "effort_limit":
-            changes = {"effort_min": -value, "effort_max": value}
-        values = {name: row.copy() for name, row in self.values.items()}
-        for name, changed in changes.items():
-            values[name][joint] = np.clip(changed, *_OPTIONS[name][1:])
-        self._apply(values)
+        values = self.values
+        if choice("gain", gain, GAINS) == "effort_limit":
+            values["effort_min"][joint], values["effort_max"][joint] = -value, value
+        else:
+            values[gain][joint] = np.clip(value, *_OPTIONS[gain][1:])
+        self.params = self.params.replace(**values)
 
     def slider_range(self, gain: str, joint: int) -> tuple[float, float]:
         """Return a gain of a joint, and the upper end of the range worth trying."""
         name = "effort_max" if gain == "effort_limit" else choice("gain", gain, GAINS)
         value = float(self.values[name][joint])
-        largest = max(float(values[name][joint]) for values in self._sets.values())
+        largest = max(float(_values(params)[name][joint]) for params in self._sets.values())
         if gain == "effort_limit":
             return min(value, _MAX_EFFORT), min(float(self._robot.effort_limit[joint]), _MAX_EFFORT)
         ends = {"setpoint_weight": 1.0, "derivative_filter_time": max(0.02, largest)}
@@ -77,13 +79,8 @@ class GroupGains:
 
         The effort limits move with it, so that they bound the effort of the motors alone.
         """
-        return self.params.replace(**{end: disturbance + self.values[end] for end in ("effort_min", "effort_max")})
-
-    def _apply(self, values: dict[str, Float64]) -> None:
-        self.values = values
-        """Options of make_params in force, (dof,) each."""
-        self.params = self._base.replace(**values)
-        """Params in force."""
+        values = self.values
+        return self.params.replace(**{end: disturbance + values[end] for end in ("effort_min", "effort_max")})
 
 
 def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:

@@ -25,16 +25,12 @@ _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.8
 
 
 class RobotLayout(NamedTuple):
-    """Positions of robots and camera, in meters."""
+    """Positions of the robots (robots, 3), group by group, of the camera and its target (3,); a robot's reach. In m."""
 
     positions: Float64
-    """Root links (robots, 3), group by group."""
     camera: Float64
-    """Camera (3,)."""
     target: Float64
-    """Point that the camera looks at (3,)."""
     reach: float
-    """Horizontal reach of a robot."""
 
 
 def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group: int) -> RobotLayout:
@@ -44,8 +40,7 @@ def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group:
     reach = max(0.3, float(np.quantile(distance, 0.95)))
     columns = max(1, round(math.sqrt(per_group / groups)))
     group, index = np.divmod(np.arange(groups * per_group), per_group)
-    width = columns + (_GAP if groups > 1 else 0.0)
-    grid = np.stack([index % columns + group * width, index // columns, np.zeros(len(index))], axis=1)
+    grid = np.stack([index % columns + group * (columns + _GAP), index // columns, 0 * index], axis=1)
     positions = _PITCH * reach * (grid - (grid.min(0) + grid.max(0)) / 2)
     size = float(np.hypot(*np.ptp(positions, axis=0)[:2])) + 2.0 * reach
     return RobotLayout(positions, 1.16 * size * _CAMERA_DIRECTION, np.array([0.0, 0.0, 0.35 * reach]), reach)

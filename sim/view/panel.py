@@ -20,14 +20,7 @@ from sim.view.gains import GAINS
 from sim.view.playback import Playback
 from sim.view.simulation import LiveSimulation
 
-_DIRECTIONS = {
-    "+x": (1, 0, 0),
-    "-x": (-1, 0, 0),
-    "+y": (0, 1, 0),
-    "-y": (0, -1, 0),
-    "up": (0, 0, 1),
-    "down": (0, 0, -1),
-}
+_DIRECTIONS = dict(zip(("+x", "+y", "up", "-x", "-y", "down"), np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _MILLISECONDS = {"derivative_filter_time": 1e3}
 """Factor from a gain to the number on its slider, where that is not 1."""
 
@@ -38,10 +31,8 @@ class Panel:
     def __init__(self, server: Any, data: ViewData) -> None:
         self._gui, self._data = server.gui, data
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self.playing = True
-        """Whether time passes."""
-        self.steps = 0
-        """Frames still to run while paused."""
+        self.frames_left = math.inf
+        """Frames to run before the next pause."""
         self._names = short_names(data.robot)
         gui = self._gui
         self._status = gui.add_markdown("starting ...")
@@ -60,12 +51,10 @@ class Panel:
             self._show_setpoint = gui.add_checkbox("Show its setpoint", True)
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
-            with tabs.add_tab("Setpoint"):
-                self._add_setpoints(data)
-            with tabs.add_tab("Gains"):
-                self._add_gains(data)
-            with tabs.add_tab("Disturb"):
-                self._add_disturbances(data)
+            adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
+            for title, add in adders.items():
+                with tabs.add_tab(title):
+                    add(data)
 
     @property
     def env(self) -> int:
@@ -100,7 +89,7 @@ class Panel:
         """Show time, real-time factor, frame rate, and the robots that diverged or saturate."""
         data, time = self._data, float(frame.time[0])
         diverged, saturated = int((~frame.ok).sum()), int(frame.saturated.any(-1).sum())
-        speed = f"{factor:.2f} x real time · {rate:.0f} frames/s" if self.playing else "paused"
+        speed = f"{factor:.2f} x real time · {rate:.0f} frames/s" if self.frames_left else "paused"
         lines = [
             f"**{data.per_group} x {data.robot.name}** · {' and '.join(data.groups)}",
             f"t = {time:.2f} s · {speed}",
@@ -112,8 +101,6 @@ class Panel:
         if isinstance(data, Playback):
             self._time.value = time
 
-    # -- inside ----------------------------------------------------------------------------------------------------
-
     def _on(self, handle: Any, action: Callable[[Any], None]) -> None:
         """Queue ``action(value)`` whenever a user, and not this program, changes a control."""
 
@@ -124,12 +111,12 @@ class Panel:
         (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(changed)
 
     def _control_motion(self, button: str) -> None:
-        if button == "Step":
-            self.playing, self.steps = False, self.steps + 1
-        elif button == "Reset":
+        if button == "Reset":
             self._data.reset()
+        elif button == "Step":
+            self.frames_left = 1 if math.isinf(self.frames_left) else self.frames_left + 1
         else:
-            self.playing = button == "Run"
+            self.frames_left = math.inf if button == "Run" else 0
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
         gui, robot = self._gui, live.robot
@@ -146,11 +133,11 @@ class Panel:
             if pose == "random":
                 live.randomize_setpoints()
             else:
-                live.set_setpoints(poses[pose])
+                live.set_setpoint(poses[pose])
             update()
 
         def move(joint: int, position: float) -> None:
-            live.set_setpoint(joint, position, self.env if watched_only.value else None)
+            live.set_setpoint(position, joint=joint, env=self.env if watched_only.value else None)
 
         self._on(buttons, go_to)
         for index, (name, joint) in enumerate(zip(self._names, robot.joints, strict=True)):
@@ -211,7 +198,7 @@ class Panel:
         push = gui.add_button_group("Push along", tuple(_DIRECTIONS))
         self._on(link, lambda name: setattr(live, "load_link", live.kinematics.index(name)))
         self._on(payload, partial(setattr, live, "payload"))
-        self._on(push, lambda name: live.push(float(force.value) * np.array(_DIRECTIONS[name])))
+        self._on(push, lambda name: live.push(force.value * _DIRECTIONS[name]))
 
 
 def short_names(robot: Robot) -> tuple[str, ...]:

@@ -16,14 +16,9 @@ HISTORY_SECONDS = 8.0
 
 
 class Playback:
-    """Recorded run as the data of a page; after the last row it starts over. Time counts from the first row.
+    """Recorded run as the data of a page, from the first row to the last and then again.
 
-    Parameters
-    ----------
-    robot
-        Robot of the run; default the bundled one of its name.
-    period
-        Time between frames [s], at least a tick of the run.
+    ``robot`` is by default the bundled one of the run's name. Frames are ``period`` [s] apart, or a tick of the run.
 
     Raises
     ------
@@ -52,13 +47,11 @@ class Playback:
 
     def frame(self) -> Rollout:
         """Return the state recorded at the present time, as a rollout of one tick."""
-        row = int(rows_at(self._rollout, self._now))
-        return self._finite(slice(row, row + 1))
+        return self._since(self._now)
 
     def history(self) -> Rollout:
         """Return the rows up to the present one, of the last :data:`HISTORY_SECONDS`."""
-        first, last = rows_at(self._rollout, np.array([self._now - HISTORY_SECONDS, self._now]))
-        return self._finite(slice(int(first), int(last) + 1))
+        return self._since(self._now - HISTORY_SECONDS)
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits in the URDF [N m or N]."""
@@ -80,8 +73,10 @@ class Playback:
     def close(self) -> None:
         """Do nothing: a playback holds no resources."""
 
-    def _finite(self, rows: slice) -> Rollout:
-        part = self._rollout.for_ticks(rows)
+    def _since(self, start: float) -> Rollout:
+        """Return the rows from a time [s] to the present one; numbers that are not finite become 0."""
+        first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
+        part = self._rollout.for_ticks(slice(first, last + 1))
         finite = (np.nan_to_num(array, posinf=0.0, neginf=0.0) for array in part.observation)
         return replace(part, observation=Observation._make(finite))
 

@@ -21,15 +21,13 @@ Float64 = NDArray[np.float64]
 
 _SETPOINT_COLOUR = (70, 130, 255)
 _DIVERGED_COLOUR = np.array([200, 40, 40], np.uint8)
-_GROUP_COLOURS = np.array([[255, 255, 255], [255, 150, 40], [90, 200, 160]])
-_TINT = 0.5
-"""Share of the group's colour in that of its robots, from the second group on."""
+_TINT, _TINT_SHARE = np.array([255, 150, 40]), 0.5
+"""Colour mixed into that of the second group's robots, and its share."""
 _FLOOR_COLOURS = np.array([[189, 198, 211], [203, 211, 222]], np.uint8)
-_TILE = 0.5
-"""Edge of a floor tile [m]."""
-_TILE_PIXELS = 16
-"""Edge of a floor tile in the floor's picture; the browser blurs the joints over one pixel."""
+_TILE, _TILE_PIXELS = 0.5, 16
+"""Edge of a floor tile [m], and in pixels of the floor's picture, in which tiles blend over one pixel."""
 _NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
+_SETPOINT_STYLE = {"batched_colors": _SETPOINT_COLOUR, "opacity": 0.22, **_NO_SHADOW}
 
 
 class RobotScene:
@@ -43,17 +41,14 @@ class RobotScene:
         self._setpoints: list[Any] = []
         self._links: list[int] = []
         self._colours: list[NDArray[np.uint8]] = []
-        for index, surface in enumerate(surfaces(robot, _deviation(count))):
+        # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
+        deviation = 5e-4 if count <= 4 else 1.5e-3 if count < 16 else 3e-3 if count < 48 else 6e-3  # [m]
+        for index, surface in enumerate(surfaces(robot, deviation)):
             colours = _group_colours(surface.rgba, len(groups), per_group)
             opacity = surface.rgba[3] if surface.rgba[3] < 1 else None
-            self._robots.append(
-                self._add_surface(f"/robots/{index}", surface, count, batched_colors=colours, opacity=opacity)
-            )
-            self._setpoints.append(
-                self._add_surface(
-                    f"/setpoint/{index}", surface, 1, batched_colors=_SETPOINT_COLOUR, opacity=0.22, **_NO_SHADOW
-                )
-            )
+            node = self._add_surface(f"/robots/{index}", surface, count, batched_colors=colours, opacity=opacity)
+            self._robots.append(node)
+            self._setpoints.append(self._add_surface(f"/setpoint/{index}", surface, 1, **_SETPOINT_STYLE))
             self._links.append(self._kinematics.index(surface.link))
             self._colours.append(colours)
         self._shown_setpoint: tuple[Any, ...] | None = None
@@ -103,6 +98,8 @@ class RobotScene:
 
     def _add_surroundings(self, groups: tuple[str, ...]) -> None:
         """Add floor, lights, the ring under the selected robot, labels of the groups, and set the camera."""
+        import trimesh  # installed with viser
+
         scene, layout = self._server.scene, self._layout
         scene.set_up_direction("+z")
         # Where a browser draws in software, the environment map costs more than all robots.
@@ -112,8 +109,6 @@ class RobotScene:
         # An image is not lit and costs a third of tiles made of triangles.
         image, size, center = _floor(layout.positions, layout.reach)
         scene.add_image("/floor", image, *size, format="png", position=(*center, 0.0), **_NO_SHADOW)
-        import trimesh  # a dependency of viser
-
         ring = trimesh.creation.annulus(0.30 * layout.reach, 0.335 * layout.reach, height=1e-3, sections=48)
         self._ring = scene.add_mesh_simple("/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW)
         if len(groups) > 1:
@@ -123,11 +118,6 @@ class RobotScene:
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(layout.camera), tuple(layout.target)
         camera.fov = FIELD_OF_VIEW
-
-
-def _deviation(robots: int) -> float:
-    """Return the tolerance of round surfaces [m]: a browser without a GPU transforms every vertex in software."""
-    return 5e-4 if robots <= 4 else 1.5e-3 if robots < 16 else 3e-3 if robots < 48 else 6e-3
 
 
 def _floor(positions: Float64, reach: float) -> tuple[NDArray[np.uint8], Float64, Float64]:
@@ -141,7 +131,7 @@ def _floor(positions: Float64, reach: float) -> tuple[NDArray[np.uint8], Float64
 
 
 def _group_colours(rgba: tuple[float, ...], groups: int, per_group: int) -> NDArray[np.uint8]:
-    """Return the colour of a surface on every robot (robots, 3), tinted from the second group on."""
+    """Return the colour of a surface on every robot (robots, 3), tinted in the second group."""
     own = 255 * np.array(rgba[:3])
-    rows = [own + (_TINT * (_GROUP_COLOURS[group % 3] - own) if group else 0.0) for group in range(groups)]
-    return np.repeat(np.array(rows), per_group, axis=0).round().astype(np.uint8)
+    rows = [own, own + _TINT_SHARE * (_TINT - own)][:groups]
+    return np.repeat(rows, per_group, axis=0).round().astype(np.uint8)

@@ -6,6 +6,7 @@ import math
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -25,10 +26,8 @@ from sim.view.playback import HISTORY_SECONDS
 Float64 = NDArray[np.float64]
 
 CONTROLS = ("pid", "drive")
-PUSH_SECONDS = 0.25
-"""Duration of a push [s]."""
-GRAVITY = 9.81
-"""Acceleration of a payload [m/s^2]."""
+PUSH_SECONDS, GRAVITY = 0.25, 9.81
+"""Duration of a push [s], and acceleration of a payload [m/s^2]."""
 
 
 class LiveSimulation:
@@ -41,9 +40,7 @@ class LiveSimulation:
     period
         Simulated time between frames [s], rounded to whole sim steps.
     spread
-        Largest distance of a joint from the robot's start pose at the beginning [rad or m].
-    seed
-        Of start poses and random setpoints.
+        Largest distance of a joint from the robot's start pose at the beginning [rad or m]; ``seed`` determines it.
     workers
         Processes in all; default one for each core.
     params
@@ -92,31 +89,18 @@ class LiveSimulation:
         self.load_link = self.kinematics.tool
         """Index of the link that payload and pushes act on."""
         self._push: Float64 = np.zeros(3)
-        self._push_frames = 0
-        self._count = 0
+        self._count = self._push_frames = 0
         self._frames: deque[Rollout] = deque(maxlen=round(HISTORY_SECONDS / self.period))
-        self._pool = ThreadPoolExecutor(groups)
-        self._runners: list[Runner] = []
         cores = len(os.sched_getaffinity(0)) if workers is None else workers
-        share = 0 if cores == 0 else max(1, cores // groups)
-        try:
-            for control, gains in self.gains.items():
-                runner = Runner(
-                    robot,
-                    self.per_group,
-                    params=gains.params,
-                    control=control,
-                    substeps=substeps,
-                    workers=share,
-                    **options,
-                )
-                self._runners.append(runner)
-        except BaseException:
-            self.close()
-            raise
+        options = dict(substeps=substeps, workers=0 if cores == 0 else max(1, cores // groups), **options)
+        with ExitStack() as stack:
+            self._pool = stack.enter_context(ThreadPoolExecutor(groups))
+            self._runners = [
+                stack.enter_context(Runner(robot, self.per_group, params=gains.params, control=control, **options))
+                for control, gains in self.gains.items()
+            ]
+            self._resources = stack.pop_all()
         self.reset()
-
-    # -- commands --------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Put every robot back to its start pose, at rest, with a reset controller."""
@@ -126,24 +110,18 @@ class LiveSimulation:
         self._frames.clear()
         self._observe(np.zeros((len(self.groups) * self.per_group, self.robot.dof)))
 
-    def set_setpoint(self, joint: int, position: float, env: int | None = None) -> None:
-        """Set the setpoint of a joint [rad or m], of one env of every group or (None) of all."""
-        self.setpoint[slice(None) if env is None else env, joint] = position
-
-    def set_setpoints(self, pose: ArrayLike) -> None:
-        """Set every setpoint: (dof,) or (envs, dof) [rad or m]."""
-        self.setpoint = np.array(np.broadcast_to(pose, self.setpoint.shape), np.float64)
+    def set_setpoint(self, position: ArrayLike, *, joint: int | None = None, env: int | None = None) -> None:
+        """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env of each group or all."""
+        self.setpoint[slice(None) if env is None else env, slice(None) if joint is None else joint] = position
 
     def randomize_setpoints(self) -> None:
         """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start pose."""
         drawn = self.robot.start + self._random.uniform(-1.0, 1.0, self.setpoint.shape)
-        self.set_setpoints(np.clip(drawn, self.robot.lower, self.robot.upper))
+        self.set_setpoint(np.clip(drawn, self.robot.lower, self.robot.upper))
 
     def push(self, force: ArrayLike) -> None:
         """Push the load link of every robot with a force (3,) [N] for :data:`PUSH_SECONDS`."""
         self._push, self._push_frames = np.array(force, np.float64), math.ceil(PUSH_SECONDS / self.period)
-
-    # -- data of the page ------------------------------------------------------------------------------------------
 
     @property
     def time(self) -> float:
@@ -156,7 +134,7 @@ class LiveSimulation:
 
     def history(self) -> Rollout:
         """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
-        return Rollout.join(self._frames)
+        return Rollout.join(list(self._frames))  # a copy: another thread may add a frame
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits of a joint [N m or N]."""
@@ -173,15 +151,10 @@ class LiveSimulation:
 
     def close(self) -> None:
         """Close the runners."""
-        for runner in self._runners:
-            runner.close()
-        self._pool.shutdown()
-
-    # -- inside ----------------------------------------------------------------------------------------------------
+        self._resources.close()
 
     def _step(self, control: str, runner: Runner, disturbance: Float64) -> None:
-        loaded = bool(disturbance.any())
-        gains = self.gains[control]
+        gains, loaded = self.gains[control], bool(disturbance.any())
         params = gains.params_under(disturbance) if loaded and control == "pid" else gains.params
         if runner.params is not params:
             runner.params = params

@@ -62,7 +62,7 @@ def live(panda):
 @pytest.fixture
 def view(live, serve):
     view = serve(live)
-    view.panel.playing = False  # a paused page answers at once
+    view.panel.frames_left = 0  # a paused page answers at once
     return view
 
 
@@ -101,15 +101,15 @@ def test_gains_pause_step_reset_and_push(live, view, open_page, until):
     press(page, "Run")
     until(lambda: np.abs(live.frame().qpos[0] - live.start).max() > 0.02, what="the push")
     press(page, "Pause")
-    until(lambda: not view.panel.playing, what="the pause")
+    until(lambda: view.panel.frames_left == 0, what="the pause")
     press(page, "Reset")
     until(lambda: live.time == 0.0, what="the reset")
     np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
 
 
 def test_charts_draw_the_watched_joint(live, view, open_page, until):
-    live.set_setpoints(live.robot.settings.target)
-    view.panel.steps = 10
+    live.set_setpoint(live.robot.settings.target)
+    view.panel.frames_left = 10
     page = open_page(view.url)
     until(lambda: "joint1 [rad]" in page.page_source, what="the chart's title")
 
@@ -128,6 +128,6 @@ def test_a_recorded_run_plays(jaco2, serve, open_page, until):
     page = open_page(view.url)
     until(lambda: dark(picture(page)) > 500, what="drawing the robots")
     until(lambda: playback.frame().time[0] > 0.5, what="playing")
-    view.panel.playing = False
+    view.panel.frames_left = 0
     enter(page, "Time [s]", 0.1)
     until(lambda: playback.frame().time[0] == pytest.approx(0.1, abs=playback.period), what="seeking")

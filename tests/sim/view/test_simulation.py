@@ -48,7 +48,7 @@ def test_frames_equal_those_of_a_runner_before_and_after_a_gain_changes(live):
 def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, params):
     given = None if params is None else panda.tuned()
     live = LiveSimulation(panda, 2, workers=0, physics="fast", params=given)
-    live.set_setpoints(panda.settings.target)
+    live.set_setpoint(panda.settings.target)
     with Runner(panda, 2, workers=0, physics="fast", params=panda.tuned()) as runner:
         runner.reset(live.start)
         for _ in range(3):
@@ -62,7 +62,7 @@ def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, 
 
 
 def test_the_motors_hold_a_payload(live):
-    live.set_setpoints(live.robot.settings.target)
+    live.set_setpoint(live.robot.settings.target)
     free_qpos, free_effort = run(live, 4.0)
     live.payload = 1.5
     qpos, effort = run(live, 4.0)
@@ -76,7 +76,7 @@ def test_the_motors_hold_a_payload(live):
 
 
 def test_effort_limits_bound_the_motors_and_not_the_payload(live):
-    live.set_setpoints(live.robot.settings.target)
+    live.set_setpoint(live.robot.settings.target)
     before, _ = run(live, 3.0)
     for joint in range(7):
         live.gains["pid"].set("effort_limit", joint, 40.0)
@@ -98,8 +98,8 @@ def test_a_push_moves_the_robots_and_ends(live):
 
 
 def test_setpoints_are_set_for_one_robot_or_for_all(live):
-    live.set_setpoint(2, 0.5)
-    live.set_setpoint(2, 0.7, env=1)
+    live.set_setpoint(0.5, joint=2)
+    live.set_setpoint(0.7, joint=2, env=1)
     assert live.frame().setpoint[0, :, 2].tolist() == [0.5, 0.7, 0.5]
     live.randomize_setpoints()
     assert (live.setpoint >= live.robot.lower).all()
@@ -114,7 +114,7 @@ def test_setpoints_are_set_for_one_robot_or_for_all(live):
 
 def test_pid_and_drive_run_in_two_groups_under_the_same_setpoints(jaco2):
     live = LiveSimulation(jaco2, 2, controls=("pid", "drive"), workers=0, physics="fast")
-    live.set_setpoints(jaco2.settings.target)
+    live.set_setpoint(jaco2.settings.target)
     qpos, _ = run(live, 0.5)
     frame = live.frame()
     assert qpos.shape == (4, 13)
@@ -131,7 +131,7 @@ def test_a_diverged_robot_stays_finite_until_a_reset(live):
         live.gains["pid"].set("kd", joint, 5000.0)
         live.gains["pid"].set("derivative_filter_time", joint, 0.0)
         live.gains["pid"].set("effort_limit", joint, np.inf)
-    live.set_setpoints(live.robot.settings.target)
+    live.set_setpoint(live.robot.settings.target)
     with pytest.warns(FaultWarning):
         qpos, effort = run(live, 1.0)
     assert not live.frame().ok.all()
@@ -150,7 +150,7 @@ def test_a_robot_without_settings_gets_gains_that_hold_it(tmp_path, panda, contr
     path.write_text(panda.path.read_text())
     robot = type(panda).load(path, fixed_base=fixed_base)
     live = LiveSimulation(robot, 1, controls=(control,), workers=0)
-    live.set_setpoints(robot.start)
+    live.set_setpoint(robot.start)
     qpos, _ = run(live, 1.0)
     assert np.abs(qpos - robot.start)[:, :7].max() < (0.1 if fixed_base else 0.5)
     live.close()

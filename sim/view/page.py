@@ -17,10 +17,8 @@ from sim.view.data import ViewData
 from sim.view.panel import Panel
 from sim.view.scene import RobotScene
 
-CHARTS_EVERY = 5
-"""Frames between two updates of the charts."""
-STATUS_EVERY = 15
-"""Frames between two updates of the status."""
+CHARTS_EVERY, STATUS_EVERY = 5, 15
+"""Frames between two updates of the charts, and of the status."""
 
 
 class View:
@@ -42,10 +40,8 @@ class View:
             self._server: Any = viser.ViserServer(host=host, port=port, verbose=False, label="batchpid")
         self.url = f"http://{'127.0.0.1' if host in ('0.0.0.0', '') else host}:{self._server.get_port()}"
         """Address of the page."""
-        self.rate = 0.0
-        """Frames per second of wall time."""
-        self.factor = 0.0
-        """Real-time factor."""
+        self.rate, self.factor = 0.0, 0.0
+        """Frames per second of wall time, and real-time factor."""
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
         self._scene = RobotScene(self._server, data.robot, data.groups, data.per_group)
@@ -71,11 +67,10 @@ class View:
         with ThreadPoolExecutor(1) as executor:
             while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
                 panel.run_requests()
-                moving = panel.playing or panel.steps > 0
-                panel.steps = max(0, panel.steps - 1)
                 frame = data.frame()
                 # The workers compute the next frame while this one is sent.
-                job = executor.submit(data.advance) if moving else None
+                job = executor.submit(data.advance) if panel.frames_left > 0 else None
+                panel.frames_left = max(0, panel.frames_left - 1)
                 if self._server.get_clients():
                     self._show(frame, count)
                 if job is not None:
