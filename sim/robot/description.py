@@ -123,7 +123,7 @@ class Dissipation(NamedTuple):
 
 DISSIPATION = {
     "urdf": Dissipation(joint_friction=None, link_damping=0.0),
-    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),  # SAPIEN 3's defaults, which ignore the URDF
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),  # SAPIEN 3's defaults
 }
 """Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""
 
