@@ -17,13 +17,14 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from identical import assert_identical
+from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError
 from sim import Recorder, Robot, Runner, Snapshot, read_recording
 
 CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "10000"))
-ROBOT = Robot.load("panda")
+ROBOT = load_bundled("panda")
 DOF, N = ROBOT.dof, 2
 PARAMS = ROBOT.params()
 ARRAY = np.zeros((N, DOF))

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot
 from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
 from sim.engine.physics import PHYSICS
 
@@ -83,7 +83,7 @@ def test_unknown_motion_is_refused(panda):
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_errors_are_of_the_documented_order_of_magnitude(name):
     """The table of docs/performance.md, within a factor."""
-    robot = Robot.load(name)
+    robot = load_bundled(name)
     bounds = {  # motion: (max, RMS) [rad]
         "free": (5e-2, 5e-3),
         "contact": (1.0, 5e-2),

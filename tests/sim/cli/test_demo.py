@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Robot
 from sim.cli.run import start_poses
 
-ROBOTS = {name: Robot.load(name) for name in ("panda", "jaco2")}
+ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 
 
 @pytest.mark.parametrize("name", list(ROBOTS))

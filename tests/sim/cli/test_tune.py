@@ -4,9 +4,9 @@ import dataclasses
 import json
 
 import pytest
+from robots import load_bundled
 
 import batchpid as bp
-from sim import Robot
 from sim.cli import parse
 from sim.tuning.weights import Weights
 
@@ -22,7 +22,7 @@ def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_
     assert "designed" in said
     assert "tuned" in said
     params, names = bp.load_params(out)
-    assert tuple(names) == Robot.load("panda").joint_names
+    assert tuple(names) == load_bundled("panda").joint_names
     assert type(params.gain_units).__name__ == "PerMassMatrix"
     about = bp.load_about(out)
     assert about["seed"] == 0
@@ -54,7 +54,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
 
 
 def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
-    robot = Robot.load("panda")
+    robot = load_bundled("panda")
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)
     picture = tmp_path / "two.png"
     flags = ("--moves", 1, "--seconds", 1.2, "--workers", 0, "--picture", picture)

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 import batchpid as bp
-from sim import Observation, Robot, Rollout, write_recording
+from sim import Observation, Rollout, write_recording
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -14,7 +15,7 @@ SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
 
 def write(path, robot="panda", envs=1):
     """Write a rollout of two ticks at rest."""
-    panda = Robot.load("panda")
+    panda = load_bundled("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
     info = replace(panda.run_info(), robot=robot)
@@ -33,7 +34,7 @@ def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
 
 
 def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
-    robot = Robot.load("panda")
+    robot = load_bundled("panda")
     bp.save_params(tmp_path / "plain.yaml", robot.params(kp=50.0), robot.joint_names)
     for gains in ("tuned", "tutorial", tmp_path / "plain.yaml"):
         status, _, err = batchpid("view", *SHORT, "--gains", gains, "--time-limit", 0.1)
@@ -67,5 +68,5 @@ def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_pa
     run = write(tmp_path / "run.npz", robot="arm")
     assert "robot: 'arm' of the recording is not bundled; give the path" in batchpid("view", "--play", run)[2]
     path = tmp_path / "arm.urdf"
-    path.write_text(Robot.load("panda").path.read_text())
+    path.write_text(load_bundled("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

@@ -10,11 +10,12 @@ import sys
 import numpy as np
 import pytest
 from identical import assert_identical
+from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner, Snapshot
+from sim import Runner, Snapshot
 
-ROBOTS = {name: Robot.load(name) for name in ("panda", "jaco2")}
+ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 N = 5
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 import batchpid as bp
 from sim import Robot
@@ -40,7 +41,7 @@ ROBOTS = {
 
 def load(name):
     if not name.endswith(".urdf"):
-        return Robot.load(name)
+        return load_bundled(name)
     if not (FOLDER / name).is_file():
         pytest.skip("example-robot-data is not installed")
     robot = Robot.load(FOLDER / name, missing_meshes="skip")

@@ -19,11 +19,12 @@ import numpy as np
 import psutil
 import pytest
 from identical import assert_identical
+from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
-from sim import RecoveryWarning, Robot, Runner
+from sim import RecoveryWarning, Runner
 
-ROBOT = Robot.load("panda")
+ROBOT = load_bundled("panda")
 N, TICKS = 8, 30
 KILLS = int(os.environ.get("BATCHPID_SOAK_KILLS", "100"))
 
