@@ -23,7 +23,7 @@ def skip_without_h5py(suffix):
 
 @pytest.fixture(scope="module")
 def rollout(panda):
-    """A rollout of 6 ticks in which env 1 of 3 fails; every env has a kp of its own."""
+    """A rollout of 6 ticks in which env 1 of 3 fails; every env has another kp."""
     params = panda.params(kp=np.linspace(30.0, 50.0, 3)[:, None])
     setpoints = np.tile(panda.settings.target, (6, 3, 1))
     setpoints[4, 1, 3] = np.nan
