@@ -13,6 +13,7 @@ slide, however fine the steps; so there are two references, and an error against
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -106,18 +107,9 @@ def measure_errors(
 ) -> dict[tuple[str, str], Accuracy]:
     """Return the errors of each solver of ``physics`` under the robot's tuned gains, by (solver, reference).
 
-    Parameters
-    ----------
-    motion
-        "free": to random poses, touching nothing; "contact": until a link presses on the ground or on another;
-        "limit": a joint against its limit.
-    count
-        Number of moves, run side by side.
-
-    Raises
-    ------
-    InvalidArgumentError
-        An argument is out of range, the robot carries no tuned gains, or it has no room for such moves.
+    ``motion`` is "free": to random poses, touching nothing; "contact": until a link presses on the ground or on
+    another; or "limit": a joint against its limit. ``count`` moves are run at once. Raises InvalidArgumentError where
+    an argument is out of range, or the robot has no tuned gains or no room for such moves.
     """
     references = REFERENCES[choice("motion", motion, REFERENCES)]
     steps = round(number("seconds", seconds, TIMESTEP, 1e3, "seconds") / TIMESTEP)
@@ -142,7 +134,13 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     ``solver`` None is the equation of motion. ``refinement`` sim steps are made in each period.
     """
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
-    plant = _plant(robot, moves, solver, TIMESTEP / refinement)
+    finer = replace(spec, timestep=TIMESTEP / refinement)
+    plant: Pack | EquationOfMotion
+    if solver is None:
+        plant = EquationOfMotion(robot.dynamics(), robot.damping, moves.start, finer.timestep)
+    else:
+        plant = Pack(parse(finer), finer, len(moves.start), system_size=4)
+        plant.write_state(range(plant.size), moves.start, np.zeros_like(moves.start))
     control = PIDControl(spec, robot.tuned(), plant)
     control.begin(Command(moves.target), steps)
     table = np.empty((steps, *moves.start.shape))
@@ -153,15 +151,6 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
             plant.step()
         table[step] = plant.read_qpos()
     return table
-
-
-def _plant(robot: Robot, moves: Moves, solver: Physics | None, timestep: float) -> Pack | EquationOfMotion:
-    if solver is None:
-        return EquationOfMotion(robot.dynamics(), robot.damping, moves.start, timestep)
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, timestep, solver)
-    pack = Pack(parse(spec), spec, len(moves.start), system_size=4)
-    pack.write_state(range(pack.size), moves.start, np.zeros_like(moves.start))
-    return pack
 
 
 def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:

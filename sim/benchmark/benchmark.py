@@ -79,21 +79,10 @@ def make_closed_loops(workload: Workload) -> dict[str, Case]:
 def measure_rates(
     workload: Workload, progress: Callable[[str], None] = lambda case: None, peers: Collection[str] = ()
 ) -> dict[str, Result]:
-    """Measure every case ``workload.rounds`` times in turn; the rounds of different cases are paired.
+    """Measure every case and ``peers`` ``workload.rounds`` times in turn; the rounds of different cases are paired.
 
-    Parameters
-    ----------
-    progress
-        Called with the case's name before every round.
-    peers
-        Names in :data:`sim.benchmark.peers.PEERS` to measure as well.
-
-    Raises
-    ------
-    BatchPIDError
-        The robots of a case did not move, or ended elsewhere: its figure would mean nothing.
-    MissingDependencyError
-        The package of a peer is not installed.
+    ``progress`` is called with the case's name before every round. Raises BatchPIDError where the robots of a case did
+    not move or ended elsewhere, and MissingDependencyError where the package of a peer is not installed.
     """
     with ExitStack() as stack:
         cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload)

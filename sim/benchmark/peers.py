@@ -143,13 +143,7 @@ def installed_peers() -> tuple[str, ...]:
 
 
 def make_peers(workload: Workload, names: Collection[str]) -> dict[str, Case]:
-    """Return the peers of these names, ready to run.
-
-    Raises
-    ------
-    MissingDependencyError
-        The package of one is not installed; none is started.
-    """
+    """Return the peers of these names, ready to run; raise MissingDependencyError where a package is missing."""
     for name in names:
         if importlib.util.find_spec(PEERS[name].package) is None:
             raise MissingDependencyError(PEERS[name].package, f"peer {name!r}", "peers")

@@ -23,13 +23,7 @@ Float64 = NDArray[np.float64]
 
 
 def tutorial_settings(robot: Robot) -> Settings:
-    """Return the tutorial's gains, start and target for a bundled robot.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The robot is not bundled.
-    """
+    """Return the tutorial's gains, start and target; raise InvalidArgumentError for a robot that is not bundled."""
     if robot.settings is None:
         raise InvalidArgumentError(
             "robot", f"{robot.name!r} carries no gains and target", remedy=f"use one of {', '.join(Robot.bundled())}"

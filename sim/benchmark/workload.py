@@ -26,12 +26,9 @@ DISTANCE = 0.3
 
 @dataclass(frozen=True)
 class Workload:
-    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps.
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, ``rounds`` times.
 
-    Raises
-    ------
-    InvalidArgumentError
-        The robot is not bundled, so that it carries no gains and target to move with.
+    Raises InvalidArgumentError for a robot that is not bundled: it carries no gains and target.
     """
 
     robot: Robot
@@ -85,13 +82,7 @@ class Workload:
         return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **options)
 
     def check_motion(self, case: str, final: Float64) -> None:
-        """Raise unless the robot at ``final`` (dof,) has moved from the start towards the target.
-
-        Raises
-        ------
-        BatchPIDError
-            It has not; the figures of ``case`` would mean nothing.
-        """
+        """Raise BatchPIDError unless the robot at ``final`` (dof,) has moved from the start towards the target."""
         moved, left = (np.abs(final - place)[self.moving] for place in (self.start, self.target))
         if not np.isfinite(final).all() or moved.min() < 0.1 * DISTANCE or left.max() > DISTANCE:
             raise BatchPIDError(

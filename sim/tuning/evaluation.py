@@ -99,6 +99,17 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     return shared if shared.sum() >= 3 else np.ones(robot.dof, bool)
 
 
+def run_moves(runner: Runner, moves: Moves, seconds: float) -> tuple[Rollout, StepMetrics]:
+    """Run ``moves``, one per env, from rest for ``seconds``; return the rollout and its metrics."""
+    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SetpointWarning)
+        runner.reset(moves.start)
+        rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)))
+    with_effort = runner.control != "drive"
+    return rollout, step_response_metrics(runner.robot, rollout, moves.start, with_effort=with_effort)
+
+
 def evaluate_gains(
     robot: Robot,
     params: bp.PIDParams,
@@ -106,44 +117,23 @@ def evaluate_gains(
     *,
     name: str = "gains",
     seconds: float = 2.0,
-    control: str = "pid",
-    workers: int | None = None,
-    with_chatter: bool = True,
     **runner_options: Any,
 ) -> Evaluation:
     """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
 
-    Parameters
-    ----------
-    params
-        One row for all moves, or one row per move.
-    with_chatter
-        False saves the time of computing the chatter, which is then NaN.
-    runner_options
-        More options of :class:`sim.Runner`.
+    ``params`` have one row for all moves, or one row per move; ``runner_options`` are those of :class:`sim.Runner`.
     """
-    options = {"substeps": SUBSTEPS, **runner_options}
-    with (
-        Runner(robot, len(moves.start), params=params, control=control, workers=workers, **options) as runner,
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore", SetpointWarning)
-        runner.reset(moves.start)
-        ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
-        rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)))
-    metrics = step_response_metrics(robot, rollout, moves.start, with_effort=control != "drive")
+    with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
+        rollout, metrics = run_moves(runner, moves, seconds)
     shortest = shortest_durations(robot, moves)
-    chatter = np.full(moves.start.shape, np.nan)
-    if with_chatter:
-        # The smooth motion takes as long as the slowest arm joint took to settle.
-        settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
-        durations = np.maximum(np.maximum(settled, np.where(np.isfinite(shortest), shortest, 0.0)), 0.1)
-        chatter = metrics.effort_variation / smooth_variation(robot, moves, durations)
+    # The smooth motion to compare with takes as long as the slowest arm joint took to settle.
+    settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
+    durations = np.maximum(np.maximum(settled, np.where(np.isfinite(shortest), shortest, 0.0)), 0.1)
     return Evaluation(
         name=name,
         moves=moves,
         rollout=rollout,
         metrics=metrics,
-        chatter=chatter,
+        chatter=metrics.effort_variation / smooth_variation(robot, moves, durations),
         settling_limit=np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest),
     )

@@ -21,7 +21,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,10 +34,9 @@ from batchpid.files import write_atomically
 from batchpid.stability import stability_bound
 from batchpid.validate import integer, number
 from batchpid.versions import package_versions
-from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.evaluation import SUBSTEPS, absolute_band, step_response_metrics
+from sim.tuning.evaluation import SUBSTEPS, absolute_band, run_moves
 from sim.tuning.moves import Moves, search_moves, smooth_variation
 from sim.tuning.randomization import draw_variation
 from sim.tuning.weights import Weights
@@ -172,8 +170,7 @@ def tune(
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
     points: list[Float64] = []
     began = time.monotonic()
-    with Runner(robot, population * count, **options) as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore", SetpointWarning)
+    with Runner(robot, population * count, **options) as runner:
         bar = (progress or (lambda items: items))(range(generations))
         for generation in bar:
             points += [optimizer.ask() for _ in range(population)]
@@ -237,11 +234,8 @@ class _Search:
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: HEADROOM * limit for name, limit in limits.items() if limit is not None})
         runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
-        start, target = np.tile(moves.start, (count, 1)), np.tile(moves.target, (count, 1))
-        runner.reset(start)
-        ticks = max(10, round(self.seconds / (runner.timestep * runner.substeps)))
-        rollout = runner.rollout(np.broadcast_to(target, (ticks, *target.shape)))
-        m, w = step_response_metrics(self.robot, rollout, start), self.weights
+        rollout, m = run_moves(runner, moves.take(np.tile(np.arange(len(moves.start)), count)), self.seconds)
+        w = self.weights
 
         def bounded(figure: Float64) -> Float64:
             return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)

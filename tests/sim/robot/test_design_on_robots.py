@@ -65,7 +65,6 @@ def test_designed_gains_settle_within_two_seconds(name, units, record_property):
         bp.design_gains(robot, gain_units=units, measurement_rate="measured"),
         moves,
         seconds=2.2,
-        with_chatter=False,
         ground=False,
         physics="fast",
         workers=0,
