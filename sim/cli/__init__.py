@@ -6,7 +6,6 @@ status (None: 0) and imports what loads SAPIEN, Matplotlib or JAX, so that ``--h
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import signal
 import sys
@@ -17,6 +16,7 @@ from typing import Any
 import tyro
 
 from batchpid.errors import BatchPIDError
+from batchpid.versions import package_versions
 from sim.cli.bench import BenchCommand
 from sim.cli.compare import CompareCommand
 from sim.cli.demo import DemoCommand
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         if arguments == ["--version"]:
-            print(_version())
+            print(package_versions(["batchpid"]).get("batchpid", "not installed: running from its source tree"))
             return 0
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -83,13 +83,6 @@ def parse(arguments: Sequence[str]) -> Any:
     )
     about = "Joint-level PID control for many robots at once, in SAPIEN."
     return app.cli(prog="batchpid", description=about, args=arguments, config=options)
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("batchpid")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed: running from its source tree"
 
 
 def _fail(message: str, status: int = 2) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import number
@@ -11,18 +12,13 @@ from sim import Robot
 from sim.cli import flags
 from sim.tuning.gain_sets import gain_set
 
-SUBSTEPS = 10
-"""Sim steps between two samples of the picture."""
-SPREAD = 0.3
-"""Largest distance of a start pose from the tutorial's [rad or m]."""
-
 
 @dataclass(frozen=True)
 class DemoCommand:
     """Move 64 arms to the tutorial's setpoint; print a table of the joints and draw a picture.
 
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where SAPIEN's tutorial
-    does, the others at seeded poses around it.
+    does, the others at seeded poses within 0.3 rad (or m) of it.
     """
 
     robot: flags.RobotName = "panda"
@@ -53,27 +49,14 @@ class DemoCommand:
         settings = robot.settings
         if settings is None:
             raise InvalidArgumentError(
-                "robot",
-                "has no tutorial settings to demonstrate",
-                value=self.robot,
-                remedy=f"use one of {', '.join(Robot.bundled())}, or run: batchpid rollout {self.robot}",
+                "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
-        start = start_poses(robot, self.num_envs, SPREAD, self.seed)
+        start = start_poses(robot, self.num_envs, 0.3, self.seed)
         gains = gain_set(robot, self.gains)
-        timestep = 1 / settings.rate_hz
-        with Runner(
-            robot,
-            self.num_envs,
-            params=gains.params,
-            control=gains.control,
-            workers=self.workers,
-            timestep=timestep,
-            substeps=SUBSTEPS,
-        ) as runner:
-            title = (
-                f"{robot.name}: {self.num_envs} robots, {runner.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-            )
+        title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
+        options: dict[str, Any] = {"params": gains.params, "control": gains.control, "workers": self.workers}
+        with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes", flush=True)
             rollout, wall = hold_setpoint(runner, start, settings.target, seconds)
         print(run_report(runner, rollout, start, wall))

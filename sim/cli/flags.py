@@ -34,13 +34,9 @@ RecordedRobot = Annotated[
     tyro.conf.Positional,
     _flag("Bundled robot, or path of a URDF. Default: that of the recording, or panda."),
 ]
-MissingMeshes = Annotated[
-    Literal["error", "skip"], _flag("Raise an error for collision meshes that are missing, or skip their shapes.")
-]
+MissingMeshes = Annotated[Literal["error", "skip"], _flag("Raise an error for missing meshes, or skip their shapes.")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
-Workers = Annotated[
-    int | None, _flag("Processes that step the scenes; 0: this one. Default: one for each available core.")
-]
+Workers = Annotated[int | None, _flag("Processes that step the scenes; 0: this one. Default: one per available core.")]
 Gains = Annotated[
     str | None,
     _flag(
@@ -58,9 +54,7 @@ GainSets = Annotated[
     ),
 ]
 Physics = Annotated[Literal["accurate", "fast"], _flag("Solver settings: SAPIEN's, or fewer iterations.")]
-Compensate = Annotated[
-    Literal["gravity+coriolis", "gravity", "none"], _flag("Passive force added to the joints at every sim step.")
-]
+Compensate = Annotated[Literal["gravity+coriolis", "gravity", "none"], _flag("Passive force added at every sim step.")]
 Seconds = Annotated[float, _flag("Simulated time [s].")]
 Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]

@@ -7,15 +7,17 @@ from dataclasses import dataclass
 
 from sim import Robot
 from sim.cli import flags
+from sim.tuning.gain_sets import gain_set
 
 HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
 
 
 @dataclass(frozen=True)
 class InspectCommand:
-    """List the joints of a robot in the order of qpos, and what is odd about it."""
+    """List the joints of a robot in the order of qpos, and what is odd about it and about gains."""
 
     robot: flags.RobotName = "panda"
+    gains: flags.Gains = None
     all: flags.Switch = False
     """List the fixed joints too."""
     strict: flags.Switch = False
@@ -28,13 +30,15 @@ class InspectCommand:
         print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
         print(joint_table(robot, fixed_too=self.all) + "\n")
         setpoint = None if robot.settings is None else robot.settings.target
-        findings = robot.check(setpoint=setpoint)
-        of_robot = robot.check(setpoint=setpoint, control="drive")  # without the PID's gains
-        of_gains = [finding for finding in findings if finding not in of_robot]
-        print("\n".join(map(str, of_robot)) or "Nothing odd about it.")
-        if of_gains:
-            print("\nUnder the tutorial's gains, robot.params(); those of robot.tuned() keep the bound:")
-            print("\n".join(map(str, of_gains)))
+        findings = robot.check(setpoint=setpoint, control="drive")  # without gains
+        print("\n".join(map(str, findings)) or "Nothing odd about it.")
+        if self.gains is not None or robot.has_tuned:  # designed gains keep the stability bound
+            gains = gain_set(robot, self.gains)
+            with_gains = robot.check(params=gains.params, setpoint=setpoint, control=gains.control)
+            of_gains = [finding for finding in with_gains if finding not in findings]
+            print(f"\nUnder gains {gains.name}:")
+            print("\n".join(map(str, of_gains)) or "Nothing odd.")
+            findings += of_gains
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 

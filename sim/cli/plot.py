@@ -56,9 +56,5 @@ def _read(path: Path, every: int) -> Rollout:
     rollout = read_recording(path, every=every)
     print(f"{path}{'' if rollout.info.complete else ' (cut short)'}: {rollout.info.robot}, {rollout!r}")
     if not len(rollout.time):
-        raise InvalidArgumentError(
-            "recording",
-            f"{path} holds no tick",
-            remedy="its run was cut short in its first second: run it again",
-        )
+        raise InvalidArgumentError("recording", f"{path} holds no tick", remedy="its run was cut short: run it again")
     return rollout

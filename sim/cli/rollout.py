@@ -11,8 +11,6 @@ from sim import Recorder, Robot, write_recording
 from sim.cli import flags
 from sim.tuning.gain_sets import gain_set
 
-FORMATS = (".npz", ".h5", ".hdf5")
-
 
 @dataclass(frozen=True)
 class RolloutCommand:
@@ -55,14 +53,13 @@ class RolloutCommand:
         from sim.cli.report import run_report
         from sim.cli.run import hold_setpoint, start_poses
 
-        out = flags.output_path("out", self.out, FORMATS)
+        out = flags.output_path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, dissipation=self.dissipation)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
-        goal: Any = self.setpoint
-        if goal is None:
-            goal = robot.start if robot.settings is None else robot.settings.target
+        target = robot.start if robot.settings is None else robot.settings.target
+        goal: Any = target if self.setpoint is None else self.setpoint
         setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
         gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
         with Runner(

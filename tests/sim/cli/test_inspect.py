@@ -58,6 +58,15 @@ def test_strict_fails_on_findings_worse_than_notes(batchpid, odd):
     assert batchpid("inspect", "panda", "--strict")[0] == 0
 
 
+def test_gains_are_checked_too(batchpid):
+    status, out, _ = batchpid("inspect", "jaco2")
+    assert status == 0
+    assert "Under gains tuned:\nNothing odd." in out
+    status, out, _ = batchpid("inspect", "jaco2", "--gains", "tutorial", "--strict")
+    assert status == 1
+    assert "Under gains tutorial:\nwarning:" in out
+
+
 def test_unknown_robot(batchpid):
     status, out, err = batchpid("inspect", "panda2")
     assert (status, out) == (2, "")
