@@ -7,7 +7,6 @@ objects are SAPIEN's own, with its default settings; the Runner uses none of thi
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -75,18 +74,13 @@ class TutorialLoop:
         """Make one sim step: passive force, one PID object per joint, set_qf, scene.step."""
         qf = self.robot.compute_passive_force(gravity=True, coriolis_and_centrifugal=True)
         if self.pids:
-            qf = qf + self._pid_forward(self.robot.get_qpos(), self.scene.get_timestep())
+            errors, dt = self.target - self.robot.get_qpos(), self.scene.get_timestep()
+            qf = qf + np.array([pid.compute(error, dt) for pid, error in zip(self.pids, errors, strict=True)])
         self.robot.set_qf(qf)
         self.scene.step()
 
-    def run(self, steps: int, record: Callable[[NDArray[np.float32]], None] | None = None) -> NDArray[np.float32]:
-        """Make ``steps`` sim steps, calling ``record`` with qpos after each; return the last qpos (dof,)."""
+    def run(self, steps: int) -> NDArray[np.float32]:
+        """Make ``steps`` sim steps; return the last qpos (dof,) [rad or m]."""
         for _ in range(steps):
             self.step()
-            if record is not None:
-                record(self.robot.get_qpos())
         return self.robot.get_qpos()
-
-    def _pid_forward(self, position: NDArray[np.float32], dt: float) -> Float64:
-        errors = self.target - position
-        return np.array([pid.compute(error, dt) for pid, error in zip(self.pids, errors, strict=True)])

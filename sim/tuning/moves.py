@@ -89,12 +89,8 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     """Return ``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
-    whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0.
-
-    Raises
-    ------
-    InvalidArgumentError
-        ``count`` or ``size`` out of range, or the robot touches itself in nearly every pose.
+    whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0. Raises
+    InvalidArgumentError where ``count`` or ``size`` is out of range, or the robot touches itself in nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
     dynamics, rng = robot.dynamics(ground), np.random.default_rng(seed)
@@ -122,10 +118,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
 def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Float64, str] | None]) -> Moves:
     """Return ``count`` moves: the start, target and name that ``draw(moves so far)`` returns, skipping None.
 
-    Raises
-    ------
-    InvalidArgumentError
-        Nearly every draw is None.
+    Raises InvalidArgumentError where nearly every draw is None.
     """
     moves: list[tuple[Float64, Float64, str]] = []
     for _ in range(200 * count + 200):

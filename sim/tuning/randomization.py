@@ -24,21 +24,11 @@ def draw_variation(
     resolution: float = 2 * np.pi / 2**18,
     late: bool = True,
 ) -> Variation:
-    """Return a variation for ``num_envs`` envs, with payload and friction drawn uniformly from 0.
+    """Return a variation for ``num_envs`` envs, with payload and friction drawn uniformly.
 
-    Parameters
-    ----------
-    payload
-        Largest payload [kg], or what the robot can carry (:func:`payload_capacity`) if that is less.
-    friction
-        Largest joint friction (PhysX's coefficient).
-    resolution, late
-        As in :class:`sim.engine.variation.Variation`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A number is out of range.
+    Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; joint friction from 0
+    to ``friction`` (PhysX's coefficient). ``resolution`` and ``late`` are those of :class:`Variation`. Raises
+    InvalidArgumentError for a number out of range.
     """
     num_envs, seed = integer("num_envs", num_envs, 1, 1_000_000), integer("seed", seed, 0, 2**63 - 1)
     payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "1")

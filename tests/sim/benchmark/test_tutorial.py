@@ -13,8 +13,7 @@ def test_runner_follows_the_tutorials_loop():
     robot = Robot.load("panda", dissipation="sapien")
     settings = robot.settings
     loop = TutorialLoop(robot, settings.target)
-    recorded = []
-    loop.run(2000, recorded.append)
+    recorded = [loop.run(1) for _ in range(2000)]
 
     params = bp.presets.tutorial(robot.dof, settings.kp, settings.ki, settings.kd)
     with Runner(robot, 2, params=params, workers=0, substeps=1) as runner:
