@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,14 +18,13 @@ from sim.engine.physics import Physics
 from sim.engine.user_content import Build, HeadlessScene
 from sim.robot.description import DISSIPATION, Joint
 
-GRAVITY = (0.0, 0.0, -9.81)
-
 
 @dataclass(frozen=True)
 class SceneSpec:
     """Everything that a scene is built from, picklable.
 
     ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` are the degrees of freedom in SAPIEN's order.
+    Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
@@ -36,8 +35,8 @@ class SceneSpec:
     dissipation: str = "urdf"
     ground: bool = True
     fixed_base: bool = True
-    build: Build | None = None
-    gravity: tuple[float, float, float] = GRAVITY
+    build: Build | None = field(default=None, compare=False)
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
 def parse(spec: SceneSpec) -> ArticulationBuilder:
@@ -115,26 +114,15 @@ def headless_scene(system: Any = None) -> HeadlessScene:
 def engine_settings(spec: SceneSpec) -> Iterator[None]:
     """Apply ``spec`` to SAPIEN's process-wide settings, and restore the caller's at the end.
 
-    Every setting is given, so that a result does not depend on what the caller's process did before.
+    Every setting is overwritten, so that a result does not depend on what the caller's process did before.
     """
     scene, body = physx.get_scene_config(), physx.get_body_config()
     shape, material = physx.get_shape_config(), physx.get_default_material()
-    physx.set_scene_config(
-        gravity=np.array(spec.gravity, np.float32),
-        bounce_threshold=2.0,
-        enable_pcm=True,
-        enable_tgs=spec.physics.solver == "TGS",
-        enable_ccd=False,
-        enable_enhanced_determinism=False,
-        enable_friction_every_iteration=True,
-        cpu_workers=0,
-    )
-    physx.set_body_config(
-        solver_position_iterations=spec.physics.position_iterations,
-        solver_velocity_iterations=spec.physics.velocity_iterations,
-        sleep_threshold=0.0,
-    )
-    physx.set_shape_config(contact_offset=0.01, rest_offset=0.0)
+    # Settings that are not given get SAPIEN's defaults.
+    gravity = np.array(spec.gravity, np.float32)
+    physx.set_scene_config(gravity=gravity, enable_tgs=spec.physics.solver == "TGS")
+    physx.set_body_config(spec.physics.position_iterations, spec.physics.velocity_iterations, sleep_threshold=0.0)
+    physx.set_shape_config()
     physx.set_default_material(0.3, 0.3, 0.1)
     try:
         yield
@@ -145,19 +133,30 @@ def engine_settings(spec: SceneSpec) -> Iterator[None]:
         physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
 
 
-def build_robot(builder: ArticulationBuilder, scene: HeadlessScene, spec: SceneSpec) -> Any:
-    """Return the robot, built in ``scene`` with the dissipation that ``spec`` asks for.
+def new_system(spec: SceneSpec) -> Any:
+    """Return a new PhysX system, which has the solver, gravity and time step of ``spec``."""
+    with engine_settings(spec):
+        system = physx.PhysxCpuSystem()
+    system.timestep = spec.timestep
+    return system
+
+
+def build_scene(builder: ArticulationBuilder, spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
+    """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of ``spec``.
 
     Raises
     ------
     RobotError
         SAPIEN numbers the joints in another order than ours.
     """
-    builder.set_scene(scene)
-    robot = builder.build()
+    scene = headless_scene(system)
+    with engine_settings(spec):
+        robot = builder.set_scene(scene).build()
+        if spec.ground:
+            scene.add_ground(0.0, render=False)
     names, ours = [joint.name for joint in robot.active_joints], [joint.name for joint in spec.joints]
     if names != ours:
-        raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}")
+        raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF")
     robot.set_sleep_threshold(0.0)
     dissipation = DISSIPATION[spec.dissipation]
     for link in robot.links:
@@ -166,7 +165,7 @@ def build_robot(builder: ArticulationBuilder, scene: HeadlessScene, spec: SceneS
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
         # SAPIEN parses <dynamics friction> and never applies it.
         built.set_friction(joint.friction if dissipation.joint_friction is None else dissipation.joint_friction)
-    return robot
+    return scene, robot
 
 
 def link_extents(robot: Any) -> list[LinkExtent]:

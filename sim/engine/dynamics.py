@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sapien import physx
 
-from sim.engine.building import SceneSpec, build_robot, engine_settings, headless_scene, parse, rigid_bodies
+from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies
 from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
 from sim.robot.description import RobotDescription
@@ -25,14 +24,8 @@ class Dynamics:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        builder = parse(spec)
-        with engine_settings(spec):
-            self._system = physx.PhysxCpuSystem()
-            self._system.timestep = 1e-6
-            self._scene = headless_scene(self._system)
-            self._robot = build_robot(builder, self._scene, spec)
-            if spec.ground:
-                self._scene.add_ground(0.0, render=False)
+        builder, self._system = parse(spec), new_system(replace(spec, timestep=1e-6))
+        self._scene, self._robot = build_scene(builder, spec, self._system)
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
         bodies = rigid_bodies(builder)
@@ -41,10 +34,7 @@ class Dynamics:
 
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
-        matrices = np.empty((*np.shape(qpos), self._robot.dof))
-        for matrix, row in zip(matrices, np.asarray(qpos, np.float64), strict=True):
-            matrix[...] = self._model.compute_generalized_mass_matrix(row)
-        return matrices
+        return _rowwise(self._model.compute_generalized_mass_matrix, qpos)
 
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
@@ -83,13 +73,9 @@ def _rowwise(compute: Any, *tables: NDArray[Any]) -> Float64:
     return np.array([compute(*row) for row in zip(*(np.asarray(table, np.float64) for table in tables), strict=True)])
 
 
-def scene_dynamics(spec: SceneSpec) -> Dynamics:
-    """Return the dynamics of the robot of ``spec``, the same object for equal specs; ``spec.build`` is left out."""
-    return _cached_dynamics(replace(spec, build=None))
-
-
 @lru_cache(maxsize=8)
-def _cached_dynamics(spec: SceneSpec) -> Dynamics:
+def scene_dynamics(spec: SceneSpec) -> Dynamics:
+    """Return the dynamics of the robot of ``spec``, the same object for equal specs."""
     return Dynamics(spec)
 
 

@@ -15,17 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from sim.engine.building import (
-    SceneSpec,
-    build_robot,
-    engine_settings,
-    headless_scene,
-    link_extents,
-    set_collision_group,
-)
+from sim.engine.building import SceneSpec, build_scene, engine_settings, link_extents, new_system, set_collision_group
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.root_state import read_root, write_root
@@ -62,15 +54,15 @@ class Pack:
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates
-        systems = [_system(spec) for _ in range(-(-size // shared))]
+        systems = [new_system(spec) for _ in range(-(-size // shared))]
         self._shared_systems = [systems[row // shared] for row in range(size)]
         self.systems = list(self._shared_systems)
-        with engine_settings(spec):
-            built = [self._build(row, system) for row, system in enumerate(self.systems)]
-            # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
-            self._scenes, self.robots = map(list, zip(*built, strict=True))
-            self._contents = []
-            if spec.build is not None:
+        built = [self._build(row, system) for row, system in enumerate(self.systems)]
+        # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
+        self._scenes, self.robots = map(list, zip(*built, strict=True))
+        self._contents = []
+        if spec.build is not None:
+            with engine_settings(spec):
                 envs = enumerate(self._scenes, start=first_env)
                 self._contents = [SceneContent(spec.build, scene, env) for env, scene in envs]
         for row, scene in enumerate(self._scenes):
@@ -85,16 +77,12 @@ class Pack:
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``."""
-        scene = headless_scene(system)
-        robot = build_robot(self._builder, scene, self._spec)
-        if self._spec.ground:
-            scene.add_ground(0.0, render=False)
-        return scene, robot
+        return build_scene(self._builder, self._spec, system)
 
     def _bind(self) -> None:
         """Store the bound methods that every sim step calls, which is cheaper than looking them up."""
         robots = self.robots
-        self._joints = [robot.active_joints for robot in robots]
+        self._joints = [joint for robot in robots for joint in robot.active_joints]
         self._get_qpos = [robot.get_qpos for robot in robots]
         self._get_qvel = [robot.get_qvel for robot in robots]
         self._passive_force = [robot.compute_passive_force for robot in robots]
@@ -128,7 +116,7 @@ class Pack:
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
-        self._rebuild({row: _system(self._spec) for row in rows if self._isolates and not self.isolated[row]})
+        self._rebuild({row: new_system(self._spec) for row in rows if self._isolates and not self.isolated[row]})
 
     def _assign_systems(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
         """Assign systems to robots that were placed: the shared one, or a new one where contact is predicted.
@@ -141,7 +129,7 @@ class Pack:
             if state not in predicted:
                 predicted[state] = self._predictor.predicts_contact(dynamics.near_pairs(position), velocity)
             if predicted[state]:
-                systems[row] = _system(self._spec)
+                systems[row] = new_system(self._spec)
             elif self.isolated[row]:
                 systems[row] = self._shared_systems[row]
         self._rebuild(systems)
@@ -150,8 +138,7 @@ class Pack:
         """Rebuild the robots of some rows in these systems, in their present state."""
         for row, system in systems.items():
             old, old_scene = self.robots[row], self._scenes[row]
-            with engine_settings(self._spec):
-                scene, new = self._build(row, system)
+            scene, new = self._build(row, system)
             set_collision_group(scene, row + 1)
             new.set_qpos(old.get_qpos())
             new.set_qvel(old.get_qvel())
@@ -160,8 +147,7 @@ class Pack:
                 joint.set_drive_properties(before.stiffness, before.damping, before.force_limit, before.drive_mode)
                 joint.set_drive_target(before.drive_target)
                 joint.set_drive_velocity_target(before.drive_velocity_target)
-            if self._suspended[row]:
-                _disable_gravity(new, True)
+            _disable_gravity(new, bool(self._suspended[row]))
             old_scene.clear()
             self.systems[row], self._scenes[row], self.robots[row] = system, scene, new
             self.isolated[row] = system is not self._shared_systems[row]
@@ -248,20 +234,17 @@ class Pack:
         The URDF's joint damping, which SAPIEN also implements as drive damping, is added to ``damping``.
         """
         limit = np.minimum(force_limit, np.finfo(np.float32).max)
-        tables = (np.broadcast_to(table, self.qf.shape) for table in (stiffness, damping + self._damping, limit))
-        for joints, *rows in zip(self._joints, *tables, strict=True):
-            for joint, *values in zip(joints, *rows, strict=True):
-                joint.set_drive_properties(*map(float, values), "force")
+        tables = (np.broadcast_to(table, self.qf.shape).flat for table in (stiffness, damping + self._damping, limit))
+        for joint, *values in zip(self._joints, *tables, strict=True):
+            joint.set_drive_properties(*map(float, values), "force")
 
     def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
-        for joints, row in zip(self._joints, position.tolist(), strict=True):
-            for joint, target in zip(joints, row, strict=True):
-                joint.set_drive_target(target)
+        for joint, target in zip(self._joints, position.ravel().tolist(), strict=True):
+            joint.set_drive_target(target)
         if velocity is not None:
-            for joints, row in zip(self._joints, velocity.tolist(), strict=True):
-                for joint, target in zip(joints, row, strict=True):
-                    joint.set_drive_velocity_target(target)
+            for joint, target in zip(self._joints, velocity.ravel().tolist(), strict=True):
+                joint.set_drive_velocity_target(target)
 
     def close(self) -> None:
         """Free the scenes. The pack cannot be used afterwards."""
@@ -272,11 +255,3 @@ class Pack:
 def _disable_gravity(robot: Any, disabled: bool) -> None:
     for link in robot.links:
         link.disable_gravity = disabled
-
-
-def _system(spec: SceneSpec) -> Any:
-    """Return a new PhysX system; solver and gravity are the system's."""
-    with engine_settings(spec):
-        system = physx.PhysxCpuSystem()
-    system.timestep = spec.timestep
-    return system

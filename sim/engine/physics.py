@@ -7,11 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Physics:
-    """Solver settings of a PhysX scene.
-
-    ``solver`` is ``"TGS"`` (temporal Gauss-Seidel) or ``"PGS"`` (projected Gauss-Seidel);
-    ``position_iterations`` and ``velocity_iterations`` are counted per sim step.
-    """
+    """Solver of a PhysX scene, "TGS" or "PGS" (temporal or projected Gauss-Seidel), and its iterations per sim step."""
 
     solver: str
     position_iterations: int

@@ -57,18 +57,16 @@ class SceneContent:
                     self._bodies.append((entity, component))
                 elif isinstance(component, PhysxArticulationLinkComponent) and component.is_root:
                     self._articulations.append(component.articulation)
-        self._start = self._read(at_rest=True)
+        self._start = self.read(at_rest=True)
         self.size = self._start.size
 
     def reset(self) -> None:
         """Put everything that moves where ``build`` left it, at rest."""
         self.write(self._start)
 
-    def read(self) -> NDArray[np.float32]:
-        """Return the state of everything that moves (size,)."""
-        return self._read()
+    def read(self, at_rest: bool = False) -> NDArray[np.float32]:
+        """Return the state of everything that moves (size,), with zero velocities if ``at_rest``."""
 
-    def _read(self, at_rest: bool = False) -> NDArray[np.float32]:
         def velocity(values: Any) -> Any:
             return np.zeros_like(values) if at_rest else values
 

@@ -10,7 +10,7 @@ from robots import load_bundled
 
 from sim import Runner
 from sim.benchmark.accuracy import contact_moves
-from sim.engine.building import SceneSpec, build_robot, engine_settings, headless_scene, link_extents, parse
+from sim.engine.building import SceneSpec, build_scene, link_extents, new_system, parse
 from sim.engine.contact_prediction import (
     LOOKAHEAD_STEPS,
     MAX_ACCELERATION,
@@ -90,9 +90,7 @@ def test_prediction_has_no_order_and_more_speed_predicts_no_less(pairs, qvel, ra
 def test_no_link_is_faster_than_its_reach_allows(name):
     robot = load_bundled(name)
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS["fast"])
-    scene = headless_scene()
-    with engine_settings(spec):
-        built = build_robot(parse(spec), scene, spec)
+    _scene, built = build_scene(parse(spec), spec, new_system(spec))
     reach = ContactPredictor(link_extents(built), robot.dof, DT).reach[:-1]
     body = Kinematics(robot)
     order = [body.index(link.name) for link in built.links]
