@@ -69,10 +69,10 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
 
 def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
     """Yield a line on envs that diverged, one on joints that did not settle, and those of :func:`limit_lines`."""
-    seconds, num_envs = rollout.time[-1], rollout.num_envs
+    seconds, num_envs = rollout.tick * len(rollout.time), rollout.num_envs
     diverged = np.flatnonzero(~rollout.ok.all(0))
     if diverged.size:
-        first = rollout.time[np.argmin(rollout.ok[:, diverged].all(1))]
+        first = rollout.tick * (1 + np.argmin(rollout.ok[:, diverged].all(1)))
         more = f" and {diverged.size - 8} more" if diverged.size > 8 else ""
         yield (
             f"DIVERGED: {diverged.size} of {num_envs} envs are no longer finite, the first after {first:.3g} s: "
