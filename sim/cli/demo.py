@@ -37,7 +37,6 @@ class DemoCommand:
     def run(self) -> None:
         """Run the command."""
         from sim import Runner, plots
-        from sim.cli.report import run_report
         from sim.cli.run import hold_setpoint, start_poses
 
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
@@ -58,8 +57,8 @@ class DemoCommand:
         options: dict[str, Any] = {"params": gains.params, "control": gains.control, "workers": self.workers}
         with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes", flush=True)
-            rollout, wall = hold_setpoint(runner, start, settings.target, seconds)
-        print(run_report(runner, rollout, start, wall))
+            rollout, report = hold_setpoint(runner, start, settings.target, seconds)
+        print(report)
         for note in settings.notes:
             print(f"Note: {note}")
         figure = plots.step_responses(rollout, mark=0, title=f"{title}; env 0 from the tutorial's pose")

@@ -13,7 +13,7 @@ from tabulate import tabulate
 
 from batchpid.metrics import StepMetrics
 from sim import Robot, Rollout, Runner
-from sim.tuning.evaluation import Evaluation, arm_joints, step_response_metrics
+from sim.tuning.evaluation import Evaluation, arm_joints
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
@@ -22,13 +22,11 @@ def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> 
     return tabulate(rows, headers, disable_numparse=True, colalign=sides)
 
 
-def run_report(runner: Runner, rollout: Rollout, start: NDArray[np.float64], wall: float) -> str:
-    """Return the report of a ``rollout`` of ``runner`` from ``start`` (envs, dof) that took ``wall`` seconds."""
-    robot = runner.robot
-    metrics = step_response_metrics(robot, rollout, start)
+def run_report(runner: Runner, rollout: Rollout, metrics: StepMetrics, wall: float) -> str:
+    """Return the report of a ``rollout`` of ``runner`` that took ``wall`` seconds."""
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
-    outcome = "\n".join(outcome_lines(robot, rollout, metrics))
-    return f"{speed}\n\n{joint_table(robot, metrics)}\n\n{outcome}"
+    outcome = "\n".join(outcome_lines(runner.robot, rollout, metrics))
+    return f"{speed}\n\n{joint_table(runner.robot, metrics)}\n\n{outcome}"
 
 
 def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:
@@ -44,7 +42,7 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
     """Return a table with final error, overshoot, settling time and saturation of each joint over the envs."""
     median, worst = metrics.median(), metrics.worst()
     settled = np.isfinite(metrics.settling_time).sum(0)
-    saturation = np.nan_to_num(metrics.saturation_share).mean(0)
+    saturation = metrics.saturation_share.mean(0)
 
     def both(figure: str, joint: int, *style: str) -> str:
         return " / ".join(_cell(getattr(metrics, figure)[joint], *style) for metrics in (median, worst))

@@ -50,7 +50,6 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from sim import Runner, plots
-        from sim.cli.report import run_report
         from sim.cli.run import hold_setpoint, start_poses
 
         out = flags.output_path("out", self.out, (".npz", ".h5", ".hdf5"))
@@ -75,8 +74,8 @@ class RolloutCommand:
         ) as runner:
             streamed = out is not None and out.suffix != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():
-                rollout, wall = hold_setpoint(runner, start, setpoint, seconds)
-        print(run_report(runner, rollout, start, wall))
+                rollout, report = hold_setpoint(runner, start, setpoint, seconds)
+        print(report)
         if out:
             if not streamed:
                 write_recording(rollout, out, seed=self.seed, overwrite=True)

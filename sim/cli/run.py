@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,11 @@ from tqdm import tqdm
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer, number
-from sim import Robot, Rollout, Runner, SetpointWarning, read_recording
-from sim.tuning.evaluation import Evaluation, evaluate_gains
+from sim import Robot, Rollout, Runner, read_recording
+from sim.cli.report import run_report
+from sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from sim.tuning.gain_sets import GainSet
-from sim.tuning.moves import random_moves, tutorial_move
+from sim.tuning.moves import Moves, random_moves, tutorial_move
 from sim.tuning.randomization import draw_variation
 
 
@@ -44,19 +44,12 @@ def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArra
     return np.clip(poses, robot.lower, robot.upper)
 
 
-def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], seconds: float) -> tuple[Rollout, float]:
-    """Reset ``runner`` to ``start`` and hold ``setpoint``, each (dof,) or (envs, dof), for ``seconds``.
-
-    Runs whole ticks, two at least, under a progress bar. Returns the rollout and the wall-clock time it took [s].
-    """
-    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
-    setpoints = np.broadcast_to(setpoint, (ticks, runner.num_envs, runner.robot.dof))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SetpointWarning)  # the report lists setpoints out of limits
-        runner.reset(qpos=start)
-        began = time.perf_counter()
-        rollout = runner.rollout(setpoints, progress=bar("simulating", unit="tick"))
-        return rollout, time.perf_counter() - began
+def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], seconds: float) -> tuple[Rollout, str]:
+    """Hold ``setpoint`` (dof,) from ``start`` (envs, dof) for ``seconds``; return the rollout and a report on it."""
+    moves = Moves(start, np.broadcast_to(setpoint, start.shape), ("to the setpoint",) * len(start))
+    began = time.perf_counter()
+    rollout, metrics = run_moves(runner, moves, seconds, bar("simulating", unit="tick"))
+    return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
 
 
 def evaluate_sets(

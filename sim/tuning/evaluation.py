@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,13 +100,18 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     return shared if shared.sum() >= 3 else np.ones(robot.dof, bool)
 
 
-def run_moves(runner: Runner, moves: Moves, seconds: float) -> tuple[Rollout, StepMetrics]:
-    """Run ``moves``, one per env, from rest for ``seconds``; return the rollout and its metrics."""
+def run_moves(
+    runner: Runner, moves: Moves, seconds: float, progress: Callable[[Iterable[int]], Iterable[int]] | None = None
+) -> tuple[Rollout, StepMetrics]:
+    """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
+
+    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``.
+    """
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
         runner.reset(moves.start)
-        rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)))
+        rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)), progress=progress)
     with_effort = runner.control != "drive"
     return rollout, step_response_metrics(runner.robot, rollout, moves.start, with_effort=with_effort)
 

@@ -78,6 +78,13 @@ def test_the_default_gains_settle_and_the_tutorial_s_do_not(batchpid):
     assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "tutorial")[1]
 
 
+def test_the_efforts_of_a_drive_are_unknown(batchpid):
+    lines = batchpid("rollout", *SHORT, "--gains", "drive")[1].splitlines()
+    rows = [line for line in lines if line.startswith("panda_")]
+    assert len(rows) == 9
+    assert all(row.split()[-1] == "-" for row in rows)
+
+
 def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, panda):
     path = tmp_path / "arm.urdf"
     path.write_text(panda.path.read_text())
