@@ -1,7 +1,8 @@
-"""The law on NumPy and on JAX, as :class:`batchpid.BatchPID` calls it: how to run it fast, and nothing else."""
+"""The law on NumPy and on JAX, run fast, as :class:`batchpid.BatchPID` calls it."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,47 +14,44 @@ from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
 LARGE = 2**18
-"""Envs from which JAX's CPU backend does them block by block: its own buffers then come from the system each time."""
+"""Number of envs from which JAX's CPU backend steps block by block: there its own buffers are mapped anew each time."""
 
 
 class NumPyBackend:
-    """Runs the law on NumPy, with the coefficients at hand and spread over all envs."""
+    """The law on NumPy, with coefficients that are computed once and spread over all envs."""
 
     def __init__(self, dt: float, terms: bool) -> None:
         self.dt, self.terms = dt, terms
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
-        """Take these params for (envs, joints) ``shape``."""
+        """Take params for (envs, joints) ``shape``."""
         self.params, self.dtype = params, params.dtype
         self.coefficients = discretise(params, self.dt, shape[0])
 
     def array(self, value: Any) -> Any:
-        """Return ``value`` as an array that the backend steps on."""
+        """Return ``value`` as an array of this backend."""
         return np.asarray(value, dtype=self.dtype)
 
     def init(self, y: Any) -> PIDState:
         """Return the state at a first measurement."""
         return law.init(self.params, y)
 
-    def step(
-        self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
-    ) -> tuple[PIDState, Any, Terms | None]:
-        """Return the new state, the effort, and the terms where they are kept."""
-        new, effort, *terms = law.advance(self.coefficients, state, r, y, y_rate, r_rate, ff, self.terms)
+    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
+        """Return the new state, the effort, and the terms if they are kept."""
+        new, effort, *terms = law.advance(self.coefficients, state, *inputs, terms=self.terms)
         return new, effort, terms[0] if terms else None
 
-    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
-        """Return the state with the envs of ``mask`` begun anew."""
+    def reset(self, state: PIDState, y: Any, mask: Any, *, keep_integral: bool) -> PIDState:
+        """Return the state with the envs of ``mask`` restarted."""
         return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
 
-    def track(self, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any) -> PIDState:
+    def track(self, state: PIDState, r: Any, y: Any, u: Any, **inputs: Any) -> PIDState:
         """Return the state whose next step gives the effort ``u``."""
-        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-        return bumpless.track(self.params, state, r, y, u, dt=self.dt, feedforward=ff, **rates)
+        return bumpless.track(self.params, state, r, y, u, dt=self.dt, **inputs)
 
 
 class JAXBackend:
-    """Runs the law compiled by JAX: once per structure of params and inputs, the state's buffers donated.
+    """The law compiled by JAX: once per structure of params and inputs, with the state's buffers donated.
 
     A call costs JAX some 4 us per array, so the params that all envs share travel as one.
     """
@@ -63,53 +61,38 @@ class JAXBackend:
             import jax
         except ImportError:
             raise MissingDependencyError("jax", "backend='jax'", "jax") from None
-        from batchpid.blocks import advance_in_blocks
+        from batchpid import blocks
 
         self.jax, self.terms = jax, terms
-        self._spare: PIDState | None = None  # the state before the last, to write over
+        self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
-        def step(
-            params: PIDParams, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
-        ) -> tuple[PIDState, Any, Terms | None]:
-            k = discretise(params, dt)
-            new, effort, *shown = law.advance(k, state, r, y, y_rate, r_rate, ff, terms)
+        def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
+            new, effort, *shown = law.advance(discretise(params, dt), state, *inputs, terms=terms)
             return new, effort, shown[0] if shown else None
 
         def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:
             out = (spare, jax.numpy.zeros_like(inputs[1]))
-            return advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
-
-        def reset(params: PIDParams, state: PIDState, y: Any, mask: Any) -> PIDState:
-            return law.reset(params, state, y, mask)
-
-        def reset_but_integral(params: PIDParams, state: PIDState, y: Any, mask: Any) -> PIDState:
-            return law.reset(params, state, y, mask, keep_integral=True)
-
-        def track(
-            params: PIDParams, state: PIDState, r: Any, y: Any, u: Any, y_rate: Any, r_rate: Any, ff: Any
-        ) -> PIDState:
-            rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate}
-            return bumpless.track(params, state, r, y, u, dt=dt, feedforward=ff, **rates)
+            return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
 
         self._init = self._compiled(law.init)
         self._step = self._compiled(step, donate_argnums=3)
         self._step_in_blocks = self._compiled(step_in_blocks, donate_argnums=3)
-        self._reset, self._reset_but_integral = self._compiled(reset), self._compiled(reset_but_integral)
-        self._track = self._compiled(track)
+        self._reset = self._compiled(law.reset, static_argnames="keep_integral")
+        self._track = self._compiled(partial(bumpless.track, dt=dt))
 
     def _compiled(self, function: Any, **options: Any) -> Any:
         """Return a function of params and more, compiled as one of packed params: layout, shared, own."""
 
-        def packed(layout: Any, shared: Any, own: Any, *inputs: Any) -> Any:
+        def packed(layout: Any, shared: Any, own: Any, *inputs: Any, **named: Any) -> Any:
             tree, is_shared = layout
             shared, own = iter(shared), iter(own)
             leaves = [next(shared if one else own) for one in is_shared]
-            return function(self.jax.tree.unflatten(tree, leaves), *inputs)
+            return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
         return self.jax.jit(packed, static_argnums=0, **options)
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
-        """Take these params for (envs, joints) ``shape``."""
+        """Take params for (envs, joints) ``shape``."""
         jnp = self.jax.numpy
         leaves, tree = self.jax.tree.flatten(params)
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
@@ -120,23 +103,20 @@ class JAXBackend:
         self.dtype, self._spare = self.packed[1].dtype, None
 
     def array(self, value: Any) -> Any:
-        """Return ``value`` as an array that the backend steps on."""
-        if isinstance(value, self.jax.Array) and value.dtype == self.dtype:
-            return value
-        return np.asarray(value, dtype=self.dtype)
+        """Return ``value`` as an array of this backend."""
+        fits = isinstance(value, self.jax.Array) and value.dtype == self.dtype
+        return value if fits else np.asarray(value, dtype=self.dtype)
 
     def init(self, y: Any) -> PIDState:
         """Return the state at a first measurement."""
         return self._init(*self.packed, y)
 
-    def step(
-        self, state: PIDState, r: Any, y: Any, y_rate: Any, r_rate: Any, ff: Any
-    ) -> tuple[PIDState, Any, Terms | None]:
-        """Return the new state, the effort, and the terms where they are kept."""
+    def step(self, state: PIDState, r: Any, y: Any, *rates: Any) -> tuple[PIDState, Any, Terms | None]:
+        """Return the new state, the effort, and the terms if they are kept."""
         if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
-            return self._step(*self.packed, state, r, y, y_rate, r_rate, ff)
+            return self._step(*self.packed, state, r, y, *rates)
         spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
-        new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, y_rate, r_rate, ff)
+        new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
         self._spare = state
         return new, effort, None
 
@@ -144,11 +124,10 @@ class JAXBackend:
         devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]
         return [device.platform for device in devices] == ["cpu"]
 
-    def reset(self, state: PIDState, y: Any, mask: Any, keep_integral: bool) -> PIDState:
-        """Return the state with the envs of ``mask`` begun anew."""
-        function = self._reset_but_integral if keep_integral else self._reset
-        return function(*self.packed, state, y, mask)
+    def reset(self, state: PIDState, y: Any, mask: Any, *, keep_integral: bool) -> PIDState:
+        """Return the state with the envs of ``mask`` restarted."""
+        return self._reset(*self.packed, state, y, mask, keep_integral=keep_integral)
 
-    def track(self, state: PIDState, *inputs: Any) -> PIDState:
+    def track(self, state: PIDState, r: Any, y: Any, u: Any, **inputs: Any) -> PIDState:
         """Return the state whose next step gives the effort ``u``."""
-        return self._track(*self.packed, state, *inputs)
+        return self._track(*self.packed, state, r, y, u, **inputs)

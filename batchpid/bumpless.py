@@ -24,7 +24,7 @@ def track(
     setpoint_rate: Any = None,
     feedforward: Any = None,
 ) -> PIDState:
-    """Set the integral so that the next step, on these same inputs, gives ``effort``: bumpless transfer.
+    """Return the state whose next step, on these same inputs, gives ``effort``: its integral makes up the difference.
 
     Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
     effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
@@ -36,7 +36,9 @@ def track(
         If the params have no integral (ki is None), or integrate first and dt is missing.
     """
     if params.ki is None:
-        raise no_integral()
+        raise InvalidArgumentError(
+            "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"
+        )
     if params.integration is not None and dt is None:
         raise InvalidArgumentError("dt", "is needed where the params integrate first", remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
@@ -59,11 +61,4 @@ def track(
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
         effort=None if state.effort is None else zero + effort,
         origin=origin,
-    )
-
-
-def no_integral() -> InvalidArgumentError:
-    """Return the error of tracking without an integral."""
-    return InvalidArgumentError(
-        "params.ki", "is off, so nothing can carry the effort over", remedy="give ki; 0 is allowed"
     )

@@ -49,6 +49,7 @@ def advance_with_mass_matrix(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
+    *,
     terms: bool = False,
 ) -> Any:
     """Do one step of the law in accelerations; return efforts. Otherwise as :func:`batchpid.advance`.
@@ -63,7 +64,7 @@ def advance_with_mass_matrix(
     xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
     low, high = k.effort_min, k.effort_max
     free = k._replace(effort_min=None, effort_max=None)
-    new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, None, terms)
+    new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, terms=terms)
     wanted = _multiply(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     share = None

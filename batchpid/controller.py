@@ -1,26 +1,26 @@
-"""BatchPID: the stateful shell over the law, on NumPy or JAX. It owns the state and checks what comes in."""
+"""BatchPID: the law with its state, on NumPy or JAX; arguments are checked here."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from batchpid.backends import JAXBackend, NumPyBackend
-from batchpid.bumpless import no_integral
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
+from batchpid.validate import choice, env_mask, instance, integer, names, positive
 
 BACKENDS = ("numpy", "jax")
+MOST_ENVS = 2**31
 
 
 class BatchPID:
-    """A PID controller of (num_envs, joints) loops that remembers its state between calls.
+    """PID controller of (num_envs, joints) loops that keeps its state between calls.
 
-    It starts from the first measurement it sees. Efforts come as arrays of the backend, in the params' dtype.
+    It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype.
 
     Parameters
     ----------
@@ -56,26 +56,18 @@ class BatchPID:
         terms: bool = False,
         joint_names: Sequence[str] | None = None,
     ) -> None:
-        if not isinstance(backend, str) or backend not in BACKENDS:
-            raise InvalidArgumentError(
-                "backend", "is unknown", value=backend, remedy=f"choose from {', '.join(BACKENDS)}"
-            )
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise InvalidArgumentError(
-                "num_envs", "is not a whole number >= 1", value=num_envs, remedy="give the number of envs"
-            )
-        if isinstance(dt, bool) or not isinstance(dt, int | float | np.floating) or not 0 < dt <= sys.float_info.max:
-            raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
-        if not isinstance(params, PIDParams):
-            raise _no_params(params)
-        self._dt, self._backend, self._names = float(dt), backend, joint_names
-        self._shape = (int(num_envs), params.num_joints)
-        self._engine = NumPyBackend(self._dt, terms) if backend == "numpy" else JAXBackend(self._dt, terms)
-        self._keeps_terms = terms
+        self._backend, self._dt, self._keeps_terms = (
+            choice("backend", backend, BACKENDS),
+            positive("dt", dt, "s"),
+            terms,
+        )
+        self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
+        self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
+        self._engine = (NumPyBackend if backend == "numpy" else JAXBackend)(self._dt, terms)
         self._state: PIDState | None = None
         self._stale = False  # whether the state may lack leaves that the params now need
         self._terms: Terms | None = None
-        self._params: PIDParams | None = None
+        self._params = params
         self.params = params
 
     def __repr__(self) -> str:
@@ -105,40 +97,33 @@ class BatchPID:
 
     @property
     def params(self) -> PIDParams:
-        """The parameters. Assign others at any time: they are checked, and the state carries on.
+        """Params of the law. Assign others at any time: they are checked, and the state is kept.
 
         A change of ki, limits or times makes no bump, since the integral is an effort. A change of kp or kd does,
         unless :meth:`track` follows it with the last effort.
         """
-        assert self._params is not None
         return self._params
 
     @params.setter
     def params(self, params: PIDParams) -> None:
-        if not isinstance(params, PIDParams):
-            raise _no_params(params)
-        if params.num_joints != self.num_joints:
-            raise InvalidArgumentError(
-                "params", f"hold {params.num_joints} joints, not {self.num_joints}", remedy="give one gain per joint"
-            )
+        if _checked(params).num_joints != self.num_joints:
+            problem = f"hold {params.num_joints} joints, not {self.num_joints}"
+            raise InvalidArgumentError("params", problem, remedy="give one gain per joint")
         params.check(self.num_envs, self._names)
-        if self._params is not None and params.dtype != self._params.dtype:
-            raise InvalidArgumentError(
-                "params",
-                f"are {params.dtype}, the controller's {self._params.dtype}",
-                remedy="build them with that dtype, or a new BatchPID",
-            )
+        if params.dtype != self._params.dtype:
+            problem = f"are {params.dtype}, the controller's {self._params.dtype}"
+            raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
         self._engine.prepare(params, self._shape)
         self._params, self._stale = params, self._state is not None
 
     @property
     def state(self) -> PIDState | None:
-        """The law's state; None before the first measurement. With JAX it is valid until the next call."""
+        """State of the law; None before the first measurement. With JAX it is valid until the next call."""
         return self._state
 
     @property
     def terms(self) -> Terms | None:
-        """What the law did in the last call; None before the first."""
+        """Terms of the last call; None before the first."""
         if not self._keeps_terms:
             raise InvalidArgumentError("terms", "are not kept", remedy="build the BatchPID with terms=True")
         return self._terms
@@ -158,29 +143,18 @@ class BatchPID:
         Raises
         ------
         InvalidArgumentError
-            If a shape is wrong. The state is then as before.
+            A shape is wrong. The state is unchanged.
         """
         r, y = self._array("setpoint", setpoint), self._measurement(measurement)
-        y_rate = None if measurement_rate is None else self._array("measurement_rate", measurement_rate)
-        r_rate = None if setpoint_rate is None else self._array("setpoint_rate", setpoint_rate)
-        ff = None if feedforward is None else self._array("feedforward", feedforward)
-        self._state, effort, self._terms = self._engine.step(self._started(y), r, y, y_rate, r_rate, ff)
+        rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
+        self._state, effort, self._terms = self._engine.step(self._started(y), r, y, *rest.values())
         return effort
 
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
-        """Start the envs of ``mask`` (envs,) bool, or all, anew from ``measurement`` (envs, joints)."""
+        """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
         y = self._measurement(measurement)
-        try:
-            mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidArgumentError("mask", f"is no array: {error}", remedy="give one bool per env") from None
-        if mask.dtype != bool or mask.shape != (self.num_envs,):
-            raise InvalidArgumentError(
-                "mask",
-                f"is {mask.dtype} of shape {mask.shape}, not bool of shape ({self.num_envs},)",
-                remedy="give one bool per env",
-            )
-        self._state = self._engine.reset(self._started(y), y, mask, keep_integral)
+        mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        self._state = self._engine.reset(self._started(y), y, mask, keep_integral=keep_integral)
 
     def track(
         self,
@@ -192,37 +166,26 @@ class BatchPID:
         feedforward: Any = None,
     ) -> None:
         """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
-        if self.params.ki is None:
-            raise no_integral()
-        r, y = self._array("setpoint", setpoint), self._measurement(measurement)
-        u = self._array("effort", effort)
-        y_rate = None if measurement_rate is None else self._array("measurement_rate", measurement_rate)
-        r_rate = None if setpoint_rate is None else self._array("setpoint_rate", setpoint_rate)
-        ff = None if feedforward is None else self._array("feedforward", feedforward)
-        self._state = self._engine.track(self._started(y), r, y, u, y_rate, r_rate, ff)
+        r, y, u = self._array("setpoint", setpoint), self._measurement(measurement), self._array("effort", effort)
+        rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
+        self._state = self._engine.track(self._started(y), r, y, u, **rest)
 
     def _started(self, y: Any) -> PIDState:
-        """Return the state, begun at the first measurement, and with every leaf that the params need."""
+        """Return the state, begun at the first measurement, with every leaf that the params need."""
         if self._state is None:
             return self._engine.init(y)
         if self._stale:
             self._state, self._stale = self._state.matched_to(self._engine.init(y)), False
         return self._state
 
-    def _numbers(self, name: str, value: Any) -> Any:
-        try:
-            return self._engine.array(value)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InvalidArgumentError(
-                name, f"cannot be read as an array of numbers: {error}", remedy="give an array of numbers"
-            ) from None
+    def _optional(self, **values: Any) -> dict[str, Any]:
+        return {name: None if value is None else self._array(name, value) for name, value in values.items()}
 
     def _measurement(self, value: Any) -> Any:
         array = self._numbers("measurement", value)
         if array.shape != self._shape:
-            raise InvalidArgumentError(
-                "measurement", f"has shape {array.shape}, not {self._shape}", remedy="give (num_envs, joints)"
-            )
+            problem = f"has shape {array.shape}, not {self._shape}"
+            raise InvalidArgumentError("measurement", problem, remedy="give (num_envs, joints)")
         return array
 
     def _array(self, name: str, value: Any) -> Any:
@@ -232,14 +195,16 @@ class BatchPID:
         envs, joints = self._shape
         if array.ndim <= 2 and all(n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)):
             return array.reshape((1,) * (2 - array.ndim) + array.shape)
-        raise InvalidArgumentError(
-            name,
-            f"has shape {array.shape}, which does not broadcast to {self._shape}",
-            remedy="give a value for all, per joint, or per env and joint",
-        )
+        problem = f"has shape {array.shape}, which does not broadcast to {self._shape}"
+        raise InvalidArgumentError(name, problem, remedy="give one value, one per joint, or one per env and joint")
+
+    def _numbers(self, name: str, value: Any) -> Any:
+        try:
+            return self._engine.array(value)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            problem = f"cannot be read as an array of numbers: {error}"
+            raise InvalidArgumentError(name, problem, remedy="pass an array of numbers") from None
 
 
-def _no_params(value: Any) -> InvalidArgumentError:
-    return InvalidArgumentError(
-        "params", "are no PIDParams", value=type(value).__name__, remedy="build them with make_params"
-    )
+def _checked(params: Any) -> PIDParams:
+    return instance("params", params, PIDParams, "build them with make_params")

@@ -1,18 +1,18 @@
-r"""Gains from a robot's inertia: no tuning, for any robot.
+r"""Gains from a robot's inertia, without tuning, for any robot.
 
 A joint of inertia I under u = kp (b r - q) + I_term - kd q' has the characteristic polynomial
 s^3 + (kd/I) s^2 + (kp/I) s + ki/I. With a bandwidth w, damping ratio zeta and integral time Ti::
 
     kp = I w^2        kd = 2 zeta w I - c        ki = kp / Ti
 
-where c is the joint's own viscous damping, which does part of the work. By default zeta = sqrt(3)/2 and
+where c is the joint's own viscous damping. By default zeta = sqrt(3)/2 and
 Ti = 3 sqrt(3) / w: then the three poles coincide at -w / sqrt(3), and a setpoint of small weight b, which acts through
 the integral, is reached without overshoot and without a jump of the effort, to 2 % within 13 / w.
 
-Three limits shape the rest. An arm's inertia changes with its pose: I is the largest that the poses show, since a joint
+Three limits shape the rest. An arm's inertia changes with its pose: I is the largest over the poses, since a joint
 lighter than designed for is only damped more. Two light joints nearly in line move against each other with much less
-inertia than either: the derivative's filter is made as slow as the stability bound over all those poses asks for
-(:mod:`batchpid.stability`). And where a filter that slow would spoil the damping, the bandwidth gives way.
+inertia than either: the derivative's filter is as slow as the stability bound over all poses requires
+(:mod:`batchpid.stability`). Where a filter that slow would reduce the damping, the bandwidth is reduced.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.choices import CHOICES
-from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.stability import stability_bound
+from batchpid.validate import choice, number, positive
 
 Float64 = NDArray[np.float64]
 FILTER_STEPS = 4.0
-"""The derivative's filter time, in sampling steps, where stability asks for no more: against quantisation noise."""
+"""Least filter time of the derivative, in sampling steps: against quantisation noise."""
 FILTER_SHARE = 0.3
-"""The largest filter time allowed, as a share of 1 / w: it costs at most this many radians of phase at w."""
+"""Largest filter time, as a share of 1 / w: it costs at most this many radians of phase at w."""
 DAMPING_RATIO, INTEGRAL_TIME = math.sqrt(3) / 2, 3 * math.sqrt(3)
 """zeta, and Ti in units of 1 / w, of three equal poles."""
 OWN_SHARE = 0.2
-"""Least share of kd that stays, however much damping a joint has: where it is heavy, its own does less."""
+"""Least share of kd that stays, however much damping a joint has: in poses where it is heavy, that does less."""
 BACK_OFF = 0.8
-"""Factor by which the bandwidth gives way, as often as it must."""
+"""Factor by which the bandwidth is reduced, until the filter is fast enough."""
 
 
 class Designable(Protocol):
-    """What :func:`design_gains` asks of a robot; :class:`sim.Robot` is one."""
+    """Robot that :func:`design_gains` can work on, such as :class:`sim.Robot`."""
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
+        """Return the joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
 
     def sample(self, count: int, seed: int) -> Float64:
-        """``count`` poses (count, dof) spread over the joints' ranges."""
+        """Return ``count`` poses (count, dof) spread over the joints' ranges."""
 
     def params(self, **options: Any) -> PIDParams:
-        """Params with the robot's limits filled in."""
+        """Return params with the robot's limits filled in."""
 
     @property
     def damping(self) -> Float64:
@@ -82,7 +82,7 @@ def pid_from_inertia(
         Viscous damping of the joints (joints,) [N m s/rad or N s/m].
     """
     w, load = 2 * np.pi * np.asarray(bandwidth_hz, np.float64), np.asarray(damping, np.float64)
-    # A joint that is damped beyond zeta by itself needs the stiffness of a heavier one to be as fast.
+    # A joint whose own damping exceeds zeta needs the stiffness of a heavier one to be as fast.
     own = np.maximum(inertia, load / (2 * damping_ratio * w))
     kp, full = own * w**2, 2 * damping_ratio * w * own
     return {
@@ -110,7 +110,7 @@ def design_gains(
     Parameters
     ----------
     robot
-        A :class:`sim.Robot`, or anything that gives mass matrices (:class:`Designable`).
+        A :class:`sim.Robot`, or another :class:`Designable`.
     bandwidth_hz, damping_ratio
         Of the closed loop, at the largest inertia. A step settles to 2 % in about 2 / bandwidth_hz seconds.
     integral_time
@@ -123,46 +123,36 @@ def design_gains(
         (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded ones within the
         limits.
     gain_units
-        "effort", "inertia" or "mass_matrix": what the gains are per (:mod:`batchpid.computed_torque`).
+        Unit of the gains: "effort", or per "inertia" or "mass_matrix" (:mod:`batchpid.computed_torque`).
     margin
-        Share of the stability range that may be used, below 1.
+        Share of the stability range that may be used, in [0.001, 0.999].
     options
-        More options of ``robot.params``; they replace those designed.
+        Options of ``robot.params``; they replace the designed ones.
 
     Raises
     ------
     InvalidArgumentError
         A number out of range, an unknown unit, or a robot whose mass matrix is not positive definite.
     """
-    for name, value, top in (
-        ("bandwidth_hz", bandwidth_hz, math.inf),
-        ("damping_ratio", damping_ratio, math.inf),
-        ("dt", dt, math.inf),
-        ("margin", margin, 1.0),
-        ("integral_time", 1.0 if integral_time is None else min(integral_time, 1.0), math.inf),
-    ):
-        if not 0 < value < top:
-            raise InvalidArgumentError(name, "is out of range", value=value, remedy=f"use 0 < {name} < {top:g}")
-    if gain_units not in CHOICES["gain_units"]:
-        raise InvalidArgumentError(
-            "gain_units",
-            "is unknown",
-            value=gain_units,
-            remedy=f"use one of {', '.join(CHOICES['gain_units'])}",
-        )
+    bandwidth = positive("bandwidth_hz", bandwidth_hz, "Hz")
+    positive("damping_ratio", damping_ratio, "zeta")
+    positive("dt", dt, "s")
+    number("margin", margin, 1e-3, 1 - 1e-3, "share of the stability range")
+    integrates = integral_time is None or integral_time != math.inf
+    if integral_time is not None and integrates:
+        positive("integral_time", integral_time, "s")
+    choice("gain_units", gain_units, CHOICES["gain_units"])
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     own = np.diagonal(mass, axis1=1, axis2=2)
     inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
-    # The loop that works with the whole mass matrix makes up for the joints' own damping.
+    # The loop with the whole mass matrix compensates the joints' damping.
     damping = {"effort": robot.damping, "inertia": robot.damping / own.max(0), "mass_matrix": 0.0}[gain_units]
-    bandwidth = float(bandwidth_hz)
     while True:
         gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
         filter_time = _filter_time(mass, gains, dt, robot.damping, gain_units, margin)
         if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
             break
         bandwidth *= BACK_OFF
-    integrates = integral_time is None or math.isfinite(integral_time)
     designed = {
         **gains,
         "setpoint_weight": setpoint_weight if integrates else 1.0,
@@ -178,7 +168,7 @@ def _filter_time(
 ) -> float:
     """Return the shortest filter time from FILTER_STEPS on that keeps the ratio below ``margin`` at every pose."""
     joints = mass.shape[1]
-    if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia by itself
+    if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia, coupled to no other
         mass, damping = np.eye(joints)[None], np.zeros(joints)
     scale = np.diagonal(mass, axis1=1, axis2=2) if gain_units == "inertia" else np.ones((len(mass), joints))
 
@@ -190,7 +180,7 @@ def _filter_time(
     at_low = ratios(low)
     if at_low.max() <= margin:
         return low
-    worst = np.argsort(at_low)[-10:]  # the pose that decides is among these
+    worst = np.argsort(at_low)[-10:]  # the critical pose is among these
     mass, scale = mass[worst], scale[worst]
 
     def ratio(filter_time: float) -> float:

@@ -1,4 +1,4 @@
-"""The elementwise operations that the law is written in, for NumPy and JAX alike."""
+"""Elementwise operations of the law, for NumPy and JAX alike."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
 def namespace(*leaves: Any) -> Any:
-    """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs elsewhere."""
+    """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs to another."""
     if not _NUMPY_OR_NEUTRAL.issuperset(map(type, leaves)):
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
@@ -26,31 +26,28 @@ def namespace(*leaves: Any) -> Any:
 
 def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
     """Return x within [low, high], either of which may be None; NaN stays NaN."""
-    if low is not None:
-        x = xp.maximum(x, low)
-    if high is not None:
-        x = xp.minimum(x, high)
-    return x
+    x = x if low is None else xp.maximum(x, low)
+    return x if high is None else xp.minimum(x, high)
 
 
 def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
-    """Return an angle, or a difference of two, less its whole turns; ``turns_per_rad`` is 0 where none are taken."""
+    """Return an angle, or a difference of two, less its whole turns; ``turns_per_rad`` is 0 where it is no angle."""
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
 
 
 def flush(x: Any, tiny: Any) -> Any:
-    """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers as they are.
+    """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers unchanged.
 
-    Arithmetic on denormal numbers is ten times slower, and a decaying filter ends there. Adding and taking away a
-    tiny number costs two additions, and no branch.
+    A decaying filter ends in denormal numbers, whose arithmetic is ten times slower. Adding and subtracting a tiny
+    number costs two additions and no branch.
     """
     return (x + tiny) - tiny
 
 
 @cache
 def tiny_of(dtype: Any) -> float:
-    """Return the square root of the smallest normal number.
+    """Return the square root of the smallest normal number of ``dtype``.
 
-    Its last bit is far above the denormals, and itself far below the last bit of any number that matters.
+    Its last bit is far above the denormals, and the number itself far below the last bit of any relevant number.
     """
     return float(np.sqrt(np.finfo(dtype).tiny))

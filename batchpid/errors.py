@@ -1,22 +1,26 @@
-"""The errors that batchpid raises: one root, and children that carry their data.
+"""Errors of batchpid: one root, whose children carry their data.
 
-Every message says what is wrong, where (argument, joint, env), the value found, and the remedy.
+A message says what is wrong, where (argument, joint, env), the value, and the remedy.
 """
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring, _SHORT.maxother = 500, 200
 
 
 class BatchPIDError(Exception):
-    """Root of every error that this project raises on purpose."""
+    """Root of the errors that this project raises on purpose."""
 
 
 class InvalidArgumentError(BatchPIDError, ValueError):
     """An argument has a wrong type, shape, dtype, range or a non-finite entry.
 
-    Raised before anything is changed. ``argument``, ``joint``, ``env``, ``value`` and ``remedy`` hold the
-    same facts as the message, for programs.
+    Raised before anything is changed. ``argument``, ``joint``, ``env``, ``value`` and ``remedy`` hold the facts of
+    the message, for programs.
     """
 
     def __init__(
@@ -32,7 +36,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         self.argument, self.problem, self.remedy = argument, problem, remedy
         self.joint, self.env, self.value = joint, env, value
         where = "".join(f", {kind} {place!r}" for kind, place in (("joint", joint), ("env", env)) if place is not None)
-        got = "" if value is None else f" (got {value!r})"
+        got = "" if value is None else f" (got {_SHORT.repr(value)})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -49,7 +53,7 @@ class RobotNotFoundError(RobotError, FileNotFoundError):
 
 
 class MissingDependencyError(BatchPIDError, ImportError):
-    """An optional package is needed for what was asked; the message says which extra installs it."""
+    """An optional package is missing; the message names the extra that installs it."""
 
     def __init__(self, package: str, purpose: str, extra: str) -> None:
         self.package, self.purpose, self.extra = package, purpose, extra
@@ -68,7 +72,7 @@ class ClosedError(BatchPIDError, RuntimeError):
 
 
 class InUseError(BatchPIDError, RuntimeError):
-    """The object is at work for another caller: a thread, a signal handler, or the process this one was forked from."""
+    """The object is in use: by another thread, a signal handler, or the process from which this one was forked."""
 
 
 def _rebuild(cls: type[Exception], args: tuple[Any, ...], fields: dict[str, Any]) -> Exception:

@@ -1,4 +1,4 @@
-r"""THE control law: pure functions on (envs, joints) arrays, one definition for NumPy and JAX.
+r"""The control law: pure functions on (envs, joints) arrays, one definition for NumPy and JAX.
 
 With setpoint r, measurement y and step dt, per env and joint::
 
@@ -13,9 +13,9 @@ With setpoint r, measurement y and step dt, per env and joint::
     I     <- I + ki e dt   unless (u - effort) e > 0            conditional integration
     I     <- min(max(I, integral_min), integral_max)            clamp
 
-A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. The effort is computed
-before I takes in the present error, or after, by ``integration``. Saturation is on the total effort, because that is
-what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
+A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
+whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
+is what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
 conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp.
 """
 
@@ -37,26 +37,21 @@ def init(params: PIDParams, measurement: Any) -> PIDState:
     unless the params ask for one.
     """
     xp = namespace(*params, measurement)
-    dtype = xp.result_type(params.kp, measurement)
-    y = xp.zeros_like(measurement, dtype=dtype) + measurement
-    differentiates = params.kd is not None
+    y = xp.zeros_like(measurement, dtype=xp.result_type(params.kp, measurement)) + measurement
+    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
     weights_rate = differentiates and params.setpoint_weight_derivative is not None
-    weights = params.setpoint_weight is not None
-    remembers = params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort)
+    keeps_effort = params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort)
 
     def filled(value: float, wanted: bool) -> Any:  # no two leaves share a buffer: JAX donates each of them
         return xp.full_like(y, value) if wanted else None
 
-    integral = None
-    if params.ki is not None:
-        integral = clip(filled(0.0, True), params.integral_min, params.integral_max, xp)
     return PIDState(
-        integral=integral,
+        integral=None if params.ki is None else clip(filled(0.0, True), params.integral_min, params.integral_max, xp),
         measurement=y.copy() if differentiates or (weights and params.continuous is not None) else None,
         derivative=filled(0.0, differentiates and params.derivative_filter_time is not None),
         setpoint=y.copy() if weights_rate else None,
         setpoint_seen=filled(float(params.first_derivative is not None), weights_rate),
-        effort=filled(0.0, remembers),
+        effort=filled(0.0, keeps_effort),
         origin=y.copy() if weights and params.weight_origin is not None else filled(0.0, weights),
     )
 
@@ -75,7 +70,7 @@ def step(
 ) -> Any:
     """Advance the law by ``dt`` seconds; return ``(state, effort)``, with ``terms`` also :class:`Terms`.
 
-    Arrays are (envs, joints), or (1, joints) for all envs alike, in the params' dtype; none is written to.
+    Arrays are (envs, joints), or (1, joints) for all envs, in the params' dtype; none is written to.
 
     Parameters
     ----------
@@ -84,10 +79,10 @@ def step(
     dt
         Time step > 0 [s].
     measurement_rate
-        dy/dt where it is measured [rad/s or m/s]; None: the difference quotient of the measurement.
+        dy/dt, if measured [rad/s or m/s]; None: the difference quotient of the measurement.
     setpoint_rate
-        dr/dt where it is known; it enters with weight c, or 1 where no weight is set. None: the difference quotient
-        of the setpoint where a weight c is set, else 0.
+        dr/dt, if known; it enters with weight c, or 1 without one. None: the difference quotient of the setpoint
+        with a weight c, else 0.
     feedforward
         Effort added before saturation [N m or N]: passive force, acceleration feedforward, ...
 
@@ -96,16 +91,8 @@ def step(
     InvalidArgumentError
         If dt is a Python number that is not positive and finite.
     """
-    return advance(
-        discretise(params, dt),
-        state,
-        setpoint,
-        measurement,
-        measurement_rate,
-        setpoint_rate,
-        feedforward,
-        terms,
-    )
+    rates = measurement_rate, setpoint_rate
+    return advance(discretise(params, dt), state, setpoint, measurement, *rates, feedforward, terms=terms)
 
 
 def advance(
@@ -116,9 +103,10 @@ def advance(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
+    *,
     terms: bool = False,
 ) -> Any:
-    """Do one step with coefficients at hand; otherwise as :func:`step`."""
+    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`."""
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
     finite = None
@@ -206,7 +194,7 @@ def advance(
 
 
 def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
-    """Start the envs of ``mask`` (envs,) bool anew from ``measurement`` (envs, joints); the others are untouched.
+    """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs, joints).
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load.
     """
@@ -225,7 +213,7 @@ def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
 
 
 def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
-    """Return the origin of setpoint weighting, turned along where y jumped by whole turns."""
+    """Return the origin of setpoint weighting, moved by the whole turns that y jumped."""
     if state.origin is None or k.turns is None:
         return state.origin
     moved = y - state.measurement
@@ -233,5 +221,5 @@ def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
 
 
 def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
-    """Return kp (b e - (1 - b) (y - o)): no spike in it where y wraps."""
+    """Return kp (b e - (1 - b) (y - o)), which has no spike where y wraps."""
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))

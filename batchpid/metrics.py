@@ -1,14 +1,14 @@
-r"""How good a step response is: the control literature's figures of merit, batched over (envs, joints).
+r"""Figures of merit of step responses, as in the control literature, batched over (envs, joints).
 
 With setpoint r, start y0, move A = r - y0 and error e = r - y, per env and joint::
 
     rise time            from the first 10 % of the move to the first 90 %
     overshoot            max((y - r) sign A) / |A|, at least 0
-    settling time        after which |e| <= max(band |A|, absolute band) for good
+    settling time        from which on |e| <= max(band |A|, absolute band)
     steady-state error   max |e| over the last part of the record
     IAE, ITAE            int |e| dt, int t |e| dt
     effort peak          max |u|
-    effort variation     sum |u_k - u_{k-1}|: how much the actuator is moved to and fro
+    effort variation     sum |u_k - u_{k-1}|: chatter of the actuator
     saturation share     of the samples
 
 Rise time, overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems (Princeton, 2nd ed.),
@@ -26,7 +26,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.display import array_summary
+from batchpid.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
+from batchpid.validate import broadcast, number, positive, read_array
 
 Float64 = NDArray[np.float64]
 
@@ -34,8 +36,8 @@ Float64 = NDArray[np.float64]
 class StepMetrics(NamedTuple):
     """Figures of merit of a step response, each (envs, joints); lower is better.
 
-    What is not reached, and every figure of a joint that was not finite throughout, is inf. What is not defined (rise
-    time and overshoot of a joint that hardly moves, effort figures without efforts) is NaN.
+    A time that is not reached, and every figure of a joint that was not finite throughout, is inf. An undefined
+    figure (rise time and overshoot of a joint that hardly moves, effort figures without efforts) is NaN.
     """
 
     rise_time: Float64
@@ -55,7 +57,7 @@ class StepMetrics(NamedTuple):
     effort_peak: Float64
     """Largest absolute effort [N m or N]."""
     effort_variation: Float64
-    """Total variation of the effort [N m or N]: chatter shows here."""
+    """Total variation of the effort [N m or N], which is large where it chatters."""
     saturation_share: Float64
     """Share of samples in saturation."""
 
@@ -63,9 +65,9 @@ class StepMetrics(NamedTuple):
         return array_summary(self, "envs", "joints")
 
     def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
-        """Each figure reduced over envs to (joints,): ``statistic`` is given a joint's defined figures, returns one.
+        """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one joint's figures.
 
-        Undefined figures (NaN) are left out; a joint that has none else stays NaN.
+        Undefined figures (NaN) are left out; a joint that has no other stays NaN.
         """
 
         def reduce(figure: Float64) -> Float64:
@@ -75,16 +77,16 @@ class StepMetrics(NamedTuple):
         return StepMetrics(*map(reduce, self))
 
     def worst(self) -> StepMetrics:
-        """Worst case over envs, (joints,)."""
+        """Return the worst case over envs, (joints,)."""
         return self.over_envs(np.max)
 
     def median(self) -> StepMetrics:
-        """Median over envs, (joints,); inf when half of them or more are inf."""
+        """Return the median over envs, (joints,); inf if half of them or more are inf."""
         return self.over_envs(lambda column: np.quantile(column, 0.5, method="higher"))
 
 
 def step_metrics(
-    time: ArrayLike,
+    dt: float,
     setpoint: ArrayLike,
     measurement: ArrayLike,
     *,
@@ -96,26 +98,26 @@ def step_metrics(
     tail: float = 0.1,
     continuous: ArrayLike | None = None,
 ) -> StepMetrics:
-    """Judge step responses.
+    """Return the figures of merit of step responses.
 
     Parameters
     ----------
-    time
-        (ticks,) increasing [s]; the step is at 0, or at ``time[0]`` without ``start``.
+    dt
+        Time between samples [s]. The step is at 0: at the first sample, or with ``start`` one dt before it.
     setpoint
         (joints,), (envs, joints) or (ticks, envs, joints) [rad or m]; the last row is where the move ends, the
         errors of IAE and ITAE are to each row's own.
     measurement
         (ticks, envs, joints) [rad or m].
     start
-        (envs, joints) or (joints,): where the move began; default the first row of ``measurement``.
+        (envs, joints) or (joints,): start of the move; default the first row of ``measurement``.
     effort, saturated
         (ticks, envs, joints): applied efforts [N m or N], and whether they were limited.
     band
         Half width of the settling band, as a fraction of the move.
     absolute_band
         Its least half width [rad or m], a number or (joints,). Rise time and overshoot are undefined for moves smaller
-        than absolute_band / band, where they would compare noise with next to nothing.
+        than absolute_band / band, where they would compare noise with noise.
     tail
         Last share of the record, over which the steady-state error is taken.
     continuous
@@ -124,38 +126,31 @@ def step_metrics(
     Raises
     ------
     InvalidArgumentError
-        Shapes that do not fit, a time that does not increase, a band or tail out of range.
+        Shapes that do not fit, fewer than two samples, or a dt, band or tail out of range.
     """
-    y = _table("measurement", measurement)
-    t = np.asarray(time, np.float64)
-    if t.shape != y.shape[:1] or t.size < 2 or not (np.diff(t) > 0).all():
-        raise InvalidArgumentError(
-            "time",
-            f"must increase, with one entry for each of the {y.shape[0]} rows of measurement, at least 2",
-            value=t.shape,
-            remedy="pass the rollout's time",
-        )
-    for name, value in (("band", band), ("tail", tail)):
-        if not 0 < value <= 1:
-            raise InvalidArgumentError(name, "must be a fraction", value=value, remedy="use e.g. 0.02")
-    r = _like("setpoint", setpoint, y.shape)
+    y = read_array("measurement", measurement).astype(np.float64)
+    if y.ndim != 3 or len(y) < 2:
+        problem = f"has shape {y.shape}, needs (ticks, envs, joints) with at least 2 ticks"
+        raise InvalidArgumentError("measurement", problem, remedy="pass a rollout's qpos")
+    number("band", band, 1e-9, 1.0, "fraction of the move")
+    number("tail", tail, 1e-9, 1.0, "share of the record")
+    r, floor = broadcast("setpoint", setpoint, y.shape), broadcast("absolute_band", absolute_band, y.shape[1:])
+    u = None if effort is None else broadcast("effort", effort, y.shape)
+    limited = None if saturated is None else read_array("saturated", saturated, "b")
     if start is not None:
-        first = _like("start", start, y.shape[1:])
-        t, y, r = np.append(0.0, t), np.concatenate([first[None], y]), np.concatenate([r[:1], r])
-        if t[1] <= 0:
-            raise InvalidArgumentError("time", "must be above 0 where start is given", value=t[1], remedy="drop row 0")
-    t = t - t[0]
+        y = np.concatenate([broadcast("start", start, y.shape[1:])[None], y])
+        r = np.concatenate([r[:1], r])
+    t = positive("dt", dt, "s") * np.arange(len(y), dtype=np.float64)
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
     y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
     if continuous is not None:
-        y, r = _unwrap(y, r, np.asarray(continuous, bool))
+        y, r = _unwrap(y, r, read_array("continuous", continuous, "b"))
 
     move = r[-1] - y[0]
     size, direction = np.abs(move), np.where(move < 0, -1.0, 1.0)
-    error = r - y
-    final_error = r[-1] - y
-    tolerance = np.maximum(band * size, absolute_band)
-    moves = size >= np.broadcast_to(absolute_band, size.shape) / band
+    error, final_error = r - y, r[-1] - y
+    tolerance: Float64 = np.maximum(band * size, floor)
+    moves = size >= floor / band
     beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
     beyond = np.maximum(beyond, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -165,11 +160,10 @@ def step_metrics(
     rise = high - np.where(np.isfinite(high), low, 0.0)
     tail_rows = max(1, round(tail * len(t)))
 
-    def judged(figure: Float64) -> Float64:
+    def judged(figure: Any) -> Float64:
         return np.where(finite, figure, np.inf)
 
     nothing = np.full(size.shape, np.nan)
-    u = None if effort is None else _table("effort", effort, (len(y) - (start is not None), *y.shape[1:]))
     return StepMetrics(
         rise_time=judged(np.where(moves, rise, np.nan)),
         overshoot=judged(overshoot),
@@ -180,12 +174,12 @@ def step_metrics(
         itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
         effort_peak=nothing if u is None else _or_inf(np.abs(u).max(0)),
         effort_variation=nothing if u is None else _or_inf(_variation(u)),
-        saturation_share=nothing if saturated is None else np.mean(np.asarray(saturated, bool), axis=0),
+        saturation_share=nothing if limited is None else np.mean(limited, axis=0),
     )
 
 
 def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
-    """Time at which ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a line; else inf."""
+    """Return when ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a line; else inf."""
     reached = progress >= level
     k = np.maximum(np.argmax(reached, 0), 1)
     before, after = _row(progress, k - 1), _row(progress, k)
@@ -195,7 +189,7 @@ def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
 
 
 def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
-    """Time of the last passage of ``error`` into the band, between samples by a line; inf if it ends outside."""
+    """Return when ``error`` last enters the band, between samples by a line; inf if it ends outside."""
     outside = np.abs(error) > tolerance
     last = len(t) - 1 - np.argmax(outside[::-1], 0)
     k = np.minimum(last, len(t) - 2)
@@ -217,39 +211,12 @@ def _or_inf(figure: Float64) -> Float64:
 
 
 def _row(table: Float64, k: NDArray[Any]) -> Float64:
-    """``table[k]`` for an index k per env and joint."""
+    """Return ``table[k]`` for an index k per env and joint."""
     return np.take_along_axis(table, k[None], 0)[0]
 
 
 def _unwrap(y: Float64, r: Float64, continuous: NDArray[np.bool_]) -> tuple[Float64, Float64]:
-    """Turn angles into unbroken courses, and the setpoint into the one nearest to the start."""
-    turn = 2 * np.pi
-    course = np.unwrap(y, axis=0)
-    target = np.unwrap(r, axis=0)
-    target = target - turn * np.rint((target[-1] - course[0]) / turn)
+    """Return angles without jumps, and the setpoint nearest to the start."""
+    course, target = np.unwrap(y, axis=0), np.unwrap(r, axis=0)
+    target = target - TURN * np.rint((target[-1] - course[0]) / TURN)
     return np.where(continuous, course, y), np.where(continuous, target, r)
-
-
-def _table(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Float64:
-    array = np.asarray(value, np.float64)
-    if array.ndim != 3 or (shape is not None and array.shape != shape):
-        raise InvalidArgumentError(
-            name,
-            f"must have shape {'(ticks, envs, joints)' if shape is None else shape}",
-            value=array.shape,
-            remedy="pass a rollout's arrays",
-        )
-    return array
-
-
-def _like(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
-    array = np.asarray(value, np.float64)
-    try:
-        return np.broadcast_to(array, shape)
-    except ValueError:
-        raise InvalidArgumentError(
-            name,
-            f"does not broadcast to {shape}",
-            value=array.shape,
-            remedy="give one value per joint, or per env and joint",
-        ) from None

@@ -96,10 +96,7 @@ def loads_params(text: str, joint_names: Sequence[str] | None = None) -> tuple[P
 
 
 def save_params(
-    path: str | os.PathLike[str],
-    params: PIDParams,
-    joint_names: Sequence[str],
-    about: Mapping[str, Any] | None = None,
+    path: str | os.PathLike[str], params: PIDParams, joint_names: Sequence[str], about: Mapping[str, Any] | None = None
 ) -> None:
     """Write ``params`` to ``path`` (.yaml, .yml or .json), as :func:`dumps_params`.
 

@@ -1,4 +1,4 @@
-r"""When a sampled PID loop on a chain of rigid bodies is stable: in closed form, and exactly.
+r"""Stability of a sampled PID loop on a chain of rigid bodies: in closed form, and exactly.
 
 The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with the mass matrix M,
 implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all diagonal but M)::
@@ -16,29 +16,30 @@ and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I
 kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
 stretched upright), joints that turn against each other move much less than the diagonal of M says.
 
-The integral, which is slow, is not in the ratio; :func:`spectral_radius` has everything.
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` includes it.
 E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.validate import broadcast, entries, positive, read_array
 
 Float64 = NDArray[np.float64]
 
 
 class StabilityBound(NamedTuple):
-    """How much of the sampled loop's stability range is used."""
+    """Share of the sampled loop's stability range that is used."""
 
     ratio: Float64
-    """(...): below 1 the loop is stable, above 1 it diverges, alternating from step to step."""
+    """(...): below 1 the loop is stable, above 1 it diverges, with alternating signs from step to step."""
     participation: Float64
-    """(..., joints): the share of each joint in the mode that goes first; sums to 1."""
+    """(..., joints): share of each joint in the least stable mode; sums to 1."""
 
 
 def stability_bound(
@@ -50,7 +51,7 @@ def stability_bound(
     filter_time: ArrayLike = 0.0,
     damping: ArrayLike = 0.0,
 ) -> StabilityBound:
-    """Return how near PD gains are to the sampled loop's stability limit.
+    """Return the distance of PD gains to the sampled loop's stability limit.
 
     Parameters
     ----------
@@ -61,9 +62,9 @@ def stability_bound(
     dt
         Control and simulation step [s].
     filter_time
-        Of the derivative's first-order low-pass [s], as kp.
+        Time constant of the derivative's first-order low-pass [s], shaped as kp.
     damping
-        The joints' own viscous damping, which the simulator integrates implicitly [N m s/rad or N s/m], as kp.
+        Viscous damping of the joints, which the simulator integrates implicitly [N m s/rad or N s/m], shaped as kp.
 
     Raises
     ------
@@ -90,8 +91,9 @@ def spectral_radius(
 ) -> Float64:
     """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is stable.
 
-    The exact one-step matrix of the law, output first, and the plant, on the state (q, q - q', I, d). Arguments
-    as :func:`stability_bound`, with ``ki`` [N m/(rad s) or N/(m s)] as kp. Where ki is 0 its pole at 1 is left out.
+    They are those of the exact one-step matrix of the law, output first, and the plant, on the state
+    (q, q - q', I, d). Arguments are those of :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
+    kp. Where ki is 0 its pole at 1 is left out.
     """
     m, p, i, c, tau, b = _columns(mass_matrix, dt, kp=kp, ki=ki, kd=kd, filter_time=filter_time, damping=damping)
     shape = m.shape[:-1]
@@ -103,12 +105,7 @@ def spectral_radius(
     keep, take = tau / (tau + dt), dt / (tau + dt)
     # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
     rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
-    effort = [
-        diagonal(-p),
-        c[..., None] * rate[1],
-        diagonal(np.where(i > 0, 1.0, 0.0)),
-        c[..., None] * rate[3],
-    ]
+    effort = [diagonal(-p), c[..., None] * rate[1], diagonal(np.where(i > 0, 1.0, 0.0)), c[..., None] * rate[3]]
     implicit = np.linalg.inv(m + diagonal(dt * b))
     step = [dt**2 * (implicit @ column) for column in effort]
     step[1] = step[1] + implicit @ m
@@ -118,41 +115,17 @@ def spectral_radius(
     return np.abs(np.linalg.eigvals(matrix)).max(-1)
 
 
-def _numbers(name: str, value: ArrayLike) -> Any:
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "iuf":
-            raise TypeError(f"its dtype is {array.dtype}")
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidArgumentError(name, f"is no array of numbers: {error}", remedy="give numbers") from None
-    return array.astype(np.float64)
-
-
-def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Any, ...]:
-    if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not 0 < dt <= np.finfo(float).max:
-        raise InvalidArgumentError("dt", "is not positive and finite", value=dt, remedy="give seconds > 0")
-    m = _numbers("mass_matrix", mass_matrix)
+def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:
+    """Return the mass matrix and the columns as (..., joints, joints) and (..., joints), checked."""
+    positive("dt", dt, "s")
+    m = read_array("mass_matrix", mass_matrix).astype(np.float64)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
-        raise InvalidArgumentError(
-            "mass_matrix", "is not square", value=m.shape, remedy="pass (joints, joints), or a stack of such"
-        )
+        remedy = "pass (joints, joints), or a stack of such"
+        raise InvalidArgumentError("mass_matrix", "is not square", value=m.shape, remedy=remedy)
     if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
-        raise InvalidArgumentError(
-            "mass_matrix",
-            "is not positive definite",
-            remedy="check the masses and inertias of the robot's links",
-        )
-    spread = []
-    for name, value in columns.items():
-        column = _numbers(name, value)
-        if not np.isfinite(column).all() or (column < 0).any():
-            raise InvalidArgumentError(name, "is not finite and >= 0", value=value, remedy="correct it")
-        try:
-            spread.append(np.broadcast_to(column, m.shape[:-1]))
-        except ValueError as error:
-            raise InvalidArgumentError(
-                name,
-                f"does not broadcast to {m.shape[:-1]}: {error}",
-                remedy="give one value, or one per joint",
-            ) from None
+        remedy = "check the masses and inertias of the robot's links"
+        raise InvalidArgumentError("mass_matrix", "is not positive definite", remedy=remedy)
+    spread = [broadcast(name, value, m.shape[:-1]) for name, value in columns.items()]
+    for name, column in zip(columns, spread, strict=True):
+        entries(name, column, (column >= 0) & (column < np.inf), "must be finite and >= 0")
     return (m, *spread)

@@ -7,7 +7,7 @@ A move from x0 to x1 is x(t) = x0 + (x1 - x0) s(t), with s from 0 to 1::
     jerk limited    s''' = +j, 0, -j                                        the fastest within v, a and j
 
 The first is T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7), 1985; the second B. Siciliano
-et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third is left to the ``ruckig`` library
+et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third is computed by the ``ruckig`` library
 (L. Berscheid and T. Kroeger, Jerk-limited real-time trajectory generation, RSS 2021).
 """
 
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.display import array_summary
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.validate import broadcast, entries, positive, read_array
 
 Float64 = NDArray[np.float64]
 
@@ -57,29 +58,19 @@ class Trajectory(NamedTuple):
         InvalidArgumentError
             The tick or the shape differs.
         """
+        dt = self.time[0]
         if other.position.shape[1:] != self.position.shape[1:]:
-            raise InvalidArgumentError(
-                "other",
-                f"moves {other.position.shape[1:]} (..., joints), not {self.position.shape[1:]}",
-                remedy="give both the same shape",
-            )
-        if not math.isclose(other.time[0], self.time[0], rel_tol=1e-9):
-            raise InvalidArgumentError(
-                "other",
-                "has another tick",
-                value=float(other.time[0]),
-                remedy=f"use dt={self.time[0]:g} in both",
-            )
-        parts = zip(self[1:], other[1:], strict=True)
-        return Trajectory(
-            self.time[0] * np.arange(1, self.ticks + other.ticks + 1),
-            *(np.concatenate(pair) for pair in parts),
-        )
+            problem = f"moves {other.position.shape[1:]} (..., joints), not {self.position.shape[1:]}"
+            raise InvalidArgumentError("other", problem, remedy="give both the same shape")
+        if not math.isclose(other.time[0], dt, rel_tol=1e-9):
+            remedy = f"use dt={dt:g} in both"
+            raise InvalidArgumentError("other", "has another tick", value=float(other.time[0]), remedy=remedy)
+        time = dt * np.arange(1, self.ticks + other.ticks + 1)
+        return Trajectory(time, *(np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True)))
 
     def hold(self, duration: float) -> Trajectory:
         """Return this trajectory with its last position held for ``duration`` [s], rounded up to whole ticks."""
-        _positive("duration", duration, ())
-        ticks = _count(duration, self.time[0])
+        ticks = _count(positive("duration", duration, "s"), self.time[0])
         still = np.broadcast_to(self.position[-1], (ticks, *self.position.shape[1:]))
         rest = np.zeros_like(still)
         return self.then(Trajectory(self.time[0] * np.arange(1, ticks + 1), still, rest, rest))
@@ -103,7 +94,7 @@ def minimum_jerk(
     dt
         Time of a tick [s].
     duration
-        T [s]: a number, (envs, 1) or (envs, joints); whoever arrives first holds the target.
+        T [s]: a number, (envs, 1) or (envs, joints); a joint that arrives before others holds its target.
     max_velocity, max_acceleration
         Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env takes the shortest T
         that respects them on all of its joints; an infinite one is none.
@@ -115,27 +106,15 @@ def minimum_jerk(
     """
     x0, way = _move(start, target)
     if (duration is None) == (max_velocity is None and max_acceleration is None):
-        raise InvalidArgumentError(
-            "duration",
-            "or limits are needed, and not both",
-            remedy="give duration=, or max_velocity= and max_acceleration=",
-        )
+        remedy = "give duration=, or max_velocity= and max_acceleration="
+        raise InvalidArgumentError("duration", "or limits are needed, and not both", remedy=remedy)
     if duration is not None:
-        total = np.broadcast_to(_positive("duration", duration, way.shape), way.shape)
+        total = _limits("duration", duration, way)
     else:
-        v = _positive("max_velocity", np.inf if max_velocity is None else max_velocity, way.shape, finite=False)
-        a = _positive(
-            "max_acceleration",
-            np.inf if max_acceleration is None else max_acceleration,
-            way.shape,
-            finite=False,
-        )
-        if np.isinf(np.broadcast_to(np.minimum(v, a), way.shape)).any():
-            raise InvalidArgumentError(
-                "max_velocity",
-                "and max_acceleration are both infinite on a joint",
-                remedy="limit one of them",
-            )
+        v = _limits("max_velocity", math.inf if max_velocity is None else max_velocity, way, finite=False)
+        a = _limits("max_acceleration", math.inf if max_acceleration is None else max_acceleration, way, finite=False)
+        limited = np.isfinite(np.minimum(v, a))
+        entries("max_velocity", v, limited, "and max_acceleration are both infinite", remedy="limit one of them")
         distance = np.abs(way)
         needed = np.maximum(_PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a))
         total = np.broadcast_to(needed.max(-1, keepdims=True), way.shape)
@@ -176,8 +155,7 @@ def trapezoidal(
         Naming the argument and joint.
     """
     x0, way = _move(start, target)
-    v = np.broadcast_to(_positive("max_velocity", max_velocity, way.shape, finite=False), way.shape)
-    a = np.broadcast_to(_positive("max_acceleration", max_acceleration, way.shape), way.shape)
+    v, a = _limits("max_velocity", max_velocity, way, finite=False), _limits("max_acceleration", max_acceleration, way)
     distance = np.abs(way)
     moves = distance > _NO_WAY
     # Limits of s itself: those of the joints, per metre or radian of the way.
@@ -227,49 +205,35 @@ def jerk_limited(
     except ImportError:
         raise MissingDependencyError("ruckig", "jerk_limited()", "ruckig") from None
     x0, way = _move(start, target)
-    rows = way.reshape(-1, way.shape[-1])
-
-    def by_env(value: Float64) -> Float64:
-        return np.broadcast_to(value, way.shape).reshape(rows.shape)
-
-    v, a, j = (
-        by_env(_positive(name, limit, way.shape))
-        for name, limit in (
-            ("max_velocity", max_velocity),
-            ("max_acceleration", max_acceleration),
-            ("max_jerk", max_jerk),
-        )
-    )
-    v0, a0 = (
-        by_env(_numbers(name, value, way.shape))
-        for name, value in (("start_velocity", start_velocity), ("start_acceleration", start_acceleration))
-    )
-    first, last = by_env(x0), by_env(x0 + way)
-    _positive("dt", dt, ())
-    planner, plans = ruckig.Ruckig(rows.shape[1], float(dt)), []
-    for env in range(len(rows)):
-        asked = ruckig.InputParameter(rows.shape[1])
-        asked.current_position, asked.target_position = first[env].tolist(), last[env].tolist()
-        asked.current_velocity, asked.current_acceleration = v0[env].tolist(), a0[env].tolist()
-        asked.max_velocity, asked.max_acceleration = v[env].tolist(), a[env].tolist()
-        asked.max_jerk = j[env].tolist()
-        plan = ruckig.Trajectory(rows.shape[1])
+    asked = {
+        "current_position": x0,
+        "target_position": x0 + way,
+        "current_velocity": _finite("start_velocity", start_velocity, way.shape),
+        "current_acceleration": _finite("start_acceleration", start_acceleration, way.shape),
+        "max_velocity": _limits("max_velocity", max_velocity, way),
+        "max_acceleration": _limits("max_acceleration", max_acceleration, way),
+        "max_jerk": _limits("max_jerk", max_jerk, way),
+    }
+    joints = way.shape[-1]
+    rows = {name: value.reshape(-1, joints) for name, value in asked.items()}
+    planner, plans = ruckig.Ruckig(joints, positive("dt", dt, "s")), []
+    for env in range(way.size // joints):
+        inputs, plan = ruckig.InputParameter(joints), ruckig.Trajectory(joints)
+        for name, table in rows.items():
+            setattr(inputs, name, table[env].tolist())
         try:
-            planner.calculate(asked, plan)
+            planner.calculate(inputs, plan)
         except ruckig.RuckigError:
-            raise InvalidArgumentError(
-                "start",
-                "allows no jerk-limited move",
-                env=env,
-                remedy="begin within the limits, or widen them",
-            ) from None
+            remedy = "begin within the limits, or widen them"
+            raise InvalidArgumentError("start", "allows no jerk-limited move", env=env, remedy=remedy) from None
         plans.append(plan)
-    time = _ticks(dt, np.array([plan.duration for plan in plans]))
+    durations = np.array([plan.duration for plan in plans])
+    time = _ticks(dt, durations)
     table = np.array([[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()])
-    arrived = time[:, None, None] >= np.array([plan.duration for plan in plans])[:, None]
+    arrived = time[:, None, None] >= durations[:, None]
     position, velocity, acceleration = (
         np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
-        for k, rest in enumerate((last, np.zeros(()), np.zeros(())))
+        for k, rest in enumerate((rows["target_position"], np.zeros(()), np.zeros(())))
     )
     return Trajectory(time, position, velocity, acceleration)
 
@@ -278,72 +242,44 @@ def _trajectory(
     time: Float64, x0: Float64, way: Float64, s: Float64, rate: Float64, acceleration: Float64, done: Any
 ) -> Trajectory:
     """Return x0 + way s and its derivatives; exactly the target, at rest, where the move is done."""
-    return Trajectory(
-        time,
-        np.where(done, x0 + way, x0 + way * s),
-        np.where(done, 0.0, way * rate),
-        np.where(done, 0.0, way * acceleration),
-    )
+    position, velocity = np.where(done, x0 + way, x0 + way * s), np.where(done, 0.0, way * rate)
+    return Trajectory(time, position, velocity, np.where(done, 0.0, way * acceleration))
 
 
 def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     """Return the start and the way (..., joints) of a move."""
-    x0, x1 = _numbers("start", start), _numbers("target", target)
+    shapes = [read_array(name, value).shape for name, value in (("start", start), ("target", target))]
     try:
-        shape = np.broadcast_shapes(x0.shape, x1.shape)
+        shape = np.broadcast_shapes(*shapes)
     except ValueError:
         shape = ()
     if not 1 <= len(shape) <= 2 or 0 in shape:
-        raise InvalidArgumentError(
-            "target",
-            f"has shape {x1.shape} and start {x0.shape}",
-            remedy="give each as (joints,) or (envs, joints), with the same joints",
-        )
-    x0, x1 = np.broadcast_to(x0, shape), np.broadcast_to(x1, shape)
-    return x0, x1 - x0
+        problem = f"has shape {shapes[1]} and start {shapes[0]}"
+        remedy = "give each as (joints,) or (envs, joints), with the same joints"
+        raise InvalidArgumentError("target", problem, remedy=remedy)
+    x0 = _finite("start", start, shape)
+    return x0, _finite("target", target, shape) - x0
+
+
+def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
+    array = broadcast(name, value, shape)
+    entries(name, array, np.isfinite(array), "is not finite")
+    return array
+
+
+def _limits(name: str, value: ArrayLike, way: Float64, finite: bool = True) -> Float64:
+    """Return ``value`` > 0, shaped as ``way``."""
+    array = broadcast(name, value, way.shape)
+    good = (array > 0) & (np.isfinite(array) | (not finite))
+    entries(name, array, good, "must be positive and finite" if finite else "must be > 0")
+    return array
 
 
 def _ticks(dt: float, total: Float64) -> Float64:
     """Return the times of the ticks' ends up to the longest of the durations ``total``, at least one."""
-    _positive("dt", dt, ())
-    return float(dt) * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
+    return positive("dt", dt, "s") * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
 
 
 def _count(duration: float, dt: float) -> int:
     """Return how many ticks cover a duration; a last one by rounding alone is none."""
     return max(1, math.ceil(duration / dt * (1 - 1e-12)))
-
-
-def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None, finite: bool = True) -> Float64:
-    """Return ``value`` as float64 that broadcasts to ``shape``, with no NaN, and no infinity where finite."""
-    try:
-        array = np.asarray(value, np.float64)
-        if shape is not None:
-            np.broadcast_to(array, shape)
-    except (TypeError, ValueError) as error:
-        raise InvalidArgumentError(
-            name, f"cannot be used: {error}", remedy=f"give numbers of a shape that broadcasts to {shape}"
-        ) from None
-    wrong = ~np.isfinite(array) if finite else np.isnan(array)
-    if wrong.any():
-        _complain(name, "is not finite" if finite else "is NaN", array, wrong)
-    return array
-
-
-def _positive(name: str, value: ArrayLike, shape: tuple[int, ...], finite: bool = True) -> Float64:
-    array = _numbers(name, value, shape, finite)
-    if not (array > 0).all():
-        _complain(name, "must be > 0", array, ~(array > 0))
-    return array
-
-
-def _complain(name: str, problem: str, array: Float64, wrong: Any) -> None:
-    index = tuple(int(n) for n in np.argwhere(wrong)[0])
-    raise InvalidArgumentError(
-        name,
-        problem,
-        joint=index[-1] if index else None,
-        env=index[-2] if len(index) > 1 else None,
-        value=float(array[index]),
-        remedy="correct that entry",
-    )

@@ -137,12 +137,7 @@ def broadcast(argument: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArra
 
 
 def array(
-    argument: str,
-    value: ArrayLike,
-    shape: tuple[int, ...],
-    joint_names: Sequence[str],
-    *,
-    finite: bool = True,
+    argument: str, value: ArrayLike, shape: tuple[int, ...], joint_names: Sequence[str], *, finite: bool = True
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
@@ -210,9 +205,7 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
     mask = read_array(argument, value, "b")
     if mask.shape != (num_envs,):
         raise InvalidArgumentError(
-            argument,
-            f"has shape {mask.shape}, needs ({num_envs},)",
-            remedy="use e.g. mask = ~obs.ok",
+            argument, f"has shape {mask.shape}, needs ({num_envs},)", remedy="use e.g. mask = ~obs.ok"
         )
     return mask
 

@@ -114,11 +114,12 @@ class PIDControl(Control):
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate, _ = self._command
         last = step + 1 == self._substeps
-        inputs = (qvel if self._measures_rate else None, setpoint_rate, feedforward, last)
+        inputs = (qvel if self._measures_rate else None, setpoint_rate, feedforward)
         if self._whole:
-            new = advance_with_mass_matrix(self._coefficients, self._state, setpoint, qpos, self._matrix, *inputs)
+            at = (self._state, setpoint, qpos, self._matrix)
+            new = advance_with_mass_matrix(self._coefficients, *at, *inputs, terms=last)
         else:
-            new = bp.advance(self._scaled, self._state, setpoint, qpos, *inputs)
+            new = bp.advance(self._scaled, self._state, setpoint, qpos, *inputs, terms=last)
         if last:
             self.saturated = new[2].saturated
         self._state, effort = new[:2]

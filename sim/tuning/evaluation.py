@@ -74,7 +74,7 @@ def step_response_metrics(
     Without ``with_effort`` those of the efforts are undefined (NaN), as under control "drive".
     """
     return step_metrics(
-        rollout.tick * np.arange(1, len(rollout.time) + 1),  # the rollout's own time, however long the runner has run
+        rollout.tick,
         rollout.setpoint,
         np.where(rollout.ok[..., None], rollout.qpos, np.nan),
         start=start,

@@ -31,12 +31,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "back calculation": LIMITED | {"anti_windup": "back_calculation", "tracking_time": [0.1, 0.001, 0.0]},
     "mixed": LIMITED | {"anti_windup": ["back_calculation", "conditional", "clamp"]},
     "mixed per env": LIMITED
-    | {
-        "anti_windup": [
-            ["none", "conditional", "clamp"],
-            *[["back_calculation", "conditional", "none"]] * (ENVS - 1),
-        ]
-    },
+    | {"anti_windup": [["none", "conditional", "clamp"], *[["back_calculation", "conditional", "none"]] * (ENVS - 1)]},
     "continuous": GAINS | {"continuous": [True, False, True]},
     "integrate first": LIMITED | {"integration": "integrate_first", "anti_windup": "conditional"},
     "zero effort": LIMITED | {"non_finite": "zero"},

@@ -41,10 +41,7 @@ def random_chain(seed, joints=4, poses=5):
 
 
 @given(
-    inertia=st.floats(1e-6, 1e3),
-    hertz=st.floats(0.1, 20),
-    zeta=st.floats(0.2, 2),
-    ti=st.none() | st.floats(0.05, 5),
+    inertia=st.floats(1e-6, 1e3), hertz=st.floats(0.1, 20), zeta=st.floats(0.2, 2), ti=st.none() | st.floats(0.05, 5)
 )
 def test_gains_are_the_textbooks(inertia, hertz, zeta, ti):
     w = 2 * np.pi * hertz
@@ -97,7 +94,7 @@ def test_a_step_settles_as_said_without_overshoot():
         v = v + DT * effort / np.diag(robot.mass[0])
         q = q + DT * v
         course.append(q)
-    m = step_metrics(DT * np.arange(1, 4001), [1.0, 1.0], np.array(course), start=[0.0, 0.0])
+    m = step_metrics(DT, [1.0, 1.0], np.array(course), start=[0.0, 0.0])
     assert (m.settling_time < 2 / 2.0 + 0.05).all()
     assert (m.overshoot < 1e-3).all()
     assert (m.steady_state_error < 1e-3).all()

@@ -44,7 +44,7 @@ def test_a_controller_shows_its_size_and_whether_it_started():
 def test_figures_and_trajectories_show_their_ranges():
     move = minimum_jerk([0.0, 1.0], [1.0, 3.0], 0.01, duration=1.0)
     assert repr(move).startswith("Trajectory(100 ticks, 2 joints, time 0.01 to 1, position")
-    metrics = step_metrics(move.time, [1.0, 3.0], move.position[:, None], start=[0.0, 1.0])
+    metrics = step_metrics(0.01, [1.0, 3.0], move.position[:, None], start=[0.0, 1.0])
     assert repr(metrics).startswith("StepMetrics(1 env, 2 joints, rise_time")
     assert "effort_peak nan" in repr(metrics)
 

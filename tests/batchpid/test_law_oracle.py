@@ -74,13 +74,7 @@ def test_terms_add_up(options, inputs):
     state = bp.init(params, inputs.measurement[0])
     for t in range(5):
         state, effort, terms = bp.step(
-            params,
-            state,
-            inputs.setpoint[t],
-            inputs.measurement[t],
-            DT,
-            feedforward=inputs.feedforward[t],
-            terms=True,
+            params, state, inputs.setpoint[t], inputs.measurement[t], DT, feedforward=inputs.feedforward[t], terms=True
         )
         assert np.array_equal(terms.feedforward, inputs.feedforward[t])
         np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)

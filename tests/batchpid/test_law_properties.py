@@ -158,7 +158,7 @@ def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates)
 def test_track_needs_an_integral_and_where_it_integrates_first_a_time_step():
     y = np.zeros((1, 2))
     params = bp.make_params(2, 1.0)
-    with pytest.raises(bp.InvalidArgumentError, match=r"ki.*nothing can carry"):
+    with pytest.raises(bp.InvalidArgumentError, match=r"ki.*no integral can carry"):
         bp.track(params, bp.init(params, y), y, y, y)
     params = bp.make_params(2, 1.0, 1.0, integration="integrate_first")
     with pytest.raises(bp.InvalidArgumentError, match=r"dt.*integrate first"):
@@ -272,7 +272,7 @@ def test_nothing_given_is_written_to_or_kept(case, run):
 def test_a_time_step_that_is_none_is_refused(dt):
     params = bp.make_params(1, 1.0)
     y = np.zeros((1, 1))
-    with pytest.raises(bp.InvalidArgumentError, match="dt: is not positive"):
+    with pytest.raises(bp.InvalidArgumentError, match="dt: must be positive"):
         bp.step(params, bp.init(params, y), y, y, dt)
 
 

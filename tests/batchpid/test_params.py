@@ -77,10 +77,7 @@ BAD = {
     "rate": ({"effort_rate_limit": 0.0}, "effort_rate_limit, joint 0.*> 0"),
     "filter": ({"derivative_filter_time": -0.1}, "derivative_filter_time"),
     "deadband": ({"deadband": np.inf}, "deadband"),
-    "strategy": (
-        {"anti_windup": ["none", "wind", "none"]},
-        "anti_windup, joint 1: .*'wind'.*back_calculation",
-    ),
+    "strategy": ({"anti_windup": ["none", "wind", "none"]}, "anti_windup, joint 1: .*'wind'.*back_calculation"),
     "clamp": ({"anti_windup": "clamp"}, "anti_windup: 'clamp' has no limit"),
     "tracking": ({"tracking_time": 1.0}, "tracking_time: is given, but no joint"),
     "continuous": ({"continuous": 1.0}, "continuous: cannot be read as an array of bools"),

@@ -82,10 +82,7 @@ BAD = {
     "unknown key": ('{"format": "batchpid-params-1", "joint": {}}', "unknown option .got .joint...*joints"),
     "no joints": ('{"format": "batchpid-params-1", "joints": {}}', "must map names"),
     "no kp": (JOINT % '"kd": 1.0', "'elbow'.*no kp"),
-    "unknown option": (
-        JOINT % '"kp": 1.0, "kq": 2.0',
-        "kq, joint 'elbow': unknown option.*use one of kp, ki",
-    ),
+    "unknown option": (JOINT % '"kp": 1.0, "kq": 2.0', "kq, joint 'elbow': unknown option.*use one of kp, ki"),
     "negative": (JOINT % '"kp": -1.0', "kp, joint 'elbow'.*-1.0"),
     "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
     "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is no float"),
@@ -94,18 +91,12 @@ BAD = {
     "null": (JOINT % '"kp": null', "no float"),
     "nested": (JOINT % '"kp": [[1.0]]', "no float"),
     "empty": (JOINT % '"kp": []', "no float"),
-    "strategy": (
-        JOINT % '"kp": 1.0, "anti_windup": "magic"',
-        "anti_windup, joint 'elbow'.*magic.*back_calculation",
-    ),
+    "strategy": (JOINT % '"kp": 1.0, "anti_windup": "magic"', "anti_windup, joint 'elbow'.*magic.*back_calculation"),
     "integration": (
         '{"format": "batchpid-params-1", "integration": [], "joints": {"elbow": {"kp": 1.0}}}',
         "integration.*use one of 'output_first'",
     ),
-    "dtype": (
-        '{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}',
-        "dtype",
-    ),
+    "dtype": ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}', "dtype"),
     "twice": (JOINT % '"kp": 1.0, "kp": 2.0', "given twice"),
     "deep": ("[" * 100_000, "cannot be read"),
 }

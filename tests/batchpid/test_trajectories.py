@@ -130,14 +130,8 @@ def test_moves_follow_one_another_and_hold():
         (lambda: minimum_jerk([0, 0], [1, 1, 1], DT, duration=1.0), "target"),
         (lambda: minimum_jerk(0.0, 1.0, DT, duration=1.0), "target"),
         (lambda: minimum_jerk([0, 0], [1, 1], 0.0, duration=1.0), "dt"),
-        (
-            lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, -1], max_acceleration=1),
-            "max_velocity, joint 1",
-        ),
-        (
-            lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=1, max_acceleration=np.inf),
-            "max_acceleration",
-        ),
+        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, -1], max_acceleration=1), "max_velocity, joint 1"),
+        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=1, max_acceleration=np.inf), "max_acceleration"),
         (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, 1, 1], max_acceleration=1), "max_velocity"),
         (lambda: trapezoidal(["a"], [1], DT, max_velocity=1, max_acceleration=1), "start"),
     ],

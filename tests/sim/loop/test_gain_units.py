@@ -34,7 +34,7 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
     with Runner(robot, 1, params=acceleration_params(robot, "mass_matrix"), workers=0, substeps=10) as runner:
         runner.reset(robot.settings.start)
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (400, robot.dof)))
-    m = step_metrics(rollout.time, robot.settings.target, rollout.qpos, start=robot.settings.start)
+    m = step_metrics(rollout.tick, robot.settings.target, rollout.qpos, start=robot.settings.start)
     arm = slice(0, 7)
     assert (m.settling_time[0, arm] < 1.0).all()
     assert (np.nan_to_num(m.overshoot[0, arm]) < 0.01).all()
