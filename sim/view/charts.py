@@ -15,8 +15,6 @@ _LIMIT_RATIO = 4.0
 """A limit is drawn where it is less than this many times the largest effort."""
 _MIN_RANGE = {"min": -0.012, "max": 0.012}
 """Smallest range of a vertical axis [rad, m, N m or N]: noise alone should not fill a chart."""
-_DECIMALS = 4
-"""Positions are rounded to 1e-4 rad or m: smaller differences make a flat line jitter."""
 _SCALES = {
     "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},  # without a fixed range the axis drifts in viser 1.1
     "y": {"range": {end: {"pad": 0.1, "soft": soft, "mode": 1} for end, soft in _MIN_RANGE.items()}},
@@ -71,8 +69,9 @@ class Charts:
             for limit in data.effort_limits(env, joint)
         ]
         described = data.robot.joints[joint]
+        positions = np.round([*qpos, setpoint[0]], 4)  # smaller differences make a flat line jitter
         for chart, title, curves in (
-            (self._position, f"{described.name} [{described.unit}]", np.round([*qpos, setpoint[0]], _DECIMALS)),
+            (self._position, f"{described.name} [{described.unit}]", positions),
             (self._error, f"setpoint - qpos [{described.unit}]", setpoint - qpos),
             (self._effort, f"effort [{described.effort_unit}]", [*limits, *effort]),
         ):

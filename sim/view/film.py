@@ -62,7 +62,7 @@ def render_problem(program: str = TEST_PROGRAM) -> str | None:
         return "a first picture took more than 120 s"
     if "rendered" in result.stdout:
         return None
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    lines = result.stderr.strip().splitlines()
     return lines[-1] if lines else f"the test ended with status {result.returncode}"
 
 
@@ -177,7 +177,6 @@ class _RenderScene:
         material = sapien.render.RenderMaterial(base_color=[0.62, 0.66, 0.72, 1.0], roughness=0.9)
         self.scene.add_ground(0.0, render_material=material, render_half_size=[20, 20])
         loader = self.scene.create_urdf_loader()
-        loader.fix_root_link = True
         self._articulations = [loader.load(str(robot.path)) for _ in layout.positions]
         for articulation, position in zip(self._articulations, layout.positions, strict=True):
             articulation.set_root_pose(sapien.Pose(position))

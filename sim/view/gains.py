@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +33,13 @@ _MAX_EFFORT = 1e3
 
 
 class GroupGains:
-    """Gains of one group: ``sets`` of one row each and the same gain units, by name. It starts with the first."""
+    """Gains of one group. ``sets`` are params of one row by name; the group starts with the first."""
 
     def __init__(self, robot: Robot, sets: dict[str, bp.PIDParams]) -> None:
-        self._robot, base = robot, next(iter(sets.values()))
-        if base.setpoint_weight is None:  # without effect as long as the weight is 1
-            base = base.replace(weight_origin="start")
-        self._sets = {name: base.replace(**_values(params)) for name, params in sets.items()}
-        self.set_names = tuple(sets)
-        """Names that :meth:`apply_set` takes."""
-        self.params = self._sets[self.set_names[0]]
+        self._robot = robot
+        self.sets = {name: _adjustable(params) for name, params in sets.items()}
+        """Params by name, with every option on that a slider sets."""
+        self.params = next(iter(self.sets.values()))
         """Params in force."""
 
     @property
@@ -52,8 +48,8 @@ class GroupGains:
         return _values(self.params)
 
     def apply_set(self, name: str) -> None:
-        """Give every joint the gains of a named set; the other options stay those of the first set."""
-        self.params = self._sets[choice("name", name, self._sets)]
+        """Use the params of a named set on every joint."""
+        self.params = self.sets[choice("name", name, self.sets)]
 
     def set(self, gain: str, joint: int, value: float) -> None:
         """Set one of :data:`GAINS` of a joint."""
@@ -67,8 +63,9 @@ class GroupGains:
     def slider_range(self, gain: str, joint: int) -> tuple[float, float]:
         """Return a gain of a joint, and the upper end of the range worth trying."""
         name = "effort_max" if gain == "effort_limit" else choice("gain", gain, GAINS)
-        value = float(self.values[name][joint])
-        largest = max(float(_values(params)[name][joint]) for params in self._sets.values())
+        value, units = float(self.values[name][joint]), type(self.params.gain_units)
+        same_units = [params for params in self.sets.values() if isinstance(params.gain_units, units)]
+        largest = max(float(_values(params)[name][joint]) for params in same_units)
         if gain == "effort_limit":
             return min(value, _MAX_EFFORT), min(float(self._robot.effort_limit[joint]), _MAX_EFFORT)
         ends = {"setpoint_weight": 1.0, "derivative_filter_time": max(0.02, largest)}
@@ -86,8 +83,7 @@ class GroupGains:
 def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:
     """Return the gain sets that the page offers for a control, by name; the first is in force at the start.
 
-    For the PID these are the given ``params``, tuned, designed and tutorial gains, as far as the robot has them in the
-    gain units of the first.
+    For the PID: the given ``params``, then the tuned, designed and tutorial gains as far as the robot has them.
 
     Raises
     ------
@@ -95,22 +91,25 @@ def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> di
         ``params`` are not one row of gains for the joints of ``robot``.
     """
     sets: dict[str, bp.PIDParams] = {}
-    if control == "pid":
-        units = "mass_matrix"
-        if params is not None:
-            sets["given"] = check_params(params, robot, 1, control)
-            units = params.options()["gain_units"]
-        for name, make in (("tuned", robot.tuned), ("designed", partial(robot.designed, units))):
-            with suppress(InvalidArgumentError):  # only bundled robots have tuned gains
-                sets |= {name: make()} if robot.fixed_base else {}
+    if control == "pid" and params is not None:
+        sets["given"] = check_params(params, robot, 1, control)
+    if control == "pid" and robot.fixed_base:
+        for name, make in (("tuned", robot.tuned), ("designed", robot.designed)):
+            with suppress(InvalidArgumentError):  # not every robot has them
+                sets[name] = make()
     if robot.settings is not None:
         sets["tutorial"] = robot.params() if control == "pid" else default_params(robot, control)
     if not sets:  # a critically damped 10 rad/s, for an inertia of 1 where the base floats
         inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else 1.0
         limit = None if control == "drive" else robot.effort_limit
         sets["default"] = robot.params(kp=100 * inertia, ki=0.0, kd=20 * inertia, effort_limit=limit)
-    marker = type(next(iter(sets.values())).gain_units)
-    return {name: params for name, params in sets.items() if isinstance(params.gain_units, marker)}
+    return sets
+
+
+def _adjustable(params: bp.PIDParams) -> bp.PIDParams:
+    """Return ``params`` with every option on that a slider sets."""
+    weightless = params.setpoint_weight is None  # then the origin has no effect until the weight is changed
+    return params.replace(**_values(params), **{"weight_origin": "start"} if weightless else {})
 
 
 def _values(params: bp.PIDParams) -> dict[str, Float64]:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import redirect_stdout
+from contextlib import AbstractContextManager, redirect_stdout
 from typing import Any
 
 from batchpid.errors import MissingDependencyError
@@ -17,11 +17,13 @@ from sim.view.data import ViewData
 from sim.view.panel import Panel
 from sim.view.scene import RobotScene
 
-CHARTS_EVERY, STATUS_EVERY = 5, 15
-"""Frames between two updates of the charts, and of the status."""
+CHARTS_EVERY = 5
+"""Frames between two updates of the charts."""
+STATUS_EVERY = 15
+"""Frames between two updates of the status."""
 
 
-class View:
+class View(AbstractContextManager["View"]):
     """Page that shows ``data``, served at ``host`` and ``port``, or at the next free port, until :meth:`close`.
 
     Raises
@@ -54,9 +56,8 @@ class View:
             self._charts = Charts(gui, data)
         charts.dock_left()
         charts.set_width(380)
-        self._stopped = False
+        self._stopped = self._settled = False
         self._shown: tuple[Any, ...] = ()
-        self._settled = False
 
     def run(self, seconds: float | None = None) -> None:
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
@@ -99,9 +100,6 @@ class View:
         with redirect_stdout(io.StringIO()):
             thread.start()
             thread.join(timeout=0.5)
-
-    def __enter__(self) -> View:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

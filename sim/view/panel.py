@@ -163,7 +163,7 @@ class Panel:
             label = "filter [ms]" if gain in _MILLISECONDS else gain.replace("_", " ")
             sliders[gain] = gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)
             self._on(sliders[gain], partial(change, gain))
-        names = dict.fromkeys(name for gains in live.gains.values() for name in gains.set_names)
+        names = dict.fromkeys(name for gains in live.gains.values() for name in gains.sets)
         buttons = gui.add_button_group("All joints to", tuple(names))
 
         def update() -> None:
@@ -181,7 +181,7 @@ class Panel:
                 slider.max, slider.step, slider.value = max(value, high), _slider_step(high), value
 
         def apply(name: str) -> None:
-            if name in live.gains[group.value].set_names:
+            if name in live.gains[group.value].sets:
                 live.gains[group.value].apply_set(name)
                 update()
 
@@ -193,11 +193,10 @@ class Panel:
     def _add_disturbances(self, live: LiveSimulation) -> None:
         gui, links = self._gui, live.kinematics.links
         link = gui.add_dropdown("On link", links, initial_value=links[live.load_link])
-        payload = gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0)
+        self._on(link, lambda name: setattr(live, "load_link", live.kinematics.index(name)))
+        self._on(gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0), partial(setattr, live, "payload"))
         force = gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0)
         push = gui.add_button_group("Push along", tuple(_DIRECTIONS))
-        self._on(link, lambda name: setattr(live, "load_link", live.kinematics.index(name)))
-        self._on(payload, partial(setattr, live, "payload"))
         self._on(push, lambda name: live.push(force.value * _DIRECTIONS[name]))
 
 

@@ -26,8 +26,10 @@ from sim.view.playback import HISTORY_SECONDS
 Float64 = NDArray[np.float64]
 
 CONTROLS = ("pid", "drive")
-PUSH_SECONDS, GRAVITY = 0.25, 9.81
-"""Duration of a push [s], and acceleration of a payload [m/s^2]."""
+PUSH_SECONDS = 0.25
+"""Duration of a push [s]."""
+GRAVITY = 9.81
+"""Acceleration of a payload [m/s^2]."""
 
 
 class LiveSimulation:

@@ -7,25 +7,12 @@ from batchpid.errors import InvalidArgumentError
 from sim.view.gains import GroupGains, offered_gains
 
 
-def test_tuned_and_designed_gains_are_offered_without_params(panda):
+def test_the_robots_gains_are_offered_after_the_given_ones(panda):
     sets = offered_gains(panda, "pid", None)
-    assert list(sets) == ["tuned", "designed"]
+    assert list(sets) == ["tuned", "designed", "tutorial"]
     np.testing.assert_array_equal(sets["designed"].kp, panda.designed().kp)
+    assert list(offered_gains(panda, "pid", panda.params(kp=50.0))) == ["given", *sets]
     assert list(offered_gains(panda, "drive", None)) == ["tutorial"]
-
-
-@pytest.mark.parametrize(
-    ("units", "names"),
-    [
-        ("mass_matrix", ["given", "tuned", "designed"]),
-        ("inertia", ["given", "designed"]),
-        ("effort", ["given", "designed", "tutorial"]),
-    ],
-)
-def test_only_gains_in_the_units_of_the_given_params_are_offered(panda, units, names):
-    sets = offered_gains(panda, "pid", panda.params(kp=50.0, gain_units=units))
-    assert list(sets) == names
-    assert {params.options()["gain_units"] for params in sets.values()} == {units}
 
 
 def test_params_of_several_rows_are_refused(panda):
@@ -33,16 +20,14 @@ def test_params_of_several_rows_are_refused(panda):
         offered_gains(panda, "pid", panda.params(kp=np.ones((2, panda.dof))))
 
 
-def test_a_set_replaces_the_gains_and_keeps_the_other_options(panda):
-    tuned, designed = panda.tuned().replace(deadband=1e-3), panda.designed()
-    gains = GroupGains(panda, {"given": tuned, "designed": designed})
-    assert gains.set_names == ("given", "designed")
-    np.testing.assert_array_equal(gains.params.kp, tuned.kp)
+def test_a_set_replaces_all_params(panda):
+    designed = panda.designed()
+    gains = GroupGains(panda, {"given": panda.params(kp=50.0, deadband=1e-3), "designed": designed})
+    assert list(gains.sets) == ["given", "designed"]
+    assert (gains.params.kp == 50.0).all()
     gains.apply_set("designed")
-    for name in ("kp", "ki", "kd", "derivative_filter_time", "setpoint_weight"):
-        np.testing.assert_array_equal(getattr(gains.params, name), getattr(designed, name))
-    np.testing.assert_array_equal(gains.params.deadband, tuned.deadband)
-    assert gains.params.weight_origin == designed.weight_origin
+    for ours, theirs in zip(gains.params, designed, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
     with pytest.raises(InvalidArgumentError, match="name"):
         gains.apply_set("tutorial")
 
@@ -77,8 +62,8 @@ def test_a_filter_or_weight_switched_off_stays_part_of_the_law(panda):
     assert gains.params.setpoint_weight is not None
 
 
-def test_sliders_reach_beyond_every_set(panda):
-    gains = GroupGains(panda, {"tutorial": panda.params()})
+def test_sliders_reach_beyond_every_set_in_the_same_units(panda):
+    gains = GroupGains(panda, {"tutorial": panda.params(), "tuned": panda.tuned()})
     value, end = gains.slider_range("kp", 0)
     assert (value, end) == (panda.settings.kp[0], 4 * panda.settings.kp[0])
     assert gains.slider_range("effort_limit", 0) == (87.0, 87.0)

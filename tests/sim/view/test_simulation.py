@@ -61,6 +61,17 @@ def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, 
     live.close()
 
 
+def test_gain_sets_in_other_units_are_applied_without_a_bump(panda):
+    live = LiveSimulation(panda, 1, workers=0, spread=0.0, physics="fast")  # so that the setpoint weight is no matter
+    live.payload = 1.0
+    before, _ = run(live, 4.0)
+    for name in ("tutorial", "designed"):
+        live.gains["pid"].apply_set(name)
+        qpos, _ = run(live, 0.2)
+        assert np.abs(qpos - before)[:, :7].max() < 5e-3
+    live.close()
+
+
 def test_the_motors_hold_a_payload(live):
     live.set_setpoint(live.robot.settings.target)
     free_qpos, free_effort = run(live, 4.0)
