@@ -1,4 +1,4 @@
-"""Every code block of README and docs runs, and every command in their text exists.
+"""Every code block of the pages runs; every command, link and make target in their text exists.
 
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
 which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf`` and ``gains.yaml``; commands that
@@ -21,7 +21,8 @@ from sim import Robot
 from sim.cli import COMMANDS, main, parse
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
+TEXTS = sorted({*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"})
 BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>[\w, ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
 SHORTER = {
     # command: flags that make it short
@@ -52,16 +53,28 @@ def test_every_block_is_of_a_kind_that_is_run():
             assert match["language"] in ("python", "sh", "text"), f"{page.name}: {match[0][:60]}"
 
 
-def test_links_lead_somewhere():
-    for page in [*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"]:
-        text = page.read_text()
-        assert not re.findall(r"`[\w-]+\.md`", text), f"{page.name}: a page named without a link"
-        for target in re.findall(r"\]\(([^)#\s]+)(?:#([\w-]+))?\)", text):
-            path, anchor = page.parent / target[0], target[1]
-            if not re.match(r"\w+:", target[0]):
-                assert path.exists(), f"{page.name}: {target[0]}"
-                titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
-                assert not anchor or anchor in [re.sub(r"[^\w-]", "", t.lower().replace(" ", "-")) for t in titles]
+@pytest.mark.parametrize("page", TEXTS, ids=name)
+def test_every_link_has_a_target(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    assert not re.findall(r"`[\w-]+\.md`", text), "a page is named without a link"
+    for target, anchor in re.findall(r"\]\(([^)#\s]+)(?:#([\w-]+))?\)", text):
+        if re.match(r"\w+:", target):
+            continue
+        path = page.parent / target
+        assert path.exists(), target
+        titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in [re.sub(r"[^\w-]", "", title.lower().replace(" ", "-")) for title in titles]
+
+
+def test_the_pictures_of_the_readme_are_light():
+    for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "README.md").read_text()):
+        assert (ROOT / target).stat().st_size < 400_000, target
+
+
+def test_every_make_target_in_the_text_exists():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in TEXTS:
+        assert set(re.findall(r"`make ([a-z-]+)\b", page.read_text())) <= targets, page
 
 
 def test_every_page_is_in_the_index():
@@ -80,7 +93,7 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
         exec(compile("\n" * line + match["code"], page, "exec"), namespace)
 
 
-@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]), ids=name)
+@pytest.mark.parametrize("page", TEXTS, ids=name)
 def test_commands_in_the_text_have_flags_that_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     arguments = [shlex.split(found) for found in re.findall(r"`batchpid (\w+ [^`]+)`", text)]

@@ -93,7 +93,7 @@ def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
         joint, value = robot.joints[index], setpoint[beyond[:, index].argmax(), index]
         yield (
             f"OUT OF LIMITS: setpoint {value:g} {joint.unit} of {joint.name}, whose limits are "
-            f"[{joint.lower:g}, {joint.upper:g}]: that error cannot go."
+            f"[{joint.lower:g}, {joint.upper:g}]: that error remains."
         )
     if not violations:
         yield "Setpoints out of limits: none."

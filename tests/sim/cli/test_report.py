@@ -103,7 +103,7 @@ def test_setpoints_out_of_limits_say_the_worst_once(panda):
     setpoint = np.tile(panda.settings.target, (ENVS, 1))
     setpoint[:, 3] = [1.0, 0.0, -1.0, 0.5, -3.5]
     assert list(report.limit_lines(panda, setpoint)) == [
-        "OUT OF LIMITS: setpoint 1 rad of panda_joint4, whose limits are [-3.0718, -0.0698]: that error cannot go."
+        "OUT OF LIMITS: setpoint 1 rad of panda_joint4, whose limits are [-3.0718, -0.0698]: that error remains."
     ]
 
 
