@@ -1,7 +1,7 @@
 """Frame rate of ``batchpid view``: frames served and drawn per second, and the real-time factor of the simulation.
 
     python bench/view.py --width 800 --height 600
-    python bench/view.py --robot panda --num-envs 8 --control pid drive --width 1440 --height 900 --picture view.png
+    python bench/view.py panda --num-envs 8 --control pid drive --width 1440 --height 900 --picture view.png
 
 Everything runs on this machine: workers, page server, and headless Chromium, which draws in software at the lowest
 priority (nice 19). ``served`` counts the frames that the view sends, ``drawn`` those that the browser shows.
@@ -47,7 +47,7 @@ COUNT = "window.drawn = 0; const tick = () => { window.drawn++; requestAnimation
 class Options:
     """Options of the measurement."""
 
-    robot: str = "jaco2"
+    robot: tyro.conf.Positional[str] = "jaco2"
     num_envs: int = 16
     control: tuple[Literal["pid", "drive"], ...] = ("pid",)
     physics: Literal["accurate", "fast"] = "fast"
@@ -74,7 +74,7 @@ def main(options: Options) -> None:
         for flag in (*FLAGS, f"--window-size={options.width},{options.height}", f"--user-data-dir={profile}"):
             chrome.add_argument(flag)
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
-        # viser lowers the resolution in a slow browser, unless told not to for a picture.
+        # Without fixedDpr viser lowers the resolution in a slow browser, which would spoil a picture.
         page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
         browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
         for process in browser:

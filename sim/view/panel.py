@@ -68,7 +68,7 @@ class Panel:
 
     @property
     def show_setpoint(self) -> bool:
-        """Whether the setpoint of the watched robot is shown."""
+        """True while the setpoint of the watched robot is shown."""
         return bool(self._show_setpoint.value)
 
     @property
