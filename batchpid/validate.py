@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError
 
+S = TypeVar("S", bound=str)
 T = TypeVar("T")
 
 
@@ -51,13 +52,14 @@ def positive(argument: str, value: Any, unit: str) -> float:
     return value
 
 
-def choice(argument: str, value: Any, known: Collection[str]) -> str:
+def choice(argument: str, value: Any, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
+    chosen: S = value
     if not isinstance(value, str) or value not in known:
         raise InvalidArgumentError(
             argument, "unknown option", value=value, remedy=f"use one of {', '.join(map(repr, known))}"
         )
-    return value
+    return chosen
 
 
 def flag(argument: str, value: Any) -> bool:

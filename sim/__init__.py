@@ -17,6 +17,7 @@ for _name in ("batchpid", "assets"):
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo
+from sim.options import RunnerOptions
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, RobotDescription, register_dynamics
@@ -42,6 +43,7 @@ __all__ = [
     "Rollout",
     "RunInfo",
     "Runner",
+    "RunnerOptions",
     "SetpointWarning",
     "Snapshot",
     "read_recording",

@@ -16,7 +16,7 @@ from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from sim.benchmark.workload import Case, Workload
 from sim.engine.building import parse
 from sim.engine.pack import Pack
-from sim.workers.pool import cores_of_their_own
+from sim.workers.pool import pinned_cores
 from sim.workers.worker import ONE_THREAD
 
 Float64 = NDArray[np.float64]
@@ -34,7 +34,7 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
     """Return every baseline, by name. All run in one set of processes, each of which steps its share of the envs."""
     count = workload.processes
     bounds = [workload.num_envs * index // count for index in range(count + 1)]
-    context, cores = multiprocessing.get_context("spawn"), cores_of_their_own(count)
+    context, cores = multiprocessing.get_context("spawn"), pinned_cores(count)
     connections, processes = [], []
     for index in range(count):
         ours, theirs = context.Pipe()
@@ -81,7 +81,7 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
 def single_threaded() -> Iterator[None]:
     """Limit the BLAS of processes that start now to one thread, as the Runner does with its workers."""
     saved = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    os.environ.update(ONE_THREAD)
     try:
         yield
     finally:

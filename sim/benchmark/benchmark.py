@@ -22,7 +22,9 @@ from sim.benchmark.peers import make_peers
 from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays
-from sim.loop.loop import Loop, LoopSpec
+from sim.loop.loop import Loop
+from sim.options import RunnerOptions
+from sim.robot.robot import Robot
 from sim.workers.shared_memory import SharedArrays
 
 Float64 = NDArray[np.float64]
@@ -111,9 +113,10 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     :meth:`Runner.step` beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
-    spec = LoopSpec(workload.scene(gravity=True), share, workload.robot.params())
-    shared = SharedArrays(Arrays.layout(1, share, workload.robot.dof))
-    loop = Loop(spec, Arrays.of_ticks(shared.arrays, slice(0, share)))
+    robot = Robot.load(workload.robot.path, dissipation="sapien")
+    shared = SharedArrays(Arrays.layout(1, share, robot.dof))
+    options = RunnerOptions(robot, share, physics=workload.physics)
+    loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
     loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, workload.robot.dof)))
     loop.ticks[0].command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)

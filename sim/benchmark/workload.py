@@ -14,6 +14,7 @@ from batchpid.errors import BatchPIDError
 from sim.benchmark.tutorial import tutorial_settings
 from sim.engine.building import SceneSpec
 from sim.engine.physics import PHYSICS
+from sim.options import PhysicsPreset
 from sim.robot.robot import Robot
 from sim.runner import Runner
 
@@ -34,7 +35,7 @@ class Workload:
     robot: Robot
     num_envs: int = 64
     workers: int = 2
-    physics: str = "accurate"
+    physics: PhysicsPreset = "accurate"
     substeps: int = 20
     ticks: int = 100
     rounds: int = 5

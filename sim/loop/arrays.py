@@ -1,7 +1,8 @@
-"""The arrays between a loop and its caller, in shared memory where they are in different processes."""
+"""Arrays between a loop and its caller, in shared memory where they are in different processes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +38,10 @@ class FaultArrays(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """Input and output of one tick of a loop, one row per env. Rate and feedforward count only when a tick says so."""
+    """Input and output of a loop, with leading axes (envs,) for one tick or (ticks, envs) for several.
+
+    Each run tells which commands it uses; the others are ignored.
+    """
 
     command: Command
     observation: Observation
@@ -45,7 +49,7 @@ class Arrays(NamedTuple):
 
     @staticmethod
     def layout(ticks: int, num_envs: int, dof: int) -> Layout:
-        """Return name -> (shape, dtype) of every field, for so many ticks: see :meth:`of_ticks`."""
+        """Return the layout of all fields, for :meth:`from_fields`."""
         row, table = (ticks, num_envs), (ticks, num_envs, dof)
         layout: Layout = {f"command.{name}": (table, np.float64) for name in Command._fields}
         for name, quantity in OBSERVED.items():
@@ -53,25 +57,19 @@ class Arrays(NamedTuple):
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}
 
     @staticmethod
-    def of_ticks(fields: dict[str, NDArray[Any]], envs: slice) -> list[Arrays]:
-        """Return views of ``envs``, for each of the ticks in ``fields``, which are as :meth:`layout` says."""
-        kinds: dict[str, Any] = {"command": Command, "observation": Observation, "fault": FaultArrays}
+    def from_fields(fields: Mapping[str, NDArray[Any]]) -> Arrays:
+        """Return the arrays of ``fields``, named as in :meth:`layout`."""
 
-        def views(tick: int) -> Arrays:
-            return Arrays(
-                **{
-                    group: kind(**{name: fields[f"{group}.{name}"][tick, envs] for name in kind._fields})
-                    for group, kind in kinds.items()
-                }
-            )
+        def group(kind: Any, prefix: str) -> Any:
+            return kind(*(fields[f"{prefix}.{name}"] for name in kind._fields))
 
-        return [views(tick) for tick in range(len(fields["observation.ok"]))]
+        return Arrays(group(Command, "command"), group(Observation, "observation"), group(FaultArrays, "fault"))
 
-    def for_envs(self, envs: slice) -> Arrays:
-        """Return views of some envs."""
+    def at(self, index: Any) -> Arrays:
+        """Return views at an index of the leading axes, such as a tick or a slice of envs."""
         command, observation, fault = self
         return Arrays(
-            command.map(lambda rows: rows[envs]),
-            observation.for_envs(envs),
-            FaultArrays._make(rows[envs] for rows in fault),
+            Command(*(rows[index] for rows in command)),
+            Observation(*(rows[index] for rows in observation)),
+            FaultArrays(*(rows[index] for rows in fault)),
         )

@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.choices import PerMassMatrix
-from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
-from batchpid.errors import InvalidArgumentError
-from batchpid.validate import instance
+from batchpid.computed_torque import advance_with_mass_matrix, convert_integral, per_inertia
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
-from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 
@@ -194,51 +191,8 @@ class EffortControl(Control):
 
 
 _CONTROLS = {"pid": PIDControl, "drive": DriveControl, "effort": EffortControl}
-CONTROLS = tuple(_CONTROLS)
-"""Names of the controls."""
 
 
 def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, pack: Pack) -> Control:
     """Return the control of that name for ``pack``, with ``params`` of one row or one per env."""
     return _CONTROLS[name](scene, params, pack)
-
-
-def default_params(robot: Robot, control: str) -> bp.PIDParams:
-    """Return the params that ``robot`` carries for a control: PID gains, drive gains, or its effort limits alone."""
-    settings = robot.settings
-    if control == "effort":
-        return robot.params(kp=0.0, ki=0.0, kd=0.0)
-    if control == "drive" and settings is not None:
-        return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
-    return robot.params()
-
-
-def check_params(params: bp.PIDParams, robot: Robot, num_envs: int, control: str) -> bp.PIDParams:
-    """Return ``params`` if they fit the robot, the number of envs and the control.
-
-    Raises
-    ------
-    InvalidArgumentError
-        They do not.
-    """
-    instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
-    if params.gain_units is not None and control != "pid":
-        raise InvalidArgumentError(
-            "gain_units",
-            f"have no meaning under control {control!r}",
-            remedy="use control 'pid', or params with gain_units 'effort'",
-        )
-    check_gain_units(params)
-    if params.num_joints != robot.dof:
-        raise InvalidArgumentError(
-            "params",
-            f"hold {params.num_joints} joints, robot {robot.name!r} has {robot.dof}",
-            remedy=f"give one gain for each of {', '.join(robot.joint_names)}",
-        )
-    if params.num_envs not in (1, num_envs):
-        raise InvalidArgumentError(
-            "params",
-            f"hold {params.num_envs} envs, the runner has {num_envs}",
-            remedy="give one row, or one row per env",
-        )
-    return params

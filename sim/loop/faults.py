@@ -20,9 +20,6 @@ from sim.loop.arrays import Arrays
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel")
 """Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite."""
 
-ACTIONS = ("hold", "reset")
-"""Actions on a fault: suspend the env in its last good pose, or reset it to its last start."""
-
 Bool = NDArray[np.bool_]
 
 

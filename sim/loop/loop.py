@@ -7,7 +7,6 @@ group, so that its working set stays in the cache; nothing depends on how envs a
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,77 +14,81 @@ from numpy.typing import NDArray
 import batchpid as bp
 from sim.engine.building import SceneSpec, parse
 from sim.engine.pack import Pack
-from sim.engine.variation import Variation, VariedPack
+from sim.engine.variation import VariedPack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.env_group import EnvGroup
 from sim.loop.snapshot import EnvStates, Snapshot
+from sim.options import RunnerOptions
 
-COMPENSATE = {
-    # name: (gravity, Coriolis and centrifugal)
-    "gravity+coriolis": (True, True),
-    "gravity": (True, False),
-    "none": (False, False),
-}
-IN_STEP = 16
-"""Envs that advance together: enough to share the cost of a call on arrays, few enough to stay in the cache."""
-
-
-@dataclass(frozen=True)
-class LoopSpec:
-    """What a loop is built from, picklable. ``params`` holds one row, or one row for each of ``num_envs``."""
-
-    scene: SceneSpec
-    num_envs: int
-    params: bp.PIDParams
-    control: str = "pid"
-    compensate: str = "gravity+coriolis"
-    pack_size: int = 4
-    first_env: int = 0
-    variation: Variation | None = None
-    on_fault: str = "hold"
-    speed_limit: NDArray[np.float64] | None = None
+GROUP_SIZE = 16
+"""Envs of a group: enough to share the overhead of NumPy calls, few enough for the working set to stay in the cache."""
 
 
 class Loop:
-    """The closed loop of ``spec.num_envs`` robots, which it builds.
+    """Closed loop of some envs of a runner, with their scenes.
 
-    ``ticks`` is where it reads and writes, for each of the ticks that it may be told to run at once. What it does
-    between ticks it tells in the first.
+    Parameters
+    ----------
+    options
+        Options of the runner.
+    params
+        PID parameters of these envs: one row, or one row each.
+    envs
+        Rows of the runner's envs.
+    arrays
+        Input and output (ticks, envs, ...) of these envs, for the ticks of a :meth:`run`. The other methods write to
+        the first tick.
     """
 
-    def __init__(self, spec: LoopSpec, ticks: list[Arrays]) -> None:
-        self.spec, self.ticks = spec, ticks
-        self._builder = parse(spec.scene)
+    def __init__(self, options: RunnerOptions, params: bp.PIDParams, envs: slice, arrays: Arrays) -> None:
+        robot = options.robot
+        self.options, self.arrays = options, arrays
+        self.ticks = [arrays.at(tick) for tick in range(len(arrays.observation.ok))]
+        """Input and output of each tick."""
+        self._first_env = envs.start
+        self._scene = SceneSpec(
+            urdf=robot.urdf,
+            srdf=robot.srdf,
+            joints=robot.joints,
+            timestep=options.timestep,
+            physics=options.solver,
+            dissipation=robot.dissipation,
+            ground=options.ground,
+            fixed_base=robot.fixed_base,
+            build=options.build,
+        )
+        self._builder = parse(self._scene)
         self._steps = 0
-        size = max(IN_STEP // spec.pack_size, 1) * spec.pack_size
-        starts = range(0, spec.num_envs, size)
-        slices = [slice(start, min(start + size, spec.num_envs)) for start in starts]
+        count, pack_size = envs.stop - envs.start, options.scenes_per_system
+        size = max(GROUP_SIZE // pack_size, 1) * pack_size
+        slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         self.groups = [
             EnvGroup(
-                self._build(envs),
-                envs,
-                spec.scene,
-                spec.params.for_envs(envs),
-                control=spec.control,
-                compensate=COMPENSATE[spec.compensate],
-                on_fault=spec.on_fault,
-                speed_limit=spec.speed_limit,
+                self._build(group),
+                group,
+                self._scene,
+                params.for_envs(group),
+                control=options.control,
+                compensate=(options.compensate != "none", options.compensate == "gravity+coriolis"),
+                on_fault=options.on_fault,
+                speed_limit=None if options.speed_limit is None else np.asarray(options.speed_limit),
             )
-            for envs in slices
+            for group in slices
         ]
 
     def _build(self, envs: slice) -> Pack:
-        spec, size = self.spec, envs.stop - envs.start
-        if spec.variation is not None:
-            first, variation = spec.first_env + envs.start, spec.variation.for_envs(envs)
-            return VariedPack(self._builder, spec.scene, size, first, spec.pack_size, variation)
-        return Pack(self._builder, spec.scene, size, spec.first_env + envs.start, spec.pack_size)
+        variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start
+        first = self._first_env + envs.start
+        if variation is None:
+            return Pack(self._builder, self._scene, size, first, pack_size)
+        varied = variation.for_envs(slice(first, first + size))
+        return VariedPack(self._builder, self._scene, size, first, pack_size, varied)
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
         for group in self.groups:
             group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
-            group.observe(self.ticks[0].for_envs(group.envs))
+            group.observe(self.ticks[0].at(group.envs))
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
@@ -97,7 +100,7 @@ class Loop:
         began = time.perf_counter()
         for group in self.groups:
             for done, tick in enumerate(self.ticks[:ticks]):
-                rows = tick.for_envs(group.envs)
+                rows = tick.at(group.envs)
                 setpoint, rate, feedforward = rows.command
                 command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
                 group.run(self._steps + done * substeps, substeps, command)
@@ -117,7 +120,7 @@ class Loop:
         self.set_params(snapshot.params)
         self._place(snapshot.states)
         for group in self.groups:
-            group.observe(self.ticks[0].for_envs(group.envs))
+            group.observe(self.ticks[0].at(group.envs))
 
     def _place(self, states: EnvStates) -> None:
         # The engine's contact caches, and the order in which it solves contacts, depend on its past. Only a new

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from sim.options import ControlMode
 from sim.robot.robot import Robot
 
 NAMES = ("tuned", "designed", "tutorial", "drive")
@@ -18,7 +19,7 @@ class GainSet(NamedTuple):
 
     name: str
     params: bp.PIDParams
-    control: str = "pid"
+    control: ControlMode = "pid"
 
 
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:

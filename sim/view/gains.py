@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice
-from sim.loop.control import check_params, default_params
+from sim.options import ControlMode, RunnerOptions, default_params
 from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
@@ -80,7 +80,7 @@ class GroupGains:
         return self.params.replace(**{end: disturbance + values[end] for end in ("effort_min", "effort_max")})
 
 
-def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:
+def offered_gains(robot: Robot, control: ControlMode, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:
     """Return the gain sets that the page offers for a control, by name; the first is in force at the start.
 
     For the PID: the given ``params``, then the tuned, designed and tutorial gains as far as the robot has them.
@@ -92,7 +92,7 @@ def offered_gains(robot: Robot, control: str, params: bp.PIDParams | None) -> di
     """
     sets: dict[str, bp.PIDParams] = {}
     if control == "pid" and params is not None:
-        sets["given"] = check_params(params, robot, 1, control)
+        sets["given"] = RunnerOptions(robot, 1, control=control).check_params(params)
     if control == "pid" and robot.fixed_base:
         for name, make in (("tuned", robot.tuned), ("designed", robot.designed)):
             with suppress(InvalidArgumentError):  # not every robot has them

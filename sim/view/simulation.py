@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.validate import choice, integer, number
 from sim.observation import Observation, Rollout
+from sim.options import ControlMode
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 from sim.runner import Runner
@@ -25,7 +26,7 @@ from sim.view.playback import HISTORY_SECONDS
 
 Float64 = NDArray[np.float64]
 
-CONTROLS = ("pid", "drive")
+CONTROLS: tuple[ControlMode, ...] = ("pid", "drive")
 PUSH_SECONDS = 0.25
 """Duration of a push [s]."""
 GRAVITY = 9.81
@@ -61,7 +62,7 @@ class LiveSimulation:
         robot: Robot,
         num_envs: int,
         *,
-        controls: tuple[str, ...] = ("pid",),
+        controls: tuple[ControlMode, ...] = ("pid",),
         period: float = 1 / 30,
         spread: float = 0.2,
         seed: int = 0,
@@ -155,7 +156,7 @@ class LiveSimulation:
         """Close the runners."""
         self._resources.close()
 
-    def _step(self, control: str, runner: Runner, disturbance: Float64) -> None:
+    def _step(self, control: ControlMode, runner: Runner, disturbance: Float64) -> None:
         gains, loaded = self.gains[control], bool(disturbance.any())
         params = gains.params_under(disturbance) if loaded and control == "pid" else gains.params
         if runner.params is not params:

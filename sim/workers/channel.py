@@ -1,4 +1,4 @@
-"""Messages between two processes over a socket; whoever waits for the other side can see to it meanwhile."""
+"""Messages between two processes over a stream socket, with a callback while the other side is slow."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import struct
 from collections.abc import Callable
 
 _HEAD = struct.Struct("<Q")  # bytes of the message that follows
-_LOOK = 0.1  # seconds between two calls of ``waiting``
-_LEAST, _MOST = 1 << 12, 1 << 20  # bytes to read at once
+_WAIT_INTERVAL = 0.1  # seconds between two calls of ``on_wait``
+_MIN_READ, _MAX_READ = 1 << 12, 1 << 20  # bytes to read at once
 
 
 class Channel:
-    """One end of a stream ``connected`` to another one.
+    """One end of a connected stream socket.
 
-    ``waiting`` is called now and then while the other side does not take, or does not send, the rest of a message;
-    what it raises ends the wait.
+    ``on_wait`` is called every 0.1 s while the other side does not take, or does not send, the rest of a message; an
+    exception that it raises ends the wait.
     """
 
-    def __init__(self, connected: socket.socket, waiting: Callable[[], None] | None = None) -> None:
-        self._socket, self._waiting = connected, waiting
-        self._ahead = b""  # received, and not yet asked for
-        connected.setblocking(waiting is None)
+    def __init__(self, connection: socket.socket, on_wait: Callable[[], None] | None = None) -> None:
+        self._socket, self._on_wait = connection, on_wait
+        self._unread = b""  # received, but not yet returned
+        connection.setblocking(on_wait is None)
 
     def fileno(self) -> int:
-        """File descriptor; it becomes readable when there is a message, or the other side is gone."""
+        """Return the file descriptor; it becomes readable when a message arrives or the other side closes."""
         return self._socket.fileno()
 
     def send(self, message: bytes) -> None:
@@ -34,7 +34,7 @@ class Channel:
         Raises
         ------
         OSError
-            The other side is gone.
+            The other side is closed.
         """
         rest = memoryview(_HEAD.pack(len(message)) + message)
         while rest:
@@ -44,38 +44,38 @@ class Channel:
                 self._wait(select.POLLOUT)
 
     def receive(self) -> bytes:
-        """Wait for the next message.
+        """Wait for the next message and return it.
 
         Raises
         ------
         EOFError, OSError
-            The other side is gone.
+            The other side is closed.
         """
-        (count,) = _HEAD.unpack(self._take(_HEAD.size))
-        return self._take(count)
+        (count,) = _HEAD.unpack(self._read(_HEAD.size))
+        return self._read(count)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close this end."""
         self._socket.close()
 
-    def _take(self, count: int) -> bytes:
-        parts, lacking = [self._ahead], count - len(self._ahead)
-        while lacking > 0:
+    def _read(self, count: int) -> bytes:
+        parts, missing = [self._unread], count - len(self._unread)
+        while missing > 0:
             try:
-                part = self._socket.recv(min(max(lacking, _LEAST), _MOST))
+                part = self._socket.recv(min(max(missing, _MIN_READ), _MAX_READ))
             except BlockingIOError:
                 self._wait(select.POLLIN)
                 continue
             if not part:
-                raise EOFError("the other side is gone")
+                raise EOFError("the other side is closed")
             parts.append(part)
-            lacking -= len(part)
-        taken = b"".join(parts)
-        self._ahead = taken[count:]
-        return taken[:count]
+            missing -= len(part)
+        data = b"".join(parts)
+        self._unread = data[count:]
+        return data[:count]
 
     def _wait(self, event: int) -> None:
         poll = select.poll()
         poll.register(self._socket, event)
-        if not poll.poll(1e3 * _LOOK) and self._waiting is not None:
-            self._waiting()
+        if not poll.poll(1e3 * _WAIT_INTERVAL) and self._on_wait is not None:
+            self._on_wait()

@@ -1,81 +1,198 @@
-"""What workers are asked to do. A command is for all envs, and knows how to ask each worker for its part."""
+"""Requests to workers. Each is for all envs of a pool, and makes the part for the envs of one worker."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+import pickle
+import struct
+from abc import ABC, abstractmethod
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sim.loop.arrays import Command
-from sim.workers.worker import LocalWorker, ProcessWorker
+import batchpid as bp
+from sim.loop.arrays import Arrays, Command
+from sim.loop.loop import Loop
+from sim.loop.snapshot import EnvStates, Snapshot
 
-Worker = LocalWorker | ProcessWorker
+_RUN = struct.Struct("<cII??")  # b"R", ticks, substeps, use_rate, use_feedforward
 
 
-class Request:
-    """Base of all requests."""
+class Request(ABC):
+    """Base of all requests, which are frozen dataclasses."""
 
     idle_limit = 10.0
-    """Seconds for which a worker may sleep meanwhile: it may be building, with the caller's own code."""
+    """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
+    is_replayed = True
+    """Whether it changes the loop, so that a replacement of a lost worker has to repeat it."""
 
-    def send(self, worker: Worker, envs: slice) -> None:
-        """Ask ``worker``, whose envs are ``envs``."""
-        raise NotImplementedError
+    @property
+    def observed_tick(self) -> int | None:
+        """Tick of the arrays that holds the observation afterwards; None: the observation does not change."""
+        return None
 
-    def limit(self, envs: int) -> float:
-        """Seconds that it takes for so many envs at the very most."""
-        return 1e-2 * envs
+    def limit(self, num_envs: int) -> float:
+        """Return an upper bound of the seconds that it takes for so many envs."""
+        return 1e-2 * num_envs
+
+    def for_envs(self, envs: slice) -> Self:
+        """Return the part of some envs, of fields that are arrays (envs, ...) or have such a method."""
+        parts = (value.for_envs(envs) if hasattr(value, "for_envs") else value[envs] for value in vars(self).values())
+        return type(self)(*parts)
+
+    def copy(self) -> Self:
+        """Return a copy that later writes to the caller's arrays do not change."""
+        return deepcopy(self)
+
+    def write(self, arrays: Arrays) -> None:  # noqa: B027  (most requests travel in the message)
+        """Write what travels in the shared arrays (ticks, envs, ...) of its envs."""
+
+    def encode(self) -> bytes:
+        """Return the message from which :func:`decode` makes the request in a worker process."""
+        return pickle.dumps(self)
+
+    @abstractmethod
+    def apply(self, loop: Loop) -> Any:
+        """Execute it and return its result."""
+
+
+def decode(message: bytes) -> Request:
+    """Return the request of a message from :meth:`Request.encode`."""
+    if message[:1] == b"R":
+        return Run(*_RUN.unpack(message)[1:])
+    request: Request = pickle.loads(message)
+    return request
 
 
 @dataclass(frozen=True)
 class Start(Request):
-    """What a new process does unasked: build its loop."""
+    """Build the loop. A new worker does it without being asked."""
 
-    def send(self, worker: Worker, envs: slice) -> None:
-        """Do nothing."""
+    def limit(self, num_envs: int) -> float:
+        """Return an upper bound of the seconds: mostly imports, from a disk that may be slow."""
+        return 60.0 + super().limit(num_envs)
 
-    def limit(self, envs: int) -> float:
-        """Seconds that it takes at the very most: mostly imports, from a disk that may be slow."""
-        return 60.0 + super().limit(envs)
+    def apply(self, loop: Loop) -> None:
+        """Do nothing more."""
 
 
 @dataclass(frozen=True)
-class Call(Request):
-    """Call a method of the loop. Arrays among ``args`` have a row for each env; ``for_envs`` takes parts of others."""
+class Reset(Request):
+    """Place the envs of ``mask`` (envs,) at ``qpos`` and ``qvel`` (envs, dof)."""
 
-    method: str
-    args: tuple[Any, ...] = ()
+    mask: NDArray[np.bool_]
+    qpos: NDArray[np.float64]
+    qvel: NDArray[np.float64]
+    observed_tick = 0
 
-    def send(self, worker: Worker, envs: slice) -> None:
-        """Ask ``worker``, whose envs are ``envs``."""
-        parts = (arg.for_envs(envs) if hasattr(arg, "for_envs") else arg[envs] for arg in self.args)
-        worker.send(self.method, *parts)
+    def apply(self, loop: Loop) -> None:
+        """Reset the loop."""
+        loop.reset(self.mask, self.qpos, self.qvel)
 
 
 @dataclass(frozen=True)
 class Run(Request):
-    """Run ticks under ``command`` (ticks, envs, dof)."""
+    """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, dof), which travels in the arrays."""
 
-    command: Command
     ticks: int
     substeps: int
+    use_rate: bool
+    use_feedforward: bool
+    command: Command = Command(None)  # noqa: RUF009  (immutable)
+    idle_limit = 0.7  # it only computes
 
-    idle_limit = 0.7  # ticks do nothing but compute
+    @staticmethod
+    def under(command: Command, substeps: int) -> Run:
+        """Return the run of all ticks of ``command`` (ticks, envs, dof)."""
+        setpoint, rate, feedforward = command
+        return Run(len(setpoint), substeps, rate is not None, feedforward is not None, command)
 
-    def send(self, worker: Worker, envs: slice) -> None:
-        """Ask ``worker``, whose envs are ``envs``."""
-        for name, rows in self.command._asdict().items():
+    @property
+    def observed_tick(self) -> int:
+        """The last tick."""
+        return self.ticks - 1
+
+    def _with(self, command: Command) -> Self:
+        return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
+
+    def limit(self, num_envs: int) -> float:
+        """Return an upper bound of the seconds: a sim step of an env takes about 20 us."""
+        return 1e-3 * self.ticks * self.substeps * num_envs
+
+    def for_envs(self, envs: slice) -> Self:
+        """Return the part of some envs."""
+        return self._with(self.command.map(lambda rows: rows[:, envs]))
+
+    def copy(self) -> Self:
+        """Return a copy that later writes to the caller's arrays do not change."""
+        return self._with(self.command.map(np.copy))
+
+    def write(self, arrays: Arrays) -> None:
+        """Write the commands to the arrays of their ticks."""
+        for table, rows in zip(arrays.command, self.command, strict=True):
             if rows is not None:
-                for tick, row in zip(worker.ticks, rows, strict=False):
-                    getattr(tick.command, name)[...] = row[envs]
-        _, rate, feedforward = self.command
-        worker.send_run(self.ticks, self.substeps, rate is not None, feedforward is not None)
+                table[: self.ticks] = rows
 
-    def limit(self, envs: int) -> float:
-        """Seconds that it takes for so many envs at the very most: a sim step of one takes some 20 us."""
-        return 1e-3 * self.ticks * self.substeps * envs
+    def encode(self) -> bytes:
+        """Return the message, without the commands."""
+        return _RUN.pack(b"R", self.ticks, self.substeps, self.use_rate, self.use_feedforward)
 
-    def kept(self) -> Run:
-        """Copy of it, which stays as it is when the caller writes to the arrays."""
-        return replace(self, command=self.command.map(np.copy))
+    def apply(self, loop: Loop) -> float:
+        """Run the ticks; return the seconds of work."""
+        return loop.run(self.ticks, self.substeps, self.use_rate, self.use_feedforward)
+
+
+@dataclass(frozen=True)
+class SetParams(Request):
+    """Change gains, limits and times in flight."""
+
+    params: bp.PIDParams
+
+    def apply(self, loop: Loop) -> None:
+        """Set the loop's params."""
+        loop.set_params(self.params)
+
+
+@dataclass(frozen=True)
+class TakeSnapshot(Request):
+    """Read the state of every env, and go on as if restored from it."""
+
+    def apply(self, loop: Loop) -> EnvStates:
+        """Return the states."""
+        return loop.snapshot()
+
+
+@dataclass(frozen=True)
+class Restore(Request):
+    """Put every env into its state in ``snapshot``, with its params."""
+
+    snapshot: Snapshot
+    observed_tick = 0
+
+    def apply(self, loop: Loop) -> None:
+        """Restore the loop."""
+        loop.restore(self.snapshot)
+
+
+@dataclass(frozen=True)
+class ReadContentSizes(Request):
+    """Read how many numbers a snapshot holds of each env's content."""
+
+    is_replayed = False
+
+    def apply(self, loop: Loop) -> list[int]:
+        """Return one number per env."""
+        return loop.content_sizes()
+
+
+@dataclass(frozen=True)
+class ReadPoses(Request):
+    """Read the poses of the entities that ``build`` returned."""
+
+    is_replayed = False
+
+    def apply(self, loop: Loop) -> list[NDArray[np.float32]]:
+        """Return (entities, 7) per env."""
+        return loop.poses()

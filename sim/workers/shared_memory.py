@@ -1,7 +1,7 @@
 """Arrays in memory that processes share, without a name: nothing can be left behind in /dev/shm.
 
-The memory is an anonymous file (memfd), handed to a child by file descriptor; the kernel frees it with its last
-user, however that one ends.
+The memory is an anonymous file (memfd), handed to a child by file descriptor; the kernel frees it with its last user,
+however that one ends.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
 class SharedArrays:
-    """Named arrays of given ``layout`` in one block of shared memory."""
+    """Named arrays of given ``layout`` in one block of shared memory: a new one, or with ``fd`` an existing one."""
 
     def __init__(self, layout: Layout, fd: int | None = None) -> None:
-        """Make a new block, or with ``fd`` map an existing one of the same layout."""
         self.layout = layout
         offsets, size = {}, 0
         for name, (shape, dtype) in layout.items():
@@ -33,14 +32,14 @@ class SharedArrays:
             fd = os.memfd_create("batchpid", os.MFD_CLOEXEC)
             os.ftruncate(fd, max(size, 1))
         self.fd = fd
-        self._map = mmap.mmap(fd, max(size, 1))
+        memory = mmap.mmap(fd, max(size, 1))
         self.arrays: dict[str, NDArray[Any]] = {
-            name: np.ndarray(shape, dtype, buffer=self._map, offset=offsets[name])
+            name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
             for name, (shape, dtype) in layout.items()
         }
 
     def close(self) -> None:
-        """Close the descriptor; the memory itself lives while an array refers to it."""
+        """Close the descriptor. The memory is freed when no array refers to it."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1

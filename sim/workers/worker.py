@@ -1,93 +1,136 @@
-"""A worker process: it builds its loop, then serves the parent's requests until told to stop.
+"""Workers as the pool sees them: a loop in this process, or the parent's end of a worker process.
 
-The process is started afresh (no fork, no re-import of the caller's ``__main__``), so it works from notebooks and from
-scripts without a main guard. It shares with its parent one socket and one block of memory, both by file
-descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the worker, which waits
-for that in a thread, ends at once. Requests on the hot path are one struct; all others are pickled.
+A worker process is started fresh (no fork, no re-import of the caller's ``__main__``), so that it works from notebooks
+and from scripts without a main guard. It shares with its parent one socket and one block of memory, both by file
+descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the worker exits at once
+(:mod:`sim.workers.serve`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
-import gc
 import json
 import os
 import pickle
-import select
 import signal
 import socket
-import struct
 import subprocess
 import sys
-import threading
 import time
-import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
 
+import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
-from sim.loop.arrays import Arrays, Layout
-from sim.loop.loop import Loop, LoopSpec
+from sim.loop.arrays import Arrays
+from sim.loop.loop import Loop
+from sim.options import RunnerOptions
 from sim.workers.channel import Channel
-from sim.workers.liveness import Pulse
+from sim.workers.liveness import Liveness
+from sim.workers.requests import Request
+from sim.workers.serve import DONE
 from sim.workers.shared_memory import SharedArrays
 
-TICK = struct.Struct("<cII??")  # b"T", ticks, substeps, use_rate, use_feedforward
-DONE = struct.Struct("<cd")  # b"D", seconds of work
-
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-_TAKE_LIMITS = (10.0, 60.0)
-"""Seconds amid a message, asleep or at work: a new process imports a lot before it reads."""
-_SPIN = 2e-4
-"""Seconds for which a worker looks out for the next request before it sleeps: waking up takes 30 us."""
-_STOP_LIMIT = 0.7  # seconds: whoever goes on after Ctrl-Z continues all processes at once
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+"""Environment of a process whose BLAS uses one thread."""
+_TRANSFER_LIMITS = (10.0, 60.0)
+"""Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
+_STOP_LIMIT = 0.7  # seconds: Ctrl-Z and fg stop and continue parent and workers together
 
 
 class WorkerLost(WorkerError):
-    """A worker died, or is stuck; the message names it, its envs and the cause."""
+    """A worker died or is stuck; the message names it, its envs and the cause."""
 
 
-class LocalWorker:
-    """The loop in this process, behind the same calls as a worker process."""
+class Worker(ABC):
+    """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result.
 
-    def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
-        self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        self.ticks = Arrays.of_ticks(shared.arrays, slice(self.envs.start, self.envs.stop))
-        self._loop = Loop(spec, self.ticks)
-        self._result: Any = None
-
-    def send(self, method: str, *args: Any) -> None:
-        """Call ``method`` of the loop; :meth:`receive` gives its result."""
-        self._result = getattr(self._loop, method)(*args)
-
-    def send_run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
-        """Run so many ticks; :meth:`receive` gives the seconds they took."""
-        self._result = self._loop.run(ticks, substeps, use_rate, use_feedforward)
-
-    def receive(self) -> Any:
-        """Result of the last request."""
-        return self._result
-
-    def close(self, patience: float = 0.0) -> None:
-        """Free the scenes."""
-        self._loop.close()
-
-
-class ProcessWorker:
-    """The parent's end of a worker process: ``send`` a request, then ``receive`` its result.
-
-    The first result, None, comes unasked, when the loop is built.
+    The first result, None, comes without a request, when the loop is built.
     """
 
-    def __init__(self, spec: LoopSpec, index: int, shared: SharedArrays) -> None:
-        self.index, self.envs = index, range(spec.first_env, spec.first_env + spec.num_envs)
-        message = _pickle((spec, shared.layout))
+    pid: int | None = None
+    """Process id; None: this process."""
+    loop: Loop | None = None
+    """The loop, if it is in this process."""
+
+    @abstractmethod
+    def send(self, request: Request) -> None:
+        """Start a request for the envs of this worker."""
+
+    @abstractmethod
+    def receive(self) -> Any:
+        """Wait for the result of the last request and return it.
+
+        Raises
+        ------
+        WorkerLost
+            The worker died.
+        WorkerError
+            The loop raised; the message holds the worker's traceback. A BatchPIDError is raised unchanged.
+        """
+
+    @abstractmethod
+    def close(self, patience: float) -> None:
+        """Free the scenes; a process that has not ended after ``patience`` seconds is killed."""
+
+    def fileno(self) -> int | None:
+        """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""
+        return None
+
+    def check_alive(self, idle_limit: float, limit: float) -> None:  # noqa: B027  (this process is alive)
+        """Check a worker that has not answered yet.
+
+        Raises
+        ------
+        WorkerLost
+            It is stopped, or asleep for ``idle_limit`` seconds, or at work on one request for ``limit`` seconds, not
+            counting the time for which it waited for a core.
+        """
+
+    def pin(self, core: int) -> None:  # noqa: B027  (this process stays where it is)
+        """Run on one core only."""
+
+
+class LocalWorker(Worker):
+    """Loop in this process."""
+
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, index: int, shared: SharedArrays
+    ) -> None:
+        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), envs))
+        self.loop: Loop = Loop(options, params, envs, self._arrays)
+        self._result: Any = None
+
+    def send(self, request: Request) -> None:
+        """Execute a request."""
+        request.write(self._arrays)
+        self._result = request.apply(self.loop)
+
+    def receive(self) -> Any:
+        """Return the result of the last request."""
+        return self._result
+
+    def close(self, patience: float) -> None:
+        """Free the scenes."""
+        self.loop.close()
+
+
+class ProcessWorker(Worker):
+    """Parent's end of a worker process."""
+
+    pid: int
+
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, index: int, shared: SharedArrays
+    ) -> None:
+        message = _encode_loop(options, params, envs, shared)
+        self._name = f"worker {index} (%senvs {envs.start} to {envs.stop - 1})"
         self._owner = os.getpid()
-        self.ticks = Arrays.of_ticks(shared.arrays, slice(self.envs.start, self.envs.stop))
+        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), envs))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         try:
             with contextlib.ExitStack() as undo:
@@ -99,45 +142,34 @@ class ProcessWorker:
                 undo.pop_all()
         except OSError as error:
             raise WorkerError(
-                f"worker {index} (envs {self.envs.start} to {self.envs.stop - 1}) cannot be started: {error}; "
-                "pass a smaller workers=, 0 for none"
+                f"{self._name % ''} cannot be started: {error}; pass a smaller workers=, 0 for none"
             ) from error
-        self._pulse = Pulse(self.pid)
-        self._channel = Channel(ours, lambda: self.check_alive(*_TAKE_LIMITS))
+        self.pid = self._process.pid
+        self._name %= f"pid {self.pid}, "
+        self._liveness = Liveness(Path(f"/proc/{self.pid}/stat"))
+        self._channel = Channel(ours, lambda: self.check_alive(*_TRANSFER_LIMITS))
         try:
-            with contextlib.suppress(OSError):  # it died: the first receive says so
+            with contextlib.suppress(OSError):  # it died: the first receive reports that
                 self._channel.send(message)
         except BaseException:
             self.close(0.0)
             raise
 
-    @property
-    def pid(self) -> int:
-        """Process id of the worker."""
-        return self._process.pid
-
     def fileno(self) -> int:
-        """File descriptor that becomes readable when there is a result, or the worker is dead."""
+        """Return the file descriptor that becomes readable when there is a result, or the process has ended."""
         return self._channel.fileno()
 
-    def send(self, method: str, *args: Any) -> None:
-        """Ask for ``loop.method(*args)``."""
-        self._send(pickle.dumps((method, args)))
-
-    def send_run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> None:
-        """Ask for so many ticks; the result is the seconds they took."""
-        self._send(TICK.pack(b"T", ticks, substeps, use_rate, use_feedforward))
+    def send(self, request: Request) -> None:
+        """Send a request."""
+        request.write(self._arrays)
+        self._liveness.begin()
+        try:
+            self._channel.send(request.encode())
+        except OSError as error:
+            raise self._death() from error
 
     def receive(self) -> Any:
-        """Wait for the result of the last request.
-
-        Raises
-        ------
-        WorkerLost
-            The worker died.
-        WorkerError
-            The loop raised; the message holds the worker's traceback. What it raised on purpose comes as it is.
-        """
+        """Wait for the result of the last request and return it."""
         try:
             message = self._channel.receive()
         except (EOFError, OSError) as error:
@@ -148,30 +180,23 @@ class ProcessWorker:
         if isinstance(failure, BatchPIDError):
             raise failure
         if failure is not None:
-            raise WorkerError(f"{self._name()} raised:\n{failure}")
+            raise WorkerError(f"{self._name} raised:\n{failure}")
         return result
 
     def check_alive(self, idle_limit: float, limit: float) -> None:
-        """Look at a worker that has not answered yet.
-
-        Raises
-        ------
-        WorkerLost
-            It has been stopped, or asleep for ``idle_limit`` seconds, or at work on one request for ``limit``,
-            not counting the time for which it waited for a processor.
-        """
-        pulse = self._pulse
-        pulse.look(time.monotonic())
-        if pulse.idle > (_STOP_LIMIT if pulse.stopped else idle_limit):
-            state = "stopped" if pulse.stopped else "asleep"
-            raise self._lost(f"is stuck: {state} for {pulse.idle:.1f} s amid a request")
-        if pulse.spent > limit:
+        """Check a process that has not answered yet."""
+        liveness = self._liveness
+        liveness.sample(time.monotonic())
+        if liveness.idle > (_STOP_LIMIT if liveness.stopped else idle_limit):
+            state = "stopped" if liveness.stopped else "asleep"
+            raise self._lost(f"is stuck: {state} for {liveness.idle:.1f} s during a request")
+        if liveness.busy > limit:
             raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 
-    def close(self, patience: float = 5.0) -> None:
-        """End the process: ask, and kill it after ``patience`` seconds."""
+    def close(self, patience: float) -> None:
+        """End the process: close its socket, and kill it if it has not ended after ``patience`` seconds."""
         self._channel.close()
-        if os.getpid() == self._owner:  # else we are a fork of the parent, and the process is not ours to end
+        if os.getpid() == self._owner:  # a fork of the parent must not end the parent's workers
             try:
                 self._process.wait(patience) if patience else self._process.kill()
             except subprocess.TimeoutExpired:
@@ -181,20 +206,10 @@ class ProcessWorker:
             os.close(self._trace)
             self._trace = -1
 
-    def keep_to(self, core: int) -> None:
-        """Run on that core only."""
-        with contextlib.suppress(OSError):  # it died, or the core was taken from us
+    def pin(self, core: int) -> None:
+        """Run on one core only."""
+        with contextlib.suppress(OSError):  # it died, or the core is no longer ours
             os.sched_setaffinity(self.pid, {core})
-
-    def _send(self, message: bytes) -> None:
-        self._pulse.begin()
-        try:
-            self._channel.send(message)
-        except OSError as error:
-            raise self._death() from error
-
-    def _name(self) -> str:
-        return f"worker {self.index} (pid {self.pid}, envs {self.envs.start} to {self.envs.stop - 1})"
 
     def _death(self) -> WorkerLost:
         try:
@@ -208,30 +223,40 @@ class ProcessWorker:
             self._process.send_signal(signal.SIGUSR1)  # it writes its stack, unless it is stopped
             time.sleep(0.05)
         trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
-        return WorkerLost(f"{self._name()} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+        return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+def _encode_loop(options: RunnerOptions, params: bp.PIDParams, envs: slice, shared: SharedArrays) -> bytes:
+    """Return the first message; cloudpickle includes a ``build`` that the worker cannot import."""
+    try:
+        return cloudpickle.dumps((options, params, envs, shared.layout))
+    except Exception as error:
+        raise InvalidArgumentError(
+            "build",
+            f"cannot be sent to a worker process: {error}",
+            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
+        ) from error
 
 
 def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
-    """Start a process that serves, as :func:`main`, by these file descriptors: a socket, memory, and its last stack."""
+    """Start a process that runs :func:`sim.workers.serve.main` with these descriptors: socket, memory, last stack."""
     if not sys.executable:
         raise OSError("sys.executable does not say which Python to run")
     paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
-    paths.append(str(Path(__file__).parents[2]))  # where "" led to, before the caller went to another folder
-    with _without_interrupts():
+    paths.append(str(Path(__file__).parents[2]))  # where "" led to, before the caller changed the folder
+    program = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.serve import main; main()"
+    with _interrupts_blocked():
         return subprocess.Popen(
-            [sys.executable, "-c", _BOOT, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
+            [sys.executable, "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
-            env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
+            env=os.environ | ONE_THREAD,
         )
 
 
 @contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Let processes that start now never hear of Ctrl-C: the parent does, and must not find them half-way.
-
-    A blocked signal stays blocked in the child, from its first instruction on.
-    """
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT: a process inherits that, so that Ctrl-C reaches the parent alone."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
@@ -244,82 +269,3 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-_BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.worker import main; main()"
-
-
-def main() -> None:
-    """Entry point of the child: ``argv`` holds the import path, the parent's pid and three file descriptors."""
-    parent, channel, memory, trace = map(int, sys.argv[2:])
-    faulthandler.enable(trace, all_threads=False)
-    faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    connection = Channel(socket.socket(fileno=channel))
-    try:
-        spec, layout = pickle.loads(connection.receive())
-        envs = slice(spec.first_env, spec.first_env + spec.num_envs)
-        _serve(connection, spec, Arrays.of_ticks(SharedArrays(layout, memory).arrays, envs))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent closed, or died
-    os._exit(0)  # nothing is left to save, and the engine's own end can take long
-
-
-def _end_with(parent: int) -> None:
-    """End this process when ``parent`` is gone, even in the midst of a long tick."""
-    try:
-        watched = os.pidfd_open(parent)
-    except OSError:  # gone already, or a kernel before 5.3
-        while os.getppid() == parent:
-            time.sleep(0.2)
-    else:
-        if os.getppid() == parent:
-            select.select([watched], [], [])
-    os._exit(1)
-
-
-def _serve(connection: Channel, spec: LoopSpec, ticks: list[Arrays]) -> None:
-    try:
-        loop = Loop(spec, ticks)
-    except Exception as error:
-        connection.send(pickle.dumps((None, _portable(error))))
-        return
-    connection.send(pickle.dumps((None, None)))
-    # Nothing here makes cycles; a collection in the hot loop would only cost time.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    poller = select.poll()
-    poller.register(connection.fileno(), select.POLLIN)
-    while True:
-        asleep = time.perf_counter() + _SPIN
-        while not poller.poll(0) and time.perf_counter() < asleep:
-            os.sched_yield()
-        message = connection.receive()
-        try:
-            if message[:1] == b"T":
-                connection.send(DONE.pack(b"D", loop.run(*TICK.unpack(message)[1:])))
-            else:
-                method, args = pickle.loads(message)
-                connection.send(pickle.dumps((getattr(loop, method)(*args), None)))
-        except (BrokenPipeError, ConnectionResetError):
-            raise
-        except Exception as error:
-            connection.send(pickle.dumps((None, _portable(error))))
-
-
-def _pickle(spec: tuple[LoopSpec, Layout]) -> bytes:
-    """Spec and layout of the shared arrays; cloudpickle takes along a function that the worker cannot import."""
-    try:
-        return cloudpickle.dumps(spec)
-    except Exception as error:
-        raise InvalidArgumentError(
-            "build",
-            f"cannot be sent to a worker process: {error}",
-            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
-        ) from error
-
-
-def _portable(error: Exception) -> BatchPIDError | str:
-    """The error itself where the parent can raise it as it is, else its traceback."""
-    return error if isinstance(error, BatchPIDError) else traceback.format_exc()

@@ -88,13 +88,13 @@ def quiet(call: Callable[[], Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def runner():
-    with Runner(ROBOT, N, workers=0, substeps=2) as made:
+    with Runner(ROBOT, N, params=PARAMS, workers=0, substeps=2) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
 def containing():
-    with Runner(ROBOT, N, workers=0, substeps=2, on_invalid_input="contain") as made:
+    with Runner(ROBOT, N, params=PARAMS, workers=0, substeps=2, on_invalid_input="contain") as made:
         yield made
 
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(params=[0, 1])
 def runner(request, panda):
-    with Runner(panda, 8, workers=request.param) as made:
+    with Runner(panda, 8, params=panda.params(), workers=request.param) as made:
         yield made
 
 
@@ -74,7 +74,7 @@ def test_threads_may_take_turns(runner, panda):
         thread.start()
     for thread in threads:
         thread.join()
-    with Runner(panda, 8, workers=0) as other:
+    with Runner(panda, 8, params=panda.params(), workers=0) as other:
         for step in steps:
             assert_identical(other.step(panda.settings.target), step)
 
@@ -103,7 +103,7 @@ def test_a_signal_handler_may_close_the_runner(runner, panda, on_alarm):
 
 
 def test_another_thread_may_close_the_runner(panda):
-    with Runner(panda, 8, workers=1) as runner:
+    with Runner(panda, 8, params=panda.params(), workers=1) as runner:
         pids = runner.pids
         timer = threading.Timer(0.2, runner.close)
         timer.start()
@@ -144,7 +144,7 @@ def test_a_stopped_worker_with_a_full_socket_does_not_block_the_caller(panda, mo
     socketpair = socket.socketpair
     monkeypatch.setattr(socket, "socketpair", small_socketpair)
     near = np.tile(0.9 * panda.start + 0.1 * panda.settings.target, (64, 1))
-    with Runner(panda, 64, workers=1) as runner:
+    with Runner(panda, 64, params=panda.params(), workers=1) as runner:
         os.kill(runner.pids[0], signal.SIGSTOP)
         with pytest.warns(UserWarning, match="stuck: stopped"):
             obs = runner.reset(qpos=near)

@@ -38,14 +38,14 @@ def balls_on_the_arm(scene, env):
 
 
 def run(build, num_envs=4, ticks=30, **options):
-    with Runner(ROBOT, num_envs, build=build, **options) as runner:
+    with Runner(ROBOT, num_envs, params=ROBOT.params(), build=build, **options) as runner:
         rollout = runner.rollout(np.broadcast_to(ROBOT.start, (ticks, ROBOT.dof)))
         return rollout, runner.poses()
 
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_content_falls_and_a_reset_puts_it_back(workers):
-    with Runner(ROBOT, 2, workers=workers, build=box_beside_the_robot) as runner:
+    with Runner(ROBOT, 2, params=ROBOT.params(), workers=workers, build=box_beside_the_robot) as runner:
         before = runner.poses()
         np.testing.assert_allclose(before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6)
         for _ in range(20):

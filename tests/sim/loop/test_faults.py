@@ -27,6 +27,8 @@ def setpoints(ticks, num_envs=N, seed=0):
 
 def make(num_envs=N, **options):
     options = {"workers": 0, "substeps": 4, "on_invalid_input": "contain"} | options
+    if options.get("control", "pid") == "pid":
+        options.setdefault("params", PANDA.params())
     return Runner(PANDA, num_envs, **options)
 
 

@@ -22,7 +22,7 @@ def test_passive_force_alone_holds_the_pose(panda):
 
 
 def test_pid_holds_the_pose(panda):
-    with Runner(panda, 1, workers=0) as runner:
+    with Runner(panda, 1, params=panda.params(), workers=0) as runner:
         assert drift(runner) < 1e-5
 
 

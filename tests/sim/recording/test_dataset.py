@@ -11,7 +11,7 @@ from sim.recording.dataset import open_dataset, to_dataset
 
 @pytest.fixture(scope="module")
 def rollout(panda):
-    with Runner(panda, 3, workers=0) as runner:
+    with Runner(panda, 3, params=panda.params(), workers=0) as runner:
         return runner.rollout(np.broadcast_to(panda.settings.target, (4, panda.dof)))
 
 

@@ -28,7 +28,7 @@ N = 3
 
 
 def make(**options):
-    return Runner(ROBOT, N, **({"workers": 0, "substeps": 2} | options))
+    return Runner(ROBOT, N, **({"params": ROBOT.params(), "workers": 0, "substeps": 2} | options))
 
 
 def table(ticks):
@@ -174,7 +174,7 @@ import os, sys, time, warnings
 warnings.simplefilter("ignore")
 from sim import Robot, Runner, Recorder, read_recording
 robot = Robot.load("panda")
-with Runner(robot, 3, workers=0, substeps=2) as runner:
+with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
     recorder = Recorder(sys.argv[1], runner)
     for _ in range(50):
         runner.step(robot.start)
@@ -235,7 +235,10 @@ import sys, time, numpy as np, warnings
 warnings.simplefilter("ignore")
 from sim import Robot, Runner, Recorder
 robot = Robot.load("panda")
-with Runner(robot, 3, workers=0, substeps=2) as runner, Recorder(sys.argv[1], runner) as recorder:
+with (
+    Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner,
+    Recorder(sys.argv[1], runner) as recorder,
+):
     for tick in range(10**9):
         begun = time.monotonic()
         runner.step(np.clip(robot.settings.target * np.sin(tick / 50), robot.lower, robot.upper))

@@ -13,7 +13,7 @@ from sim.view import film
 
 @pytest.fixture(scope="module")
 def rollout(panda):
-    with Runner(panda, 3, workers=0) as runner:
+    with Runner(panda, 3, params=panda.params(), workers=0) as runner:
         return runner.rollout(np.broadcast_to(panda.settings.target, (20, panda.dof)))
 
 

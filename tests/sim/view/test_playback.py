@@ -13,7 +13,7 @@ from sim.view.film import film_rows
 
 @pytest.fixture(scope="module")
 def rollout(panda):
-    with Runner(panda, 2, workers=0) as runner:
+    with Runner(panda, 2, params=panda.params(), workers=0) as runner:
         return runner.rollout(np.broadcast_to(panda.settings.target, (30, panda.dof)))
 
 

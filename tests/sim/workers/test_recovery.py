@@ -35,7 +35,7 @@ def table(ticks=TICKS):
 
 
 def make(**options):
-    return Runner(ROBOT, N, **({"workers": 2, "checkpoint_steps": 150} | options))
+    return Runner(ROBOT, N, **({"params": ROBOT.params(), "workers": 2, "checkpoint_steps": 150} | options))
 
 
 @pytest.fixture(scope="module")
@@ -149,13 +149,13 @@ def test_too_slow_for_the_timeout():
 
 def test_as_many_workers_as_cores_keep_to_one_each():
     cores = os.sched_getaffinity(0)
-    with Runner(ROBOT, 8 * len(cores) + 8, workers=len(cores), recover=True) as runner:
+    with Runner(ROBOT, 8 * len(cores) + 8, params=ROBOT.params(), workers=len(cores), recover=True) as runner:
         assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {frozenset([core]) for core in cores}
         os.kill(runner.pids[0], signal.SIGKILL)
         with pytest.warns(RecoveryWarning):
             runner.step(ROBOT.start)
         assert len(os.sched_getaffinity(runner.pids[0])) == 1
-    with Runner(ROBOT, 8 * len(cores) + 8, workers=len(cores) + 1) as runner:
+    with Runner(ROBOT, 8 * len(cores) + 8, params=ROBOT.params(), workers=len(cores) + 1) as runner:
         assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {frozenset(cores)}
 
 
@@ -237,9 +237,9 @@ def test_killed_amid_whatever_it_does(tmp_path):
         return runner.rollout(table(4)[:, :2])
 
     armed = tmp_path / "armed"
-    with Runner(ROBOT, 2, workers=0, build=lambda scene, env: []) as runner:
+    with Runner(ROBOT, 2, params=ROBOT.params(), workers=0, build=lambda scene, env: []) as runner:
         expected = program(runner)
-    with Runner(ROBOT, 2, workers=1, build=build) as runner, warnings.catch_warnings():
+    with Runner(ROBOT, 2, params=ROBOT.params(), workers=1, build=build) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
         armed.touch()
         assert_identical(expected, program(runner))
@@ -247,7 +247,7 @@ def test_killed_amid_whatever_it_does(tmp_path):
 
 
 def test_what_kills_every_worker_is_not_tried_for_ever(monkeypatch):
-    monkeypatch.setattr("sim.workers.pool._LIVES", 2)
+    monkeypatch.setattr("sim.workers.pool.MAX_LOSSES", 2)
 
     def build(scene, env):
         import sim.loop.loop
@@ -323,7 +323,7 @@ import sys, numpy as np, warnings
 warnings.simplefilter("ignore")
 from sim import Robot, Runner
 robot = Robot.load("panda")
-runner = Runner(robot, 8, workers=2)
+runner = Runner(robot, 8, params=robot.params(), workers=2)
 print(*runner.pids, flush=True)
 {body}
 """

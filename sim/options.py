@@ -1,0 +1,211 @@
+"""Options of a runner: one definition for :class:`sim.Runner`, its loops, snapshots, recordings and commands."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import KW_ONLY, astuple, dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from numpy.typing import ArrayLike
+
+import batchpid as bp
+from batchpid.computed_torque import check_gain_units
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
+from sim.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from sim.engine.physics import Physics
+    from sim.engine.variation import Variation
+
+ControlMode = Literal["pid", "drive", "effort"]
+Compensation = Literal["gravity+coriolis", "gravity", "none"]
+PhysicsPreset = Literal["accurate", "fast"]
+FaultAction = Literal["hold", "reset"]
+InvalidInputAction = Literal["raise", "contain"]
+
+
+@dataclass(frozen=True, eq=False)
+class RunnerOptions:
+    """Options of a :class:`sim.Runner`, checked when they are constructed.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An option is out of range.
+    """
+
+    robot: Robot
+    """From :meth:`sim.Robot.load`."""
+    num_envs: int
+    """Number of robots, one in each scene."""
+    _: KW_ONLY
+    workers: int | None = None
+    """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
+    pinned to its core. Results are bit-identical for any number of workers."""
+    timestep: float = 1 / 2000
+    """Time step of simulation and control [s]."""
+    substeps: int = 20
+    """Sim steps of one tick, all under the same setpoint; the control runs at every one of them."""
+    control: ControlMode = "pid"
+    """``"pid"``; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and damping;
+    ``"effort"``: the setpoint is the joint effort."""
+    compensate: Compensation = "gravity+coriolis"
+    """Passive force added at every sim step."""
+    physics: PhysicsPreset | Physics = "accurate"
+    """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, or a :class:`sim.Physics`."""
+    ground: bool = True
+    """Add a ground plane at height 0 to every scene."""
+    build: Callable[[Any, int], Any] | None = None
+    """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
+    that code written for a screen runs unchanged. It may return the entities that :meth:`sim.Runner.poses` reports. A
+    reset puts the content back to where ``build`` left it."""
+    pack_size: int = 4
+    """Largest number of scenes that share a PhysX system; affects speed alone. A robot gets its own system before
+    something touches it, so that results do not depend on the other envs (docs/reliability.md)."""
+    on_fault: FaultAction = "hold"
+    """``"hold"`` an env that fails at rest in its last valid state, with ``ok`` False until it is reset; or ``"reset"``
+    it to its last start, with ``ok`` False for that tick. An env fails when its state is no longer finite, or by
+    ``speed_limit``. The other envs are not affected."""
+    speed_limit: ArrayLike | None = None
+    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    variation: Variation | None = None
+    """Differences of each env's robot from the model: :func:`sim.tuning.randomization.draw_variation`. Snapshots do
+    not hold it, so that it turns off recovery and checkpoints."""
+    on_invalid_input: InvalidInputAction = "raise"
+    """``"raise"`` an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"`` it: the env that
+    it is for fails."""
+    recover: bool = True
+    """Replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to those of an
+    undisturbed run. Otherwise :class:`batchpid.errors.WorkerError` is raised."""
+    checkpoint_steps: int | None = 8000
+    """Sim steps between checkpoints, from which a replay starts; None: one replay from the start, for which all
+    commands are kept. After contacts the last bits of the results depend on it."""
+    timeout: float = 60.0
+    """Seconds, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A worker that is
+    stopped or asleep within a tick counts as stuck within a second."""
+
+    def __post_init__(self) -> None:
+        from sim.engine.physics import Physics
+        from sim.engine.variation import Variation
+
+        robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
+        checked: dict[str, Any] = {
+            "num_envs": integer("num_envs", self.num_envs, 1, 1_000_000),
+            "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
+            "substeps": integer("substeps", self.substeps, 1, 1_000_000),
+            "control": choice("control", self.control, get_args(ControlMode)),
+            "compensate": choice("compensate", self.compensate, get_args(Compensation)),
+            "ground": flag("ground", self.ground),
+            "pack_size": integer("pack_size", self.pack_size, 1, 65535),
+            "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
+            "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
+            "recover": flag("recover", self.recover),
+            "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
+        }
+        if self.workers is not None:
+            checked["workers"] = integer("workers", self.workers, 0, 1024)
+        if not isinstance(self.physics, Physics):
+            choice("physics", self.physics, get_args(PhysicsPreset))
+        if self.build is not None and not callable(self.build):
+            raise InvalidArgumentError(
+                "build", "must be a function", value=self.build, remedy="define build(scene, env)"
+            )
+        if self.speed_limit is not None:
+            checked["speed_limit"] = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
+        if self.checkpoint_steps is not None:
+            checked["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
+        if self.variation is not None:
+            checked |= {"recover": False, "checkpoint_steps": None}
+            count = len(instance("variation", self.variation, Variation, "draw one with draw_variation").payload)
+            if count != checked["num_envs"]:
+                raise InvalidArgumentError(
+                    "variation", f"is for {count} envs, not {checked['num_envs']}", remedy="draw one for each env"
+                )
+        vars(self).update(checked)
+
+    @property
+    def solver(self) -> Physics:
+        """Solver settings that ``physics`` stands for."""
+        from sim.engine.physics import PHYSICS, Physics
+
+        return self.physics if isinstance(self.physics, Physics) else PHYSICS[self.physics]
+
+    @property
+    def scenes_per_system(self) -> int:
+        """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
+
+        Workers get whole packs, and their number does not enter here: so results could not depend on that number even
+        where :mod:`sim.engine.contact_prediction` missed a contact.
+        """
+        return min(self.pack_size, max(1, self.num_envs // 8))
+
+    def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
+        """Return ``params`` if they fit the robot, the number of envs and the control.
+
+        Raises
+        ------
+        InvalidArgumentError
+            They do not fit.
+        """
+        instance("params", params, bp.PIDParams, "build them with robot.params() or make_params()")
+        if params.gain_units is not None and self.control != "pid":
+            raise InvalidArgumentError(
+                "gain_units",
+                f"have no meaning under control {self.control!r}",
+                remedy="use control 'pid', or params with gain_units 'effort'",
+            )
+        check_gain_units(params)
+        if params.num_joints != self.robot.dof:
+            raise InvalidArgumentError(
+                "params",
+                f"hold {params.num_joints} joints, robot {self.robot.name!r} has {self.robot.dof}",
+                remedy=f"give one gain for each of {', '.join(self.robot.joint_names)}",
+            )
+        if params.num_envs not in (1, self.num_envs):
+            raise InvalidArgumentError(
+                "params",
+                f"hold {params.num_envs} envs, the runner has {self.num_envs}",
+                remedy="give one row, or one row per env",
+            )
+        return params
+
+    def about(self) -> dict[str, Any]:
+        """Return the options that two runners must share to restore each other's snapshots, as plain values."""
+        robot = self.robot
+        return {
+            "robot": robot.name,
+            "urdf": hashlib.sha256(robot.urdf.encode()).hexdigest(),
+            "joints": list(robot.joint_names),
+            "num_envs": self.num_envs,
+            "timestep": self.timestep,
+            "control": self.control,
+            "compensate": self.compensate,
+            "physics": list(astuple(self.solver)),
+            "dissipation": robot.dissipation,
+            "ground": self.ground,
+            "fixed_base": robot.fixed_base,
+        }
+
+
+def default_params(robot: Robot, control: ControlMode = "pid") -> bp.PIDParams:
+    """Return the params of a runner that is given none.
+
+    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
+    - ``"drive"``: the drive gains of a bundled robot's settings, else ``robot.designed("effort")``;
+    - ``"effort"``: zero gains and the robot's effort limits.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The robot ships no gains and none can be designed: its mass matrix is not positive definite.
+    """
+    if control == "effort":
+        return robot.params(kp=0.0, ki=0.0, kd=0.0)
+    settings = robot.settings
+    if control == "drive":
+        if settings is None:
+            return robot.designed("effort")
+        return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
+    return robot.designed() if settings is None else robot.tuned()

@@ -1,0 +1,90 @@
+"""Main program of a worker process: build the loop, then serve the parent's requests until it closes the socket."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import gc
+import os
+import pickle
+import select
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+import traceback
+from typing import Any
+
+from batchpid.errors import BatchPIDError
+from sim.loop.arrays import Arrays
+from sim.loop.loop import Loop
+from sim.workers.channel import Channel
+from sim.workers.requests import decode
+from sim.workers.shared_memory import SharedArrays
+
+DONE = struct.Struct("<cd")  # b"D", seconds of work: the answer on the hot path, all others are pickled
+_SPIN_SECONDS = 2e-4
+"""Seconds of spinning for the next request before blocking: waking up takes 30 us."""
+
+
+def main() -> None:
+    """Serve; ``argv`` holds the import path, the parent's pid and three descriptors: socket, memory, last stack."""
+    parent, channel, memory, trace = map(int, sys.argv[2:])
+    faulthandler.enable(trace, all_threads=False)
+    faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
+    threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
+    connection = Channel(socket.socket(fileno=channel))
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the parent closed the socket, or died
+        _serve(connection, memory)
+    os._exit(0)  # nothing to save, and the engine's own cleanup can take long
+
+
+def _exit_with(parent: int) -> None:
+    """Exit when ``parent`` has ended, even in the middle of a long tick."""
+    try:
+        watched = os.pidfd_open(parent)
+    except OSError:  # it has ended already, or the kernel is older than 5.3
+        while os.getppid() == parent:
+            time.sleep(0.2)
+    else:
+        if os.getppid() == parent:
+            select.select([watched], [], [])
+    os._exit(1)
+
+
+def _serve(connection: Channel, memory: int) -> None:
+    options, params, envs, layout = pickle.loads(connection.receive())
+    arrays = Arrays.from_fields(SharedArrays(layout, memory).arrays).at((slice(None), envs))
+    try:
+        loop = Loop(options, params, envs, arrays)
+    except Exception as error:
+        connection.send(_failure(error))
+        return
+    connection.send(_success(None))
+    # The hot loop makes no reference cycles, so that collections would only cost time.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    poller = select.poll()
+    poller.register(connection.fileno(), select.POLLIN)
+    while True:
+        spin_end = time.perf_counter() + _SPIN_SECONDS
+        while not poller.poll(0) and time.perf_counter() < spin_end:
+            os.sched_yield()
+        message = connection.receive()
+        try:
+            answer = _success(decode(message).apply(loop))
+        except Exception as error:
+            answer = _failure(error)
+        connection.send(answer)
+
+
+def _success(result: Any) -> bytes:
+    return DONE.pack(b"D", result) if isinstance(result, float) else pickle.dumps((result, None))
+
+
+def _failure(error: Exception) -> bytes:
+    """Return the message of an error: itself if the parent can raise it unchanged, else its traceback."""
+    return pickle.dumps((None, error if isinstance(error, BatchPIDError) else traceback.format_exc()))
