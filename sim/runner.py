@@ -193,7 +193,9 @@ class Runner:
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
         command = self._command(
             (self.num_envs, self.robot.dof),
-            {"setpoint": setpoint, "setpoint_rate": setpoint_rate, "feedforward": feedforward},
+            ("setpoint", setpoint),
+            ("setpoint_rate", setpoint_rate),
+            ("feedforward", feedforward),
         )
         self._run(command.map(lambda rows: rows[None]), count)
         return self.observe()
@@ -229,7 +231,9 @@ class Runner:
         ticks = shape[0]
         command = self._command(
             (ticks, self.num_envs, dof),
-            {"setpoints": setpoints, "setpoint_rates": setpoint_rates, "feedforwards": feedforwards},
+            ("setpoints", setpoints),
+            ("setpoint_rates", setpoint_rates),
+            ("feedforwards", feedforwards),
         )
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
@@ -419,16 +423,18 @@ class Runner:
         self._pool.settle()
         return self._pool
 
-    def _command(self, shape: tuple[int, ...], given: dict[str, ArrayLike | None]) -> Command:
-        """Return the command of ``shape`` (..., envs, dof) of three arguments, checked."""
-        names, finite = self.robot.joint_names, self.options.on_invalid_input == "raise"
+    def _command(
+        self, shape: tuple[int, ...], setpoint: tuple[str, ArrayLike], *optional: tuple[str, ArrayLike | None]
+    ) -> Command:
+        """Return the command of ``shape`` (..., envs, dof) given by arguments with their names, checked."""
 
         def read(name: str, value: ArrayLike) -> NDArray[np.float64]:
             rows = read_array(name, value)
             rows = rows[:, None] if rows.ndim == len(shape) - 1 == 2 else rows  # (ticks, dof): for all envs alike
-            return array(name, rows, shape, names, finite=finite)
+            return array(name, rows, shape, self.robot.joint_names, finite=self.options.on_invalid_input == "raise")
 
-        command = Command(*(None if value is None else read(name, value) for name, value in given.items()))
+        rows = (None if value is None else read(name, value) for name, value in optional)
+        command = Command(read(*setpoint), *rows)
         if self.control != "effort":
             self._limits.check("setpoint", command.setpoint, stacklevel=4)
         return command

@@ -96,7 +96,7 @@ class Loop:
             group.set_params(params.for_envs(group.envs))
 
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
-        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; returns the seconds it took."""
+        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
         began = time.perf_counter()
         for group in self.groups:
             for done, tick in enumerate(self.ticks[:ticks]):
@@ -109,13 +109,13 @@ class Loop:
         return time.perf_counter() - began
 
     def snapshot(self) -> EnvStates:
-        """State of every env, physics and controller. It is a barrier: the loop goes on as if restored from it."""
+        """Return the state of every env. It is a barrier: the loop goes on as if restored from it."""
         states = EnvStates.join([group.read() for group in self.groups])
         self._place(states)
         return states
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Put every env into the state that ``snapshot`` holds for it, with its params."""
+        """Put every env into its state in ``snapshot``, with its params."""
         self._steps = snapshot.steps
         self.set_params(snapshot.params)
         self._place(snapshot.states)
@@ -123,18 +123,18 @@ class Loop:
             group.observe(self.ticks[0].at(group.envs))
 
     def _place(self, states: EnvStates) -> None:
-        # The engine's contact caches, and the order in which it solves contacts, depend on its past. Only a new
-        # world has none.
+        # The engine's contact caches, and the order in which it solves contacts, depend on its past; only those of a
+        # new world do not.
         for group in self.groups:
             group.pack.close()
             group.write(self._build(group.envs), states.for_envs(group.envs))
 
     def content_sizes(self) -> list[int]:
-        """How many numbers a snapshot holds of each env's content."""
+        """Return how many numbers a snapshot holds of each env's user content."""
         return [size for group in self.groups for size in group.pack.content_sizes()]
 
     def poses(self) -> list[NDArray[np.float32]]:
-        """Poses of the entities that each env's content wants watched, (watched, 7) each."""
+        """Return the poses of the entities that ``build`` returned for each env, (entities, 7) each."""
         return [rows for group in self.groups for rows in group.pack.read_poses()]
 
     def close(self) -> None:

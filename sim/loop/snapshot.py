@@ -1,9 +1,9 @@
-"""Snapshots: the whole state of all envs, physics and controller, as arrays.
+"""Snapshots: the state of all envs, physics and controller, as arrays.
 
-A snapshot is a barrier. The engine keeps more than positions and velocities: contact caches, warm starts, and the order
-in which it solves contacts, all of which depend on its past and can be neither read nor written. So whoever goes on
-from a snapshot, in the process that took it or in another, goes on with a new world in that state, and gets the same
-bytes. The barrier itself changes the last bits.
+A snapshot is a barrier. The engine has more state than positions and velocities: contact caches, warm starts, and the
+order in which it solves contacts. All of these depend on the past, and can be neither read nor written. So everyone who
+continues from a snapshot, in the process that took it or in another, does so with a new world in that state, and the
+results are bit-identical. The barrier itself changes the last bits.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,12 +22,15 @@ import batchpid as bp
 from batchpid.choices import CHOICE_TYPES
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
+from batchpid.validate import file_path
 from sim.loop.faults import CAUSES, FaultContainment
 
 _FORMAT = 3
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, EOFError)
+"""Errors that np.load and the steps after it raise for files that are no snapshot."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnvStates:
     """State of some envs; every array has a row for each."""
 
@@ -37,9 +40,9 @@ class EnvStates:
     root: NDArray[np.float32]
     """Position, quaternion w, x, y, z, linear and angular velocity of the root link (envs, 13)."""
     content: NDArray[np.float32]
-    """What the caller's content needs (envs, numbers); NaN where an env needs fewer than another."""
+    """State of the user content (envs, numbers); NaN where an env has fewer numbers than another."""
     isolated: NDArray[np.bool_]
-    """Whether the robot has a PhysX system of its own (:mod:`sim.engine.contact_prediction`)."""
+    """Robots that have their own PhysX system (:mod:`sim.engine.contact_prediction`)."""
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
@@ -47,43 +50,52 @@ class EnvStates:
     """See :class:`sim.loop.faults.FaultContainment`."""
 
     def for_envs(self, envs: slice) -> EnvStates:
-        """The state of some of the envs, as copies."""
-        return _build({name: rows[envs].copy() for name, rows in _flatten(self)})
+        """Return the state of some envs, as copies."""
+        return EnvStates(**_nest({name: rows[envs].copy() for name, rows in _flatten(vars(self)).items()}))
 
-    def check(self, num_envs: int, dof: int, params: bp.PIDParams, sizes: Sequence[int]) -> None:
-        """Check that these are states of so many envs and joints under such params, with content of such sizes (envs,).
+    @staticmethod
+    def join(parts: Sequence[EnvStates]) -> EnvStates:
+        """Return the states of the envs of all ``parts``."""
+        width = max(part.content.shape[1] for part in parts)
+        tables = [_flatten(vars(replace(part, content=_widen(part.content, width)))) for part in parts]
+        return EnvStates(**_nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
+
+    def check(self, num_envs: int, dof: int, params: bp.PIDParams, content_sizes: Sequence[int]) -> None:
+        """Check that these are states of so many envs and joints, under ``params``, with content of such sizes (envs,).
 
         Raises
         ------
         InvalidArgumentError
             They are not.
         """
-        row, table = np.zeros((num_envs, 13), np.float32), np.zeros((num_envs, dof), np.float32)
-        wanted: dict[str, Any] = dict.fromkeys(("qpos", "qvel", "effort"), table)
-        wanted |= {
-            "root": row,
-            "isolated": row[:, 0] > 0,
-            "saturated": table > 0,
-            "content": self.content[:num_envs],
-        }
-        known = FaultContainment(num_envs, dof, "hold", None).read()
-        wanted |= {f"containment.{name}": rows for name, rows in known.items()}
-        found = dict(_flatten(self))
-        remembered = bp.init(params, table)._asdict()
-        wanted |= {f"controller.{name}": leaf for name, leaf in remembered.items() if leaf is not None}
-        for name in sorted(set(wanted) | set(found)):
-            ours, theirs = wanted.get(name), found.get(name)
-            if ours is None or theirs is None:
-                problem = "no " + name if theirs is None else f"an unknown {name}"
-            elif ours.shape != theirs.shape or ours.dtype.kind != theirs.dtype.kind:
-                problem = f"{name} of {theirs.dtype} {theirs.shape}, not {ours.dtype} {ours.shape}"
+        table, row = np.zeros((num_envs, dof), np.float32), np.zeros(num_envs, bool)
+        expected = EnvStates(
+            qpos=table,
+            qvel=table,
+            effort=table,
+            root=np.zeros((num_envs, 13), np.float32),
+            content=np.zeros((num_envs, self.content.size // num_envs), np.float32),
+            isolated=row,
+            saturated=table > 0,
+            controller={name: leaf for name, leaf in bp.init(params, table)._asdict().items() if leaf is not None},
+            containment=FaultContainment(num_envs, dof, "hold", None).read(),
+        )
+        ours, theirs = _flatten(vars(expected)), _flatten(vars(self))
+        for name in sorted(ours | theirs):
+            if name not in theirs:
+                problem = f"no {name}"
+            elif name not in ours:
+                problem = f"an unknown {name}"
+            elif theirs[name].shape != ours[name].shape or theirs[name].dtype.kind != ours[name].dtype.kind:
+                kinds = [f"{rows.dtype} {rows.shape}" for rows in (theirs[name], ours[name])]
+                problem = f"{name} of {kinds[0]}, not {kinds[1]}"
             else:
                 continue
             raise InvalidArgumentError("snapshot", f"has {problem}", remedy="take a new one")
         for name, count in (("joint", dof), ("cause", len(CAUSES))):
             if not ((self.containment[name] >= 0) & (self.containment[name] < count)).all():
                 raise InvalidArgumentError("snapshot", f"names a {name} beyond {count}", remedy="take a new one")
-        for env, size in enumerate(sizes):
+        for env, size in enumerate(content_sizes):
             if size > self.content.shape[1] or not np.isnan(self.content[env, size:]).all():
                 raise InvalidArgumentError(
                     "snapshot",
@@ -92,33 +104,28 @@ class EnvStates:
                     remedy="make the runner with the same build=",
                 )
 
-    @staticmethod
-    def join(parts: Sequence[EnvStates]) -> EnvStates:
-        """The states of the envs of all ``parts``."""
-        width = max(part.content.shape[1] for part in parts)
-        parts = [replace(part, content=_widen(part.content, width)) for part in parts]
-        tables = [dict(_flatten(part)) for part in parts]
-        return _build({name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
+    def __repr__(self) -> str:
+        return "EnvStates({} envs, {} joints)".format(*self.qpos.shape)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """State of all envs of a runner at one moment. It can be pickled, or kept in a file: :meth:`save`, :meth:`load`."""
 
     about: dict[str, Any]
-    """What the runner was made of, as far as a snapshot fits no other."""
+    """Options that a runner must share to restore it: :meth:`sim.RunnerOptions.about`."""
     steps: int
     """Sim steps up to this moment."""
     params: bp.PIDParams
     states: EnvStates
 
-    def check(self, about: dict[str, Any]) -> None:
-        """Check that it is of a runner of which all this is true.
+    def check(self, about: Mapping[str, Any]) -> None:
+        """Check that a runner with options ``about`` can restore it.
 
         Raises
         ------
         InvalidArgumentError
-            It does not.
+            It cannot.
         """
         for key, ours in about.items():
             if self.about.get(key) != ours:
@@ -129,52 +136,45 @@ class Snapshot:
                 )
 
     def for_envs(self, envs: slice) -> Snapshot:
-        """The part of some envs."""
+        """Return the snapshot of some envs."""
         return replace(self, params=self.params.for_envs(envs), states=self.states.for_envs(envs))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to an .npz file, beside it first, so that an older file stays whole until this one is."""
+        """Write an .npz file, as a whole or not at all: an older file stays until this one is complete."""
         leaves = {name: leaf for name, leaf in self.params._asdict().items() if leaf is not None}
-        arrays = {f"params.{name}": leaf for name, leaf in leaves.items() if not isinstance(leaf, tuple)}
-        markers = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
-        head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": markers}
-        tables: dict[str, Any] = {"head": np.array(json.dumps(head))} | arrays | dict(_flatten(self.states))
-        write_atomically(path, lambda file: np.savez(file, **tables))
+        choices = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
+        arrays = {name: leaf for name, leaf in leaves.items() if name not in choices}
+        head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": choices}
+        tables: dict[str, Any] = {
+            "head": np.array(json.dumps(head)),
+            **_flatten({"params": arrays, **vars(self.states)}),
+        }
+        write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Snapshot:
-        """Read what :meth:`save` wrote. Nothing in the file can run.
+        """Read a file of :meth:`save`. Nothing in it is executed.
 
         Raises
         ------
         InvalidArgumentError
             The file is missing, or no snapshot of this version.
         """
-        if not isinstance(path, str | os.PathLike):  # open() takes a number for a file descriptor
-            raise InvalidArgumentError("path", "must be a path", value=path, remedy="pass the file's name")
+        path = file_path("path", path)
         try:
-            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 tables = {name: file[name] for name in file.files}
             head = json.loads(str(tables.pop("head")))
             if head["format"] != _FORMAT:
                 raise ValueError(f"format {head['format']}, not {_FORMAT}")
-            about, steps = head["about"], head["steps"]
+            about, steps, choices = head["about"], head["steps"], head["markers"]
             if not isinstance(about, dict) or not isinstance(steps, int) or not 0 <= steps < 2**62:
-                raise ValueError("it does not say what it is of")
-            params = {
-                name.removeprefix("params."): tables.pop(name) for name in list(tables) if name.startswith("params.")
-            }
-            params |= {name: _marker(kind) for name, kind in head["markers"].items()}
-            return cls(about, steps, bp.PIDParams(**params), _build(tables))
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            AttributeError,
-            zipfile.BadZipFile,
-            EOFError,
-        ) as error:
+                raise ValueError("its options or steps are missing")
+            known = {kind.__name__: kind for kind in CHOICE_TYPES}
+            groups = _nest(tables)
+            params = bp.PIDParams(**groups.pop("params"), **{name: known[kind]() for name, kind in choices.items()})
+            return cls(about, steps, params, EnvStates(**groups))
+        except _UNREADABLE as error:
             raise InvalidArgumentError(
                 "path",
                 f"cannot be read as a snapshot: {error}",
@@ -182,30 +182,32 @@ class Snapshot:
                 remedy="pass a file that Snapshot.save wrote",
             ) from error
 
-
-def _marker(kind: str) -> tuple[()]:
-    known = {marker.__name__: marker for marker in CHOICE_TYPES}
-    return known[kind]()
-
-
-def _flatten(states: EnvStates) -> Iterator[tuple[str, NDArray[Any]]]:
-    for item in fields(states):
-        value = getattr(states, item.name)
-        if isinstance(value, dict):
-            yield from ((f"{item.name}.{name}", rows) for name, rows in value.items())
-        else:
-            yield item.name, value
+    def __repr__(self) -> str:
+        about = self.about
+        return (
+            f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control {about.get('control')!r}, "
+            f"after {self.steps} sim steps)"
+        )
 
 
-def _build(tables: dict[str, NDArray[Any]]) -> EnvStates:
-    items: dict[str, Any] = {"controller": {}, "containment": {}}
+def _flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Return all arrays by name; those of a group as "group.name"."""
+    tables: dict[str, NDArray[Any]] = {}
+    for name, value in groups.items():
+        tables |= {f"{name}.{leaf}": rows for leaf, rows in value.items()} if isinstance(value, dict) else {name: value}
+    return tables
+
+
+def _nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the groups of :func:`_flatten`."""
+    groups: dict[str, Any] = {"controller": {}, "containment": {}}
     for name, rows in tables.items():
         group, dot, leaf = name.partition(".")
         if dot:
-            items[group][leaf] = rows
+            groups.setdefault(group, {})[leaf] = rows
         else:
-            items[name] = rows
-    return EnvStates(**items)
+            groups[name] = rows
+    return groups
 
 
 def _widen(rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.metrics import StepMetrics, step_metrics
 from sim.observation import Rollout
-from sim.options import ControlMode
 from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner

@@ -107,7 +107,7 @@ def test_another_thread_may_close_the_runner(panda):
         pids = runner.pids
         timer = threading.Timer(0.2, runner.close)
         timer.start()
-        with pytest.raises(ClosedError, match="amid a call"):
+        with pytest.raises(ClosedError, match="during a call"):
             runner.step(panda.start, substeps=100_000)
         timer.join()
     for pid in pids:
