@@ -28,7 +28,7 @@ def rollout(panda):
     setpoints = np.tile(panda.settings.target, (6, 3, 1))
     setpoints[4, 1, 3] = np.nan
     options = {"substeps": 2, "params": params, "physics": "fast", "on_invalid_input": "contain"}
-    with Runner(panda, 3, params=panda.params(), workers=0, **options) as runner:
+    with Runner(panda, 3, workers=0, **options) as runner:
         runner.step(panda.start)
         with pytest.warns(FaultWarning):
             return runner.rollout(setpoints)
