@@ -105,8 +105,8 @@ def test_a_setpoint_at_the_goal_reaches_it_and_raises_the_reward():
     env.close()
 
 
-def test_a_failed_env_terminates_with_a_finite_observation_and_begins_again():
-    env = ReachVectorEnv(2, workers=0, actions="increment", speed_limit=0.1)
+def test_a_failed_env_terminates_with_a_finite_observation_and_begins_again(panda):
+    env = ReachVectorEnv(2, workers=0, params=panda.params(), actions="increment", speed_limit=0.5)
     env.reset(seed=0)
     action = np.zeros((2, 9), np.float32)
     action[0] = 1.0  # the joints of env 0 move faster than the speed limit
