@@ -73,7 +73,7 @@ def parse(arguments: Sequence[str]) -> Any:
     app = tyro.extras.SubcommandApp()
     named = bool(arguments) and arguments[0] in COMMANDS
     for name, command in COMMANDS.items():
-        # The overview shows the first line of each docstring, the help of a command all of its own.
+        # The overview shows the first line of each docstring, the help of a command shows all of it.
         summary = None if named else (command.__doc__ or "").partition("\n")[0]
         app.command(name=name, help=summary)(command)
     options = (
