@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.validate import array, choice, env_mask, integer, number
 from sim.observation import Observation
+from sim.options import RunnerOptions
 from sim.robot.robot import Robot
 from sim.runner import Runner
 
@@ -102,7 +103,7 @@ class ReachVectorEnv(VectorEnv):
             )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
-        timestep = options.get("timestep", 1 / 2000)
+        timestep = options.get("timestep", RunnerOptions.timestep)
         substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
 
         dof = self.robot.dof

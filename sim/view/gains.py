@@ -90,20 +90,13 @@ def offered_gains(robot: Robot, control: ControlMode, params: bp.PIDParams | Non
     InvalidArgumentError
         ``params`` are not one row of gains for the joints of ``robot``.
     """
-    sets: dict[str, bp.PIDParams] = {}
-    if control == "pid" and params is not None:
-        sets["given"] = RunnerOptions(robot, 1, control=control).check_params(params)
-    if control == "pid" and robot.fixed_base:
-        for name, make in (("tuned", robot.tuned), ("designed", robot.designed)):
-            with suppress(InvalidArgumentError):  # not every robot has them
-                sets[name] = make()
-    if robot.settings is not None:
-        sets["tutorial"] = robot.params() if control == "pid" else default_params(robot, control)
-    if not sets:  # a critically damped 10 rad/s, for an inertia of 1 where the base floats
-        inertia = np.diagonal(robot.mass_matrix(robot.start)[0]) if robot.fixed_base else 1.0
-        limit = None if control == "drive" else robot.effort_limit
-        sets["default"] = robot.params(kp=100 * inertia, ki=0.0, kd=20 * inertia, effort_limit=limit)
-    return sets
+    if control == "drive":
+        return {"designed" if robot.settings is None else "tutorial": default_params(robot, control)}
+    sets = {} if params is None else {"given": RunnerOptions(robot, 1).check_params(params)}
+    for name, make in (("tuned", robot.tuned), ("designed", robot.designed), ("tutorial", robot.params)):
+        with suppress(InvalidArgumentError):  # not every robot has them
+            sets[name] = make()
+    return sets or {"designed": default_params(robot, control)}
 
 
 def _adjustable(params: bp.PIDParams) -> bp.PIDParams:

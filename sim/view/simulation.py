@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.validate import choice, integer, number
 from sim.observation import Observation, Rollout
-from sim.options import ControlMode
+from sim.options import ControlMode, RunnerOptions
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 from sim.runner import Runner
@@ -74,7 +74,7 @@ class LiveSimulation:
         self.groups = tuple(dict.fromkeys(choice("controls", control, CONTROLS) for control in controls))
         groups = integer("controls", len(self.groups), 1, len(CONTROLS))
         self.per_group = integer("num_envs", num_envs, 1, MAX_ROBOTS // groups)
-        timestep = options.get("timestep", 1 / 2000)
+        timestep = options.get("timestep", RunnerOptions.timestep)
         substeps = max(1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep))
         self.period = substeps * timestep
         self.kinematics = Kinematics(robot)
