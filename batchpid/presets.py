@@ -1,7 +1,7 @@
-"""Other controllers' numerics, step for step, as parameters of the one law.
+"""Params that give other controllers' numerics, step for step.
 
-Every preset returns :class:`batchpid.PIDParams`; more options can be set on them with ``params.replace(...)``. What a
-peer does wrong is reproduced only where its docstring says so, and can be switched off.
+Every preset returns :class:`batchpid.PIDParams` and takes further options of :func:`batchpid.make_params`. Errors of a
+controller are reproduced only where the docstring mentions them, and can be switched off.
 """
 
 from __future__ import annotations
@@ -11,27 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.elementwise import namespace
 from batchpid.params import PIDParams, make_params
 
 
 def tutorial(
     joints: int, kp: Any = 0.0, ki: Any = 0.0, kd: Any = 0.0, *, kick: bool = True, **options: Any
 ) -> PIDParams:
-    """SimplePID of SAPIEN's tutorial "Drive Robot with PID Controller".
+    """Return params of SimplePID of SAPIEN's tutorial "Drive Robot with PID Controller".
 
     Integrates first, derivative on the error, no limits. Its derivative starts from an error of 0, so its first
-    effort contains kd * error / dt: ``kick=False`` leaves that out.
+    effort contains kd * error / dt; not with ``kick=False``.
     """
-    return make_params(
-        joints,
-        kp,
-        ki,
-        kd,
-        setpoint_weight_derivative=1.0,
-        integration="integrate_first",
-        first_derivative="kick" if kick else "zero",
-        **options,
-    )
+    first = "kick" if kick else "zero"
+    order = {"integration": "integrate_first", "first_derivative": first, "setpoint_weight_derivative": 1.0}
+    return make_params(joints, kp, ki, kd, **{**order, **options})
 
 
 def simple_pid(
@@ -45,27 +39,20 @@ def simple_pid(
     differential_on_measurement: bool = True,
     **options: Any,
 ) -> PIDParams:
-    """m-lundberg/simple-pid 2.0.1, with ``sample_time=None`` and ``dt`` given.
+    """Return params of m-lundberg/simple-pid 2.0.1, with ``sample_time=None`` and ``dt`` given.
 
     Integrates first, the integral clamped to the output limits. Proportional on measurement acts on the way since the
-    first measurement. Angles are better served by ``continuous=`` than by its ``error_map``, whose derivative spikes.
+    first measurement. For angles use ``continuous=`` instead of its ``error_map``, whose derivative spikes.
     """
     low, high = output_limits
-    limited = low is not None or high is not None
-    return make_params(
-        joints,
-        kp,
-        ki,
-        kd,
-        effort_min=low,
-        effort_max=high,
-        anti_windup="clamp" if limited else "none",
-        setpoint_weight=0.0 if proportional_on_measurement else None,
-        weight_origin="start" if proportional_on_measurement else "zero",
-        setpoint_weight_derivative=None if differential_on_measurement else 1.0,
-        integration="integrate_first",
-        **options,
-    )
+    own: dict[str, Any] = {"effort_min": low, "effort_max": high, "integration": "integrate_first"}
+    if low is not None or high is not None:
+        own["anti_windup"] = "clamp"
+    if proportional_on_measurement:
+        own |= {"setpoint_weight": 0.0, "weight_origin": "start"}
+    if not differential_on_measurement:
+        own["setpoint_weight_derivative"] = 1.0
+    return make_params(joints, kp, ki, kd, **{**own, **options})
 
 
 def control_toolbox(
@@ -83,41 +70,29 @@ def control_toolbox(
     kick: bool = True,
     **options: Any,
 ) -> PIDParams:
-    """ros-controls/control_toolbox 6.3.0, src/pid.cpp, on the error alone.
+    """Return params of ros-controls/control_toolbox 6.3.0, src/pid.cpp, on the error alone.
 
     Outputs first, then integrates; ``antiwindup`` is "none", "back_calculation" or "conditional_integration"; the
     integral is clamped to [i_min, i_max] besides. ``tracking_time=None`` is its rule for 0: sqrt(d/i), or p/i. Its
-    first derivative is taken from an error of 0: ``kick=False`` leaves that out. Not reproduced: NaN for I alone with
+    first derivative is taken from an error of 0; not with ``kick=False``. Not reproduced: NaN for I alone with
     back-calculation, and the oscillation of a tracking time below dt.
     """
-    strategy = {"conditional_integration": "conditional"}.get(antiwindup, antiwindup)
-    return make_params(
-        joints,
-        p,
-        i,
-        d,
-        effort_min=u_min,
-        effort_max=u_max,
-        integral_min=i_min,
-        integral_max=i_max,
-        anti_windup=strategy,
-        tracking_time=tracking_time,
-        setpoint_weight_derivative=1.0,
-        first_derivative="kick" if kick else "zero",
-        **options,
-    )
+    own = {"effort_min": u_min, "effort_max": u_max, "integral_min": i_min, "integral_max": i_max}
+    own |= {"setpoint_weight_derivative": 1.0, "first_derivative": "kick" if kick else "zero"}
+    strategy = "conditional" if antiwindup == "conditional_integration" else antiwindup
+    return make_params(joints, p, i, d, anti_windup=strategy, tracking_time=tracking_time, **{**own, **options})
 
 
 def newton(
     joints: int, kp: Any = 0.0, ki: Any = 0.0, kd: Any = 0.0, *, integral_max: Any = math.inf, **options: Any
 ) -> PIDParams:
-    """DrivePID of newton.actuators: I = clamp(I + e dt, +-integral_max), and rates as given.
+    """Return params of DrivePID of newton.actuators: I = clamp(I + e dt, +-integral_max), and rates as given.
 
     Step it with ``measurement_rate`` and ``setpoint_rate``; its constant and feedforward efforts are the
-    ``feedforward``. ``effort_limit=`` is its clamp stage, which does not act back on I. There, integral_max is in
-    position seconds; here it becomes ki * integral_max.
+    ``feedforward``. ``effort_limit=`` is its clamp stage, which does not act back on I. Its ``integral_max`` is in
+    position seconds; the params have ki * integral_max.
     """
-    limit, gain = np.asarray(integral_max, dtype=float), np.asarray(ki, dtype=float)
+    limit = np.asarray(integral_max, dtype=float)
     unbounded = np.isinf(limit)
-    in_effort = np.where(unbounded, limit, gain * np.where(unbounded, 0.0, limit))
+    in_effort = None if unbounded.all() else namespace(ki).where(unbounded, limit, ki * np.where(unbounded, 0.0, limit))
     return make_params(joints, kp, ki, kd, integral_limit=in_effort, integration="integrate_first", **options)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from law_cases import DT, ENVS, JOINTS, Backend, read_only
+from scalar_pid import ScalarPID, scalar_pids
 
 import batchpid as bp
-from batchpid.reference import ScalarPID, SimplePID, scalar_pids
+from batchpid.reference import SimplePID
 
 ALL = ("measurement_rate", "setpoint_rate", "feedforward")
 SOME = [("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]
