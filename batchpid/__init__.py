@@ -1,4 +1,25 @@
-"""Joint-level PID control for many robots at once: arrays in, arrays out."""
+"""Joint-level PID control for many robots at once: arrays in, arrays out.
+
+Params say how to control, a state is carried from step to step, and every array is (envs, joints)::
+
+    import batchpid as bp
+    import numpy as np
+
+    params = bp.make_params(joints=9, kp=40, ki=5, kd=2, effort_limit=87, anti_windup="conditional")
+    pid = bp.BatchPID(params, num_envs=64, dt=1 / 2000)  # keeps the state; backend="jax" for the same law, jitted
+    effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
+
+- Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
+  take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params.
+- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.presets` for other controllers' numerics;
+  :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
+- Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
+- A simulator's drive with integral action: :func:`drive_target`.
+- In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
+  inertia in :mod:`batchpid.computed_torque`, errors in :mod:`batchpid.errors`.
+
+NumPy alone is needed; JAX, PyYAML and ruckig are imported by what uses them.
+"""
 
 from batchpid import presets
 from batchpid.bumpless import track

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from batchpid import bumpless, law
+from batchpid import law
 from batchpid.coefficients import discretise
 from batchpid.errors import MissingDependencyError
 from batchpid.params import PIDParams
@@ -25,29 +24,20 @@ class NumPyBackend:
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
-        self.params, self.dtype = params, params.dtype
-        self.coefficients = discretise(params, self.dt, shape[0])
+        self.params, self.coefficients = params, discretise(params, self.dt, shape[0])
 
     def array(self, value: Any) -> Any:
         """Return ``value`` as an array of this backend."""
-        return np.asarray(value, dtype=self.dtype)
+        return np.asarray(value, dtype=self.params.dtype)
 
-    def init(self, y: Any) -> PIDState:
-        """Return the state at a first measurement."""
-        return law.init(self.params, y)
+    def call(self, function: Any, *inputs: Any, **named: Any) -> PIDState:
+        """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
+        return function(self.params, *inputs, **named)
 
     def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
         """Return the new state, the effort, and the terms if they are kept."""
         new, effort, *terms = law.advance(self.coefficients, state, *inputs, terms=self.terms)
         return new, effort, terms[0] if terms else None
-
-    def reset(self, state: PIDState, y: Any, mask: Any, *, keep_integral: bool) -> PIDState:
-        """Return the state with the envs of ``mask`` restarted."""
-        return law.reset(self.params, state, y, mask, keep_integral=keep_integral)
-
-    def track(self, state: PIDState, r: Any, y: Any, u: Any, **inputs: Any) -> PIDState:
-        """Return the state whose next step gives the effort ``u``."""
-        return bumpless.track(self.params, state, r, y, u, dt=self.dt, **inputs)
 
 
 class JAXBackend:
@@ -64,6 +54,7 @@ class JAXBackend:
         from batchpid import blocks
 
         self.jax, self.terms = jax, terms
+        self._compiled: dict[Any, Any] = {}
         self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
         def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
@@ -74,13 +65,10 @@ class JAXBackend:
             out = (spare, jax.numpy.zeros_like(inputs[1]))
             return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
 
-        self._init = self._compiled(law.init)
-        self._step = self._compiled(step, donate_argnums=3)
-        self._step_in_blocks = self._compiled(step_in_blocks, donate_argnums=3)
-        self._reset = self._compiled(law.reset, static_argnames="keep_integral")
-        self._track = self._compiled(partial(bumpless.track, dt=dt))
+        self._step = self._compile(step, donate_argnums=3)
+        self._step_in_blocks = self._compile(step_in_blocks, donate_argnums=3)
 
-    def _compiled(self, function: Any, **options: Any) -> Any:
+    def _compile(self, function: Any, **options: Any) -> Any:
         """Return a function of params and more, compiled as one of packed params: layout, shared, own."""
 
         def packed(layout: Any, shared: Any, own: Any, *inputs: Any, **named: Any) -> Any:
@@ -89,7 +77,7 @@ class JAXBackend:
             leaves = [next(shared if one else own) for one in is_shared]
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
-        return self.jax.jit(packed, static_argnums=0, **options)
+        return self.jax.jit(packed, static_argnums=0, static_argnames=("dt", "keep_integral"), **options)
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
@@ -107,9 +95,11 @@ class JAXBackend:
         fits = isinstance(value, self.jax.Array) and value.dtype == self.dtype
         return value if fits else np.asarray(value, dtype=self.dtype)
 
-    def init(self, y: Any) -> PIDState:
-        """Return the state at a first measurement."""
-        return self._init(*self.packed, y)
+    def call(self, function: Any, *inputs: Any, **named: Any) -> PIDState:
+        """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
+        if function not in self._compiled:
+            self._compiled[function] = self._compile(function)
+        return self._compiled[function](*self.packed, *inputs, **named)
 
     def step(self, state: PIDState, r: Any, y: Any, *rates: Any) -> tuple[PIDState, Any, Terms | None]:
         """Return the new state, the effort, and the terms if they are kept."""
@@ -123,11 +113,3 @@ class JAXBackend:
     def _on_one_cpu(self, y: Any) -> bool:
         devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]
         return [device.platform for device in devices] == ["cpu"]
-
-    def reset(self, state: PIDState, y: Any, mask: Any, *, keep_integral: bool) -> PIDState:
-        """Return the state with the envs of ``mask`` restarted."""
-        return self._reset(*self.packed, state, y, mask, keep_integral=keep_integral)
-
-    def track(self, state: PIDState, r: Any, y: Any, u: Any, **inputs: Any) -> PIDState:
-        """Return the state whose next step gives the effort ``u``."""
-        return self._track(*self.packed, state, r, y, u, **inputs)

@@ -1,9 +1,9 @@
 """The law over a large batch on JAX's CPU backend, block by block.
 
-XLA compiles one kernel for each output there, and each reads the inputs again; over a large batch that is from memory,
-into buffers that the system hands out page by page. A block of some thousand rows stays in the cache between its
-kernels, and what it gives is written over arrays that are no longer needed. Flat, so that a row of 9 joints does not
-cut short the processor's vectors of 8 or 16.
+XLA compiles one kernel per output there, and each reads the inputs again: in a large batch from memory, into buffers
+that the system maps page by page. A block of a thousand rows stays in the cache between its kernels, and its results
+overwrite arrays that are no longer needed. Blocks are flat, so that rows of 9 joints fill the processor's vectors of 8
+or 16.
 """
 
 from __future__ import annotations
@@ -18,28 +18,21 @@ from batchpid.law import advance
 from batchpid.state import PIDState
 
 ROWS = 1024
-"""Envs to a block."""
+"""Envs per block."""
 
 
 def advance_in_blocks(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
-    *,
-    out: tuple[PIDState, Any] | None = None,
-    rows: int = ROWS,
+    k: Coefficients, state: PIDState, *inputs: Any, out: tuple[PIDState, Any] | None = None, rows: int = ROWS
 ) -> tuple[PIDState, Any]:
-    """Do one step as :func:`batchpid.advance` does, ``rows`` envs at a time: for jax.jit, with ``out`` donated.
+    """Advance the law ``rows`` envs at a time, for jax.jit with ``out`` donated.
 
-    ``out`` is a state and an effort, (envs, joints) each, to write over: those of the step before last, say, but not
-    ``state`` itself. None takes new ones. On several devices use it under ``jax.shard_map``, each with its own envs.
+    ``inputs`` are those of :func:`batchpid.advance`, in order: setpoint, measurement and, optionally, measurement_rate,
+    setpoint_rate, feedforward. ``out`` is a state and an effort, (envs, joints) each, to overwrite: e.g. those of the
+    step before last, but not ``state`` itself; None takes new ones. On several devices use it under ``jax.shard_map``,
+    each device with a part of the envs.
     """
+    measurement = inputs[1]
     envs, joints = measurement.shape
-    inputs = (setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     if envs <= rows:
         return advance(k, state, *inputs)
     if out is None:
@@ -52,7 +45,7 @@ def advance_in_blocks(
         return (jnp.tile(x, (rows, 1)) if x.shape[0] == 1 else x).reshape(-1)
 
     def step(n: Any, out: Any) -> Any:
-        # The last block may do some rows of the one before again.
+        # The last block may repeat some rows of the one before.
         start = jnp.minimum(n * block, total - block)
 
         def cut(x: Any) -> Any:

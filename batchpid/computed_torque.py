@@ -1,21 +1,21 @@
 r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
 
-With kp = w^2 and kd = 2 zeta w, all joints of all robots then respond alike, in every pose. Two ways:
+With kp = w^2 and kd = 2 zeta w, all joints of all robots respond alike, in every pose. There are two ways:
 
 - "inertia": each gain is multiplied by its joint's M_jj(q), as PhysX's drives do in mode "acceleration". The law is
   otherwise untouched: integral, limits and anti-windup are in effort units.
 - "mass_matrix": u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar,
   Robot Modeling and Control, 2nd ed., section 9.3). The joints no longer disturb each other.
 
-When the limits cut u, cutting each joint by itself would turn the acceleration aside and couple the joints again. So a
-is shortened as a whole::
+Where limits apply, clipping each joint of u alone would change the direction of the acceleration and couple the joints
+again. So a is scaled as a whole::
 
     u = s M a + passive,   s = the largest in [0, 1] with all of u within its limits
 
 which keeps its direction (P. J. Campo and M. Morari, "Robust control of processes subject to saturation
-nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot then stays on the straight line to
-its setpoint, however hard it is limited. A joint whose passive force is beyond its limit by itself is clipped, and left
-out of s. While s < 1, conditional integration does not integrate further into the direction of a.
+nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot stays on the straight line to its
+setpoint, however tight the limits. A joint whose passive force alone exceeds its limit is clipped, and left out of s.
+While s < 1, conditional integration does not integrate further into the direction of a.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def advance_with_mass_matrix(
     *,
     terms: bool = False,
 ) -> Any:
-    """Do one step of the law in accelerations; return efforts. Otherwise as :func:`batchpid.advance`.
+    """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
 
     Parameters
     ----------
     mass_matrix
         (envs, joints, joints) at about the present positions [kg m^2 or kg].
     feedforward
-        Effort [N m or N] beside the law: passive force and more.
+        Effort added to that of the law [N m or N]: passive force and more.
     """
     xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
     low, high = k.effort_min, k.effort_max
@@ -67,54 +67,37 @@ def advance_with_mass_matrix(
     new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, terms=terms)
     wanted = _multiply(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
-    share = None
     effort = unsaturated = wanted + passive
     if low is not None or high is not None:
         share = _share(wanted, passive, low, high, xp)
         effort = clip(share * wanted + passive, low, high, xp)
-    if share is not None and k.ki_dt is not None and k.conditional is not None:
-        deeper = (share < 1) & (a * (new.integral - state.integral) > 0)
-        if not isinstance(k.conditional, Everywhere):
-            deeper = deeper & (k.conditional > 0)
-        new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
+        if k.ki_dt is not None and k.conditional is not None:
+            deeper = (share < 1) & (a * (new.integral - state.integral) > 0)
+            if not isinstance(k.conditional, Everywhere):
+                deeper = deeper & (k.conditional > 0)
+            new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
     if not terms:
         return new, effort
-    t = shown[0]
-    efforts = Terms(
-        p=_multiply(mass_matrix, t.p),
-        i=_multiply(mass_matrix, t.i),
-        d=_multiply(mass_matrix, t.d),
-        feedforward=xp.zeros_like(wanted) + passive,
-        unsaturated=unsaturated,
-        effort=effort.copy(),
-        saturated=effort != unsaturated,
-        finite=t.finite,
-    )
-    return new, effort, efforts
+    p, i, d = (_multiply(mass_matrix, term) for term in shown[0][:3])
+    given = xp.zeros_like(wanted) + passive
+    saturated = effort != unsaturated
+    return new, effort, Terms(p, i, d, given, unsaturated, effort.copy(), saturated, shown[0].finite)
 
 
 def check_gain_units(params: PIDParams) -> None:
-    """Refuse options that have no meaning for accelerations.
+    """Raise InvalidArgumentError for options that have no meaning for accelerations.
 
-    Raises
-    ------
-    InvalidArgumentError
-        gain_units "mass_matrix" with back-calculation, an effort rate limit or a policy for non-finite inputs.
+    With gain_units "mass_matrix" these are back-calculation, an effort rate limit and a policy for non-finite inputs.
     """
-    if not isinstance(params.gain_units, PerMassMatrix):
-        return
-    for option, leaf in (
-        ("tracking_time", params.tracking_time),
-        ("effort_rate_limit", params.effort_rate_limit),
-        ("non_finite", params.non_finite),
-    ):
-        if leaf is not None:
-            raise InvalidArgumentError(
-                option,
-                "is not available with gain_units 'mass_matrix'",
-                remedy="use anti_windup 'conditional', no effort rate limit and non_finite 'propagate', or gain_units "
-                "'inertia'",
-            )
+    instead = {
+        "tracking_time": "anti_windup 'conditional'",
+        "effort_rate_limit": "no effort rate limit",
+        "non_finite": "non_finite 'propagate'",
+    }
+    for option, remedy in instead.items():
+        if isinstance(params.gain_units, PerMassMatrix) and getattr(params, option) is not None:
+            problem = "is not available with gain_units 'mass_matrix'"
+            raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'inertia'")
 
 
 def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Any) -> PIDState:
@@ -142,15 +125,13 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
 
 
 def _multiply(matrix: Any, vector: Any) -> Any:
-    """Return matrix @ vector for each env; the sum of each row is taken in one order, whatever the number of envs."""
+    """Return matrix @ vector for each env, with sums in one order for any number of envs."""
     return (matrix * vector[:, None, :]).sum(-1)
 
 
 def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:
-    """Return s (envs, 1): how much of ``wanted`` fits between ``passive`` and the limits."""
-    infinity = xp.inf
-    above = infinity if high is None else high - passive
-    below = infinity if low is None else passive - low
+    """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
+    above, below = (xp.inf if high is None else high - passive), (xp.inf if low is None else passive - low)
     room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
     limited = (size > room) & (room > 0)
     return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1, keepdims=True)

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from batchpid import bumpless, law
 from batchpid.backends import JAXBackend, NumPyBackend
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 from batchpid.validate import choice, env_mask, instance, integer, names, positive
 
-BACKENDS = ("numpy", "jax")
+BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31
 
 
@@ -63,7 +64,7 @@ class BatchPID:
         )
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
         self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
-        self._engine = (NumPyBackend if backend == "numpy" else JAXBackend)(self._dt, terms)
+        self._engine = BACKENDS[self._backend](self._dt, terms)
         self._state: PIDState | None = None
         self._stale = False  # whether the state may lack leaves that the params now need
         self._terms: Terms | None = None
@@ -154,7 +155,7 @@ class BatchPID:
         """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
         y = self._measurement(measurement)
         mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
-        self._state = self._engine.reset(self._started(y), y, mask, keep_integral=keep_integral)
+        self._state = self._engine.call(law.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
 
     def track(
         self,
@@ -168,14 +169,14 @@ class BatchPID:
         """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
         r, y, u = self._array("setpoint", setpoint), self._measurement(measurement), self._array("effort", effort)
         rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
-        self._state = self._engine.track(self._started(y), r, y, u, **rest)
+        self._state = self._engine.call(bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest)
 
     def _started(self, y: Any) -> PIDState:
         """Return the state, begun at the first measurement, with every leaf that the params need."""
         if self._state is None:
-            return self._engine.init(y)
+            return self._engine.call(law.init, y)
         if self._stale:
-            self._state, self._stale = self._state.matched_to(self._engine.init(y)), False
+            self._state, self._stale = self._state.matched_to(self._engine.call(law.init, y)), False
         return self._state
 
     def _optional(self, **values: Any) -> dict[str, Any]:

@@ -31,7 +31,7 @@ def span(values: Any) -> str:
 
 
 def summary(name: str, parts: Iterable[str]) -> str:
-    """Return ``name(part, part, ...)``, on as many lines as it takes."""
+    """Return ``name(part, part, ...)``, on as many lines as needed."""
     return "\n".join(
         textwrap.wrap(f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
     )

@@ -24,51 +24,40 @@ from batchpid.validate import entries, is_traced
 class PIDParams(NamedTuple):
     """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
 
-    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take traced gains.
+    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take traced gains. The
+    fields have the meaning and the units of the options of :func:`make_params`; those with another form say so.
     """
 
     kp: Any
-    """Proportional gain, effort / position."""
     ki: Any = None
-    """Integral gain, effort / (position s)."""
     kd: Any = None
-    """Derivative gain, effort s / position."""
     effort_min: Any = None
-    """Lowest total effort [N m or N]."""
     effort_max: Any = None
-    """Highest total effort [N m or N]."""
     effort_rate_limit: Any = None
-    """Largest change of the effort per second."""
     integral_min: Any = None
-    """Lowest integral term, in effort units."""
     integral_max: Any = None
-    """Highest integral term, in effort units."""
     derivative_filter_time: Any = None
-    """Time constant of the derivative's low-pass [s]."""
     setpoint_weight: Any = None
-    """b: weight of the setpoint in the proportional term (off: 1)."""
     setpoint_weight_derivative: Any = None
-    """c: weight of the setpoint in the derivative term (off: 0)."""
     deadband: Any = None
-    """Half width of the error's dead zone [rad or m]."""
     tracking_time: Any = None
-    """Back-calculation's time constant [s]; inf on a joint without it."""
+    """inf on a joint without back-calculation."""
     conditional: Any = None
-    """Conditional integration: Everywhere(), or 1.0 on the joints that have it."""
+    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the others."""
     continuous: Any = None
-    """1.0 on the joints whose position is an angle modulo 2 pi."""
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
     integration: Any = None
     """IntegrateFirst(); off: the effort is computed first, with the integral of the past errors."""
     first_derivative: Any = None
     """DerivativeKick(); off: the derivative of the first sample is 0."""
     weight_origin: Any = None
-    """WeightFromStart(); off: setpoint weighting takes positions as they are."""
+    """WeightFromStart(); off: setpoint weighting measures positions from 0."""
     non_finite: Any = None
-    """ZeroEffort() or HoldEffort(); off: what is not finite propagates."""
+    """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
     measurement_rate: Any = None
     """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
     gain_units: Any = None
-    """PerInertia() or PerMassMatrix(): whoever runs the law on a robot makes efforts of it; off: efforts."""
+    """PerInertia() or PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
 
     @property
     def num_joints(self) -> int:

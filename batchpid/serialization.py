@@ -86,7 +86,9 @@ def dumps_params(
     }
     if choice("format", format, ("yaml", "json")) == "json":
         return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
-    return _dump_yaml(document)
+    import yaml
+
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
 def loads_params(text: str, joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
@@ -146,13 +148,10 @@ def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tup
     """Return the params of a document and the names of their joints."""
     joints = _check(source, document)
     order = list(joints) if joint_names is None else names("joint_names", joint_names)
-    if set(order) != set(joints):
-        missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
-        raise InvalidArgumentError(
-            source,
-            f"does not hold these joints: missing {missing}, unknown {unknown}",
-            remedy=f"the file's joints are {', '.join(joints)}",
-        )
+    missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
+    if missing or unknown:
+        problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
+        raise InvalidArgumentError(source, problem, remedy=f"the file's joints are {', '.join(joints)}")
     head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
     options = _columns(source, {joint: joints[joint] for joint in order})
     try:
@@ -169,38 +168,29 @@ def _check(source: str, document: Any) -> dict[str, dict[str, Any]]:
     for key in document:
         choice(f"{source}: key", key, HEAD)
     if not isinstance(document.get("about", {}), dict):
-        raise InvalidArgumentError(f"{source}: about", "must be a mapping", remedy="use 'key: value', or leave it out")
+        raise _error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
     choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
     joints = document.get("joints")
     if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
-        raise InvalidArgumentError(f"{source}: joints", "must map names to options", remedy="name the joints")
+        raise _error(source, "joints", "must map names to options", "name the joints")
     for name, options in joints.items():
         if not isinstance(options, dict) or "kp" not in options:
-            raise InvalidArgumentError(f"{source}: joints", "has no kp", joint=name, remedy="give 'kp: <number>'")
+            raise _error(source, "joints", "has no kp", "give 'kp: <number>'", name)
         for key, value in options.items():
             if key not in OFF:
-                raise InvalidArgumentError(
-                    f"{source}: {key}", "unknown option", joint=name, remedy=f"use one of {', '.join(OFF)}"
-                )
+                raise _error(source, key, "unknown option", f"use one of {', '.join(OFF)}", name)
+            wanted: type = type(OFF[key])
             for entry in value if isinstance(value, list) and value else [value]:
-                _check_entry(source, name, key, entry)
+                if not (_is_number(entry) if wanted is float else isinstance(entry, wanted)):
+                    problem = f"is {reprlib.repr(entry)}, which is no {wanted.__name__}"
+                    remedy = f"give one, as in '{key}: {OFF[key]}', or a list of one per env"
+                    raise _error(source, key, problem, remedy, name)
     return joints
 
 
-def _check_entry(source: str, joint: str, key: str, entry: Any) -> None:
-    wanted: type = type(OFF[key])
-    if wanted is float:
-        whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
-        good = whole or isinstance(entry, float) or entry in ("inf", "-inf")
-    else:
-        good = isinstance(entry, wanted)
-    if not good:
-        raise InvalidArgumentError(
-            f"{source}: {key}",
-            f"is {reprlib.repr(entry)}, which is no {wanted.__name__}",
-            joint=joint,
-            remedy=f"give one, as in '{key}: {OFF[key]}', or a list of one per env",
-        )
+def _is_number(entry: Any) -> bool:
+    whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
+    return whole or isinstance(entry, float) or entry in ("inf", "-inf")
 
 
 def _columns(source: str, joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -214,15 +204,17 @@ def _columns(source: str, joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
         envs = max(map(len, lists.values()))
         for name, value in lists.items():
             if len(value) not in (1, envs):
-                problem = f"has {len(value)} values, others {envs}"
-                raise InvalidArgumentError(f"{source}: {key}", problem, joint=name, remedy="give one per env")
+                raise _error(source, key, f"has {len(value)} values, others {envs}", "give one per env", name)
             back = "back_calculation" in str(joints[name].get("anti_windup"))
             if key == "tracking_time" and back and key not in joints[name]:
-                problem = "is missing, while other joints have it"
-                raise InvalidArgumentError(f"{source}: {key}", problem, joint=name, remedy="give it too")
+                raise _error(source, key, "is missing, while other joints have it", "give it too", name)
         dtype: Any = {float: float, bool: bool, str: object}[type(off)]
         columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
     return columns
+
+
+def _error(source: str, key: str, problem: str, remedy: str, joint: str | None = None) -> InvalidArgumentError:
+    return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)
 
 
 def _plain(column: Any) -> Any:
@@ -272,15 +264,3 @@ def _parse_yaml(text: str) -> Any:
         return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from None
-
-
-def _dump_yaml(document: dict[str, Any]) -> str:
-    import yaml
-
-    class Dumper(yaml.SafeDumper):
-        """SafeDumper without aliases."""
-
-        def ignore_aliases(self, data: Any) -> bool:
-            return True
-
-    return yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=10_000)

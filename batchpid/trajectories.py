@@ -140,10 +140,8 @@ def trapezoidal(
 
     Parameters
     ----------
-    start, target
-        (joints,) or (envs, joints) [rad or m].
-    dt
-        Time of a tick [s].
+    start, target, dt
+        As in :func:`minimum_jerk`.
     max_velocity, max_acceleration
         Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. An infinite velocity is none.
     synchronise

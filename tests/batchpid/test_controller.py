@@ -33,14 +33,20 @@ def test_calls_are_the_law(kind, options, inputs):
     assert [leaf is None for leaf in pid.state] == [leaf is None for leaf in state]
 
 
-def test_jax_compiles_once_and_leaves_what_it_was_given(inputs, x64):
+def test_jax_compiles_once_and_leaves_what_it_was_given(inputs, x64, caplog):
     pid = bp.BatchPID(PARAMS, ENVS, DT, "jax")
     y = jax.numpy.asarray(inputs.measurement[0])
-    for t in range(5):
-        before = pid.state
-        pid(inputs.setpoint[t], y)
-        pid.params = PARAMS.replace(kp=float(t))
-    assert pid._engine._step._cache_size() == 1
+    pid(inputs.setpoint[0], y)
+    with jax.log_compiles():
+        for t in range(5):
+            before = pid.state
+            pid.params = PARAMS.replace(kp=float(t))
+            pid(inputs.setpoint[t], y)
+        first = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
+        pid.params = PARAMS.replace(deadband=0.1)
+        pid(inputs.setpoint[0], y)
+    assert first == []
+    assert any("Compiling" in record.getMessage() for record in caplog.records), "what compiles is logged"
     assert before.integral.is_deleted(), "the old state's buffers went into the new one"
     assert y.shape == np.asarray(y).shape, "the caller's array is alive"
 
