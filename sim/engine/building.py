@@ -147,13 +147,20 @@ def build_scene(builder: ArticulationBuilder, spec: SceneSpec, system: Any) -> t
     Raises
     ------
     RobotError
-        SAPIEN numbers the joints in another order than ours.
+        SAPIEN cannot build a collision shape, which it would silently leave out, or numbers the joints in another order
+        than ours.
     """
     scene = headless_scene(system)
     with engine_settings(spec):
         robot = builder.set_scene(scene).build()
         if spec.ground:
             scene.add_ground(0.0, render=False)
+    asked = {link.name: link.collision_records for link in builder.link_builders}
+    for link in robot.links:
+        if len(link.collision_shapes) != len(records := asked[link.name]):
+            files = ", ".join(record.filename for record in records if record.filename)
+            remedy = "repair the file, or remove that <collision>"
+            raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
     names, ours = [joint.name for joint in robot.active_joints], [joint.name for joint in spec.joints]
     if names != ours:
         raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF")

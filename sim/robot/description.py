@@ -154,7 +154,7 @@ class Urdf:
 
     ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
     fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
-    that were not found.
+    that were not found or cannot be read, the latter with the reason.
     """
 
     name: str

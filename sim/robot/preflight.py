@@ -111,8 +111,8 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
         yield Finding(
             "warning",
             "missing-mesh",
-            f"collision meshes not found, simulated without: {', '.join(robot.missing_meshes)}",
-            "pass package_dirs=[...] to Robot.load",
+            f"collision meshes not found or not readable, simulated without: {', '.join(robot.missing_meshes)}",
+            "repair the files, or pass package_dirs=[...] to Robot.load",
         )
     if not robot.fixed_base:
         yield Finding(

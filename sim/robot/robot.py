@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from lxml import etree
 from numpy.typing import ArrayLike
 
 import assets
@@ -20,8 +19,7 @@ from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
 from sim.robot.description import DISSIPATION, Joint, RobotDescription, Settings
 from sim.robot.preflight import Finding, check
-from sim.robot.urdf import read_urdf
-from sim.robot.xml import parse_xml
+from sim.robot.urdf import read_srdf, read_urdf
 
 _ASSETS = Path(assets.__file__).parent
 DESIGN_HZ = 1.7
@@ -49,7 +47,7 @@ class Robot(RobotDescription):
         package_dirs
             Folders in which ``package://`` mesh paths are looked up first.
         missing_meshes
-            ``"error"``, or ``"skip"`` to leave out collision shapes whose mesh is missing.
+            ``"error"``, or ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read.
         dissipation
             ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: SAPIEN's defaults,
             joint friction 0.05 and link damping 0.05, for comparison with its tutorial.
@@ -81,7 +79,7 @@ class Robot(RobotDescription):
         return cls(
             **vars(urdf),
             path=path,
-            srdf=etree.tostring(parse_xml(srdf), encoding="unicode") if srdf.is_file() else None,
+            srdf=read_srdf(srdf, urdf) if os.path.isfile(srdf) else None,
             joints=joints,
             dissipation=dissipation,
             fixed_base=fixed_base,

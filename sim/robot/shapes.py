@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
 from sim.robot.description import RobotDescription
+from sim.robot.meshes import find_mesh
 from sim.robot.rotations import from_rpy, rotate
-from sim.robot.urdf import find_mesh
 from sim.robot.xml import numbers, parse_xml
 
 Vertices = NDArray[np.float64]

@@ -1,14 +1,14 @@
 """URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the joints.
 
 SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
-and silently skips a collision mesh that is missing. The text made here has no visuals, absolute mesh paths, and no
+and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
 mimic joint that SAPIEN would silently mis-simulate.
 """
 
 from __future__ import annotations
 
 import math
-import os
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,29 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic, Urdf
+from sim.robot.meshes import find_mesh, mesh_problem
 from sim.robot.xml import number, numbers, parse_xml
+
+MAX_LINKS = 255
+"""PhysX counts the links of an articulation in a byte."""
+MAX_PAIRS = 31
+"""SAPIEN has a bit for each pair of links that may not collide."""
+SMALLEST = 1e-30
+"""Smallest mass [kg] and principal moment of inertia [kg m^2] above 0, whose reciprocal PhysX can hold."""
+SIZES = 1e-6, 1e6
+"""Sizes of shapes [m] and scales of meshes, by PhysX's limits of the latter."""
 
 _SIZES = {  # of the shapes that SAPIEN knows: their attributes, each with as many numbers as it has
     "box": {"size": "0 0 0"},
     "sphere": {"radius": "0"},
     "cylinder": {"radius": "0", "length": "0"},
     "capsule": {"radius": "0", "length": "0"},
+    "mesh": {"scale": "1 1 1"},
+}
+_READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
+    "robot": {"link", "joint"},
+    "link": {"inertial", "collision"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
 }
 
 
@@ -36,36 +52,46 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -
     package_dirs
         Folders searched for ``package://NAME/...`` before the folders above the file.
     missing_meshes
-        ``"error"``, or ``"skip"`` to leave out the shapes whose mesh file is not found.
+        ``"error"``, or ``"skip"`` to leave out the shapes whose mesh file is not found or cannot be read.
 
     Raises
     ------
     RobotError
-        Unreadable file, malformed XML, an entity or DTD, a structure that SAPIEN cannot build, a missing mesh.
+        Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a missing or
+        unreadable mesh.
     """
     root = parse_xml(path)
     if root.tag != "robot":
         raise RobotError(f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?")
-    for element in list(root.iter("visual")):
-        element.getparent().remove(element)
+    if (count := len(root.findall("link"))) > MAX_LINKS:
+        remedy = "merge links that are joined by fixed joints, or split the robot"
+        raise RobotError(f"{path}: has {count} links; PhysX holds at most {MAX_LINKS} in one robot; {remedy}")
+    for parent in [*root.findall("link"), *root.findall("joint"), root]:
+        for child in [child for child in parent if child.tag not in _READ[parent.tag]]:
+            parent.remove(child)
     missing = _resolve_meshes(root, path, package_dirs)
     if missing and missing_meshes == "error":
         raise RobotError(
-            f"{path}: collision mesh not found: {', '.join(missing)}; "
-            "pass package_dirs=[...] with the folder that holds the package, or missing_meshes='skip' to "
-            "simulate without these shapes"
+            f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the file, pass "
+            "package_dirs=[...] with the folder that holds the package, or missing_meshes='skip' to simulate without"
         )
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
     ordered = _breadth_first(links, joints, path)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
         _repair(element, joint, joints, path)
+    for element, link in zip(root.findall("link"), links, strict=True):
+        for inertial in element.findall("inertial") if not link.inertial else []:
+            element.remove(inertial)  # SAPIEN does not use it, and fails where a part is missing
+        for inertia in element.findall("inertial/inertia"):
+            for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+                inertia.set(key, inertia.get(key, "0"))
     text = etree.tostring(root, encoding="unicode")
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing))
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
-    """Make mesh paths absolute; drop the shapes whose file is missing and return their names."""
+    """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their names and why."""
     missing = []
     for collision in list(root.iter("collision")):
         mesh = collision.find("geometry/mesh")
@@ -73,29 +99,20 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
             continue
         name = mesh.get("filename", "")
         found = find_mesh(name, path, package_dirs)
-        if found is None:
-            missing.append(name)
+        problem = None if found is None else mesh_problem(found)
+        if found is None or problem is not None:
+            missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
         else:
             mesh.set("filename", str(found))
     return missing
 
 
-def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist."""
-    relative = name.removeprefix("package://").removeprefix("file://")
-    own = path.absolute().parents
-    folders = [*package_dirs, *own] if name.startswith("package://") else [own[0], *package_dirs]
-    for folder in folders:
-        candidate = (folder / relative).absolute()
-        if relative and os.path.isfile(candidate):
-            return candidate
-    return None
-
-
 def _read_joint(element: etree._Element, path: Path) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{path}: joint {name!r}"
+    if not name:
+        raise RobotError(f"{where}: has no name; add name=")
     if kind not in (*MOVING_TYPES, "fixed"):
         raise RobotError(
             f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; "
@@ -113,13 +130,11 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
     limits: dict[str, float] = {}
     if limit is not None:
-        limits = {f"{key}_limit": number(limit, key, math.inf, where) for key in ("effort", "velocity")}
+        limits = {f"{key}_limit": number(limit, key, "inf", where, limit=True) for key in ("effort", "velocity")}
         if kind in ("revolute", "prismatic"):
-            limits |= {key: number(limit, key, 0.0, where) for key in ("lower", "upper")}
+            limits |= {key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")}
     elif kind in ("revolute", "prismatic"):
         raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
-    if any(map(math.isnan, limits.values())):
-        raise RobotError(f"{where}: a limit is NaN ({limits}); give numbers")
     if limits.get("lower", -math.inf) > limits.get("upper", math.inf):
         raise RobotError(
             f"{where}: lower limit {limits['lower']:g} is above upper limit {limits['upper']:g}; swap them"
@@ -127,12 +142,12 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     if limits.get("effort_limit", 0.0) < 0 or limits.get("velocity_limit", 0.0) < 0:
         raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
     if dynamics is not None:
-        passive = {key: number(dynamics, key, 0.0, where) for key in ("damping", "friction")}
-        if any(not 0 <= value < math.inf for value in passive.values()):
-            raise RobotError(f"{where}: damping and friction must be finite and >= 0 ({passive}); correct the URDF")
+        passive = {key: number(dynamics, key, "0", where) for key in ("damping", "friction")}
+        if min(passive.values()) < 0:
+            raise RobotError(f"{where}: damping and friction must be >= 0 ({passive}); correct the URDF")
         fields |= passive
     if mimic is not None:
-        multiplier, offset = number(mimic, "multiplier", 1.0, where), number(mimic, "offset", 0.0, where)
+        multiplier, offset = number(mimic, "multiplier", "1", where), number(mimic, "offset", "0", where)
         fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return Joint(name, kind, parent, child, **(limits | fields))
 
@@ -155,12 +170,17 @@ def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
 def _repair(element: etree._Element, joint: Joint, joints: Sequence[Joint], path: Path) -> None:
     """Write out default values, and remove a mimic that SAPIEN would mis-simulate (the preflight reports it).
 
-    SAPIEN reads a missing limit as NaN, and fails on ``<dynamics>`` without damping.
+    SAPIEN reads a missing limit as NaN, and fails on ``<dynamics>`` without damping; a limit or axis that it does not
+    use is not checked and removed.
     """
-    limit, dynamics = element.find("limit"), element.find("dynamics")
+    limit, dynamics, axis = element.find("limit"), element.find("dynamics"), element.find("axis")
     if limit is not None and joint.moves and not joint.continuous:
         limit.set("lower", repr(joint.lower))
         limit.set("upper", repr(joint.upper))
+    elif limit is not None:
+        element.remove(limit)
+    if axis is not None and not joint.moves:
+        element.remove(axis)
     if dynamics is not None:
         dynamics.set("damping", repr(joint.damping))
         dynamics.set("friction", repr(joint.friction))
@@ -177,25 +197,34 @@ def _repair(element: etree._Element, joint: Joint, joints: Sequence[Joint], path
 def _read_link(element: etree._Element, path: Path) -> Link:
     name = element.get("name", "")
     where = f"{path}: link {name!r}"
+    if not name:
+        raise RobotError(f"{where}: has no name; add name=")
     mass, inertia = element.find("inertial/mass"), element.find("inertial/inertia")
-    value = None if mass is None else number(mass, "value", 0.0, where)
-    if value is not None and not 0 <= value < math.inf:
-        raise RobotError(f"{where}: mass {value} must be finite and >= 0; correct the URDF")
+    value = None if mass is None else number(mass, "value", "0", where)
+    if value and value < SMALLEST:
+        raise RobotError(f"{where}: mass {value} must be 0 or at least {SMALLEST:g} kg; correct the URDF")
     tensor = np.zeros((3, 3))
     if inertia is not None:
         keys = ("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz")
-        tensor = np.array([[number(inertia, key, 0.0, where) for key in row] for row in keys])
-        if tensor.any() and (not np.isfinite(tensor).all() or np.linalg.eigvalsh(tensor)[0] <= 0):
+        tensor = np.array([[number(inertia, key, "0", where) for key in row] for row in keys])
+        if tensor.any() and np.linalg.eigvalsh(tensor)[0] < SMALLEST:
             raise RobotError(
-                f"{where}: no body has the inertia {dict(inertia.attrib)}, whose principal moments are not all > 0; "
-                "correct the URDF"
+                f"{where}: no body has the inertia {dict(inertia.attrib)}, whose principal moments are not all at "
+                f"least {SMALLEST:g} kg m^2; correct the URDF"
             )
     for part in element.findall("inertial") + element.findall("collision"):
         _origin(part, where)
-    for shape in element.iterfind("collision/geometry/*"):
-        for key, default in _SIZES.get(shape.tag, {}).items():
-            if min(numbers(shape, key, default, where)) <= 0:
-                raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> must be > 0; correct the URDF")
+    for collision in element.findall("collision"):
+        shapes = [shape for shape in collision.iterfind("geometry/*") if shape.tag in _SIZES]
+        if not shapes:
+            raise RobotError(f"{where}: a <collision> has none of {', '.join(_SIZES)}; add <geometry> with a shape")
+        for shape in shapes:
+            for key, default in _SIZES[shape.tag].items():
+                sizes = np.array(numbers(shape, key, default, where))
+                sizes = np.abs(sizes) if key == "scale" else sizes  # a negative scale mirrors the mesh
+                if sizes.min() < SIZES[0] or sizes.max() > SIZES[1]:
+                    need = f"must be > 0, from {SIZES[0]:g} to {SIZES[1]:g}"
+                    raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> {need}; correct the URDF")
     return Link(name, value, len(element.findall("collision")), bool(value) and bool(tensor.any()))
 
 
@@ -208,25 +237,57 @@ def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
     """Return the joints level by level from the root, siblings in file order, if they form one tree."""
     known, children = [link.name for link in links], [joint.child_link for joint in joints]
+    linked = set(known)
     for joint in joints:
-        for link in {joint.parent_link, joint.child_link} - set(known):
+        for link in {joint.parent_link, joint.child_link} - linked:
             raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
     for problem, names, remedy in (
         ("link name used twice", known, "names must be unique"),
         ("joint name used twice", [joint.name for joint in joints], "names must be unique"),
         ("link with two parents", children, "a robot must be a tree"),
     ):
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise RobotError(f"{path}: {problem}: {', '.join(sorted(twice))}; {remedy}")
-    roots = [name for name in known if name not in set(children)]
+        if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+            raise RobotError(f"{path}: {problem}: {', '.join(twice)}; {remedy}")
+    below = defaultdict(list)
+    for joint in joints:
+        below[joint.parent_link].append(joint)
+    moved = set(children)
+    roots = [name for name in known if name not in moved]
     if len(roots) != 1:
         raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
     ordered: list[Joint] = []
     level = roots
     while level:
-        found = [joint for link in level for joint in joints if joint.parent_link == link]
+        found = [joint for link in level for joint in below[link]]
         ordered += found
         level = [joint.child_link for joint in found]
     if len(ordered) != len(joints):
         raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")
     return ordered
+
+
+def read_srdf(path: Path, urdf: Urdf) -> str:
+    """Return the text of the .srdf at ``path``, checked for what SAPIEN's loader fails on.
+
+    Raises
+    ------
+    RobotError
+        Unreadable file, malformed XML, an entity or DTD, a pair without reason or of unknown links, too many pairs.
+    """
+    root = parse_xml(path)
+    names = {link.name for link in urdf.links}
+    joined = {frozenset((joint.parent_link, joint.child_link)) for joint in urdf.all_joints}
+    pairs = 0
+    for element in root.findall("disable_collisions"):
+        first, second = element.get("link1"), element.get("link2")
+        where = f"{path}: <disable_collisions link1={first!r} link2={second!r}>"
+        if "reason" not in element.attrib:
+            raise RobotError(f"{where} has no reason; add reason='Default' for SAPIEN to apply it, or another")
+        if element.get("reason").lower() != "default":
+            continue  # SAPIEN applies no others
+        if first not in names or second not in names or first == second:
+            raise RobotError(f"{where} needs two links of the URDF; correct the names")
+        pairs += frozenset((first, second)) not in joined
+    if pairs > MAX_PAIRS:
+        raise RobotError(f"{path}: disables {pairs} pairs with reason 'Default'; SAPIEN takes {MAX_PAIRS}; remove some")
+    return etree.tostring(root, encoding="unicode")

@@ -1,4 +1,4 @@
-"""Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees.
+"""Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees, no odd numbers.
 
 lxml's own options do it: they cover what ``defusedxml`` checks, whose lxml module is deprecated, and libxml2 limits
 nesting and the size of text, which the standard library's parser does not.
@@ -13,44 +13,64 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 
+SIZE_LIMIT = 2**25
+"""Largest file that is parsed [bytes]: the tree takes about ten times as much memory."""
+LARGEST = 1e18
+"""Largest magnitude of a number: PhysX computes in single precision, in which its square is still finite."""
+LARGEST_LIMIT = 3.4e38
+"""Largest magnitude of a finite joint limit, which is compared and not multiplied."""
+
 
 def parse_xml(path: Path) -> etree._Element:
-    """Return the root element of the file at ``path``, without comments.
+    """Return the root element of the file at ``path``, without comments and processing instructions.
 
     Raises
     ------
     RobotError
-        The file cannot be read, is not well-formed, or has a DTD.
+        The file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or has a DTD.
     """
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True)
+    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
     try:
-        tree = etree.parse(str(path), parser)
+        with open(path, "rb") as file:
+            data = file.read(SIZE_LIMIT + 1)
+        if len(data) > SIZE_LIMIT:
+            raise RobotError(f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need")
+        root = etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
     except etree.XMLSyntaxError as error:
         raise RobotError(f"{path}: not well-formed XML: {error.msg}; correct the file at that line") from error
     except OSError as error:
         raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
-    if tree.docinfo.internalDTD is not None:
+    if root.getroottree().docinfo.internalDTD is not None:
         raise RobotError(f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines")
-    return tree.getroot()
+    return root
 
 
-def number(element: etree._Element, key: str, default: float, where: str) -> float:
-    """Return an attribute as a number, NaN and infinity included; ``where`` is for the RobotError if it is none."""
-    text = element.get(key)
-    try:
-        return default if text is None else float(text)
-    except ValueError:
-        raise RobotError(f"{where}: <{element.tag} {key}={text!r}> is not a number; correct the URDF") from None
+def numbers(
+    element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
+) -> tuple[float, ...]:
+    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing one.
 
+    They are finite and at most LARGEST in magnitude; those of a joint ``limit`` at most LARGEST_LIMIT, or infinite.
 
-def numbers(element: etree._Element | None, key: str, default: str, where: str) -> tuple[float, ...]:
-    """Return the finite numbers in an attribute, as many as there are in ``default``, which replaces a missing one."""
+    Raises
+    ------
+    RobotError
+        They are not; the message begins with ``where``.
+    """
     text, count = default if element is None else element.get(key, default), len(default.split())
+    largest = LARGEST_LIMIT if limit else LARGEST
     try:
-        values = tuple(float(word) for word in text.split())
+        values = tuple(float(word) for word in text.split() if word.isascii() and "_" not in word)
     except ValueError:
         values = ()
-    if element is not None and (len(values) != count or not all(map(math.isfinite, values))):
+    fits = all(abs(value) <= largest or (limit and math.isinf(value)) for value in values)
+    if element is not None and (len(values) != count or len(text.split()) != count or not fits):
         need = "one finite number" if count == 1 else f"{count} finite numbers"
-        raise RobotError(f"{where}: <{element.tag} {key}={text!r}> needs {need}; correct the URDF")
+        problem = f"needs {need} within +-{largest:g}, which PhysX can hold"
+        raise RobotError(f"{where}: <{element.tag} {key}={text!r}> {problem}; correct the URDF")
     return values
+
+
+def number(element: etree._Element | None, key: str, default: str, where: str, limit: bool = False) -> float:
+    """Return the number in an attribute; see :func:`numbers`."""
+    return numbers(element, key, default, where, limit)[0]

@@ -25,20 +25,20 @@ BAD = {
     "unknown type": (one_joint(LIMIT, "ball"), "joint 'hinge'.*type 'ball'.*use revolute"),
     "floating": (one_joint("", "floating"), "joint 'hinge'.*type 'floating'"),
     "planar": (one_joint("", "planar"), "joint 'hinge'.*type 'planar'"),
-    "NaN limit": (one_joint(LIMIT.replace('"-1"', '"nan"')), "joint 'hinge'.*limit is NaN.*give numbers"),
-    "NaN effort": (one_joint(LIMIT.replace('"10"', '"nan"')), "joint 'hinge'.*limit is NaN"),
+    "NaN limit": (one_joint(LIMIT.replace('"-1"', '"nan"')), "joint 'hinge'.*limit lower='nan'.*finite number"),
+    "NaN effort": (one_joint(LIMIT.replace('"10"', '"nan"')), "joint 'hinge'.*limit effort='nan'.*finite number"),
     "swapped limits": (one_joint(LIMIT.replace('"-1"', '"2"')), "'hinge'.*lower limit 2 is above.*swap them"),
     "negative effort": (one_joint(LIMIT.replace('"10"', '"-1"')), "'hinge'.*must be >= 0.*correct"),
-    "no number": (one_joint(LIMIT.replace('"10"', '"ten"')), "'hinge'.*effort='ten'.*not a number"),
+    "no number": (one_joint(LIMIT.replace('"10"', '"ten"')), "'hinge'.*effort='ten'.*one finite number"),
     "negative damping": (one_joint(LIMIT + '<dynamics damping="-1"/>'), "'hinge'.*damping and friction"),
-    "infinite friction": (one_joint(LIMIT + '<dynamics friction="inf"/>'), "'hinge'.*damping and friction"),
+    "infinite friction": (one_joint(LIMIT + '<dynamics friction="inf"/>'), "'hinge'.*friction='inf'.*finite"),
     "negative mass": (one_joint(arm=INERTIAL.replace('"1"', '"-1"')), "link 'arm'.*mass -1"),
     "negative inertia": (one_joint(arm=INERTIAL.replace('ixx="0.1"', 'ixx="-0.1"')), "link 'arm'.*inertia"),
     "inertia no matrix can have": (
         one_joint(arm=INERTIAL.replace('ixy="0"', 'ixy="1"')),
         "link 'arm'.*inertia",
     ),
-    "NaN mass": (one_joint(arm=INERTIAL.replace('"1"', '"nan"')), "link 'arm'.*mass nan"),
+    "NaN mass": (one_joint(arm=INERTIAL.replace('"1"', '"nan"')), "link 'arm'.*mass value='nan'"),
     "NaN origin": (
         robot(BASE, ARM, joint("hinge", "base", "arm", origin="0 nan 0")),
         "joint 'hinge'.*origin.*finite",
@@ -64,6 +64,16 @@ BAD = {
         "joint name used twice: hinge",
     ),
     "unknown link": (robot(BASE, HINGE), "joint 'hinge' names the unknown link 'arm'"),
+    "link without name": (robot(BASE, ARM, "<link/>", HINGE), "link ''.*has no name"),
+    "joint without name": (one_joint().replace('name="hinge"', ""), "joint ''.*has no name"),
+    "collision without a shape": (
+        one_joint(arm=INERTIAL + "<collision><geometry/></collision>"),
+        "link 'arm'.*<collision> has none of box.*add <geometry>",
+    ),
+    "too many links": (
+        robot(link("l0"), *(link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}") for n in range(255))),
+        "has 256 links; PhysX holds at most 255.*merge links",
+    ),
     "no parent": (one_joint().replace('<parent link="base"/>', ""), "joint 'hinge'.*needs <parent"),
     "mimic of nothing": (
         one_joint(LIMIT + '<mimic joint="ghost"/>'),
@@ -74,11 +84,11 @@ BAD = {
     "no link": (robot(), "exactly one root|without"),
     "missing mesh": (
         one_joint(arm=INERTIAL + MESH.format("no.stl")),
-        "collision mesh not found: no.stl.*package_dirs",
+        "collision mesh not found or not readable: no.stl.*package_dirs",
     ),
     "missing package": (
         one_joint(arm=INERTIAL + MESH.format("package://ghost/no.stl")),
-        "collision mesh not found: package://ghost/no.stl",
+        "collision mesh not found or not readable: package://ghost/no.stl",
     ),
     "negative box": (
         one_joint(arm=INERTIAL + '<collision><geometry><box size="-1 1 1"/></geometry></collision>'),
@@ -90,11 +100,39 @@ BAD = {
     ),
 }
 
+BOX = '<collision><geometry><box size="{} 1 1"/></geometry></collision>'
+SCALED = '<collision><geometry><mesh filename="any.stl" scale="{}"/></geometry></collision>'
+UNHOLDABLE = {  # by single precision or by PhysX
+    "mass": (one_joint(arm=INERTIAL.replace('value="1"', 'value="1e300"')), "link 'arm'.*mass value='1e300'"),
+    "tiny mass": (one_joint(arm=INERTIAL.replace('value="1"', 'value="1e-300"')), "link 'arm'.*mass 1e-300"),
+    "inertia": (one_joint(arm=INERTIAL.replace("0.1", "1e300")), "link 'arm'.*inertia ixx='1e300'"),
+    "tiny inertia": (one_joint(arm=INERTIAL.replace("0.1", "1e-300")), "link 'arm'.*inertia.*1e-300"),
+    "origin": (one_joint().replace('xyz="0 0 1"', 'xyz="0 0 1e300"'), "joint 'hinge'.*origin xyz='0 0 1e300'"),
+    "angle": (one_joint().replace('xyz="0 0 1"', 'rpy="0 0 1e300"'), "joint 'hinge'.*origin rpy='0 0 1e300'"),
+    "axis": (one_joint().replace('axis xyz="0 1 0"', 'axis xyz="0 1e300 0"'), "joint 'hinge'.*axis xyz='0 1e300 0'"),
+    "centre of mass": (
+        one_joint(arm=INERTIAL.replace("<mass", '<origin xyz="1e300 0 0"/><mass')),
+        "link 'arm'.*origin xyz='1e300 0 0'",
+    ),
+    "size": (one_joint(arm=INERTIAL + BOX.format("1e300")), "link 'arm'.*box size='1e300 1 1'"),
+    "tiny size": (one_joint(arm=INERTIAL + BOX.format("1e-300")), "link 'arm'.*box size='1e-300 1 1'"),
+    "scale": (one_joint(arm=INERTIAL + SCALED.format("1e300 1 1")), "link 'arm'.*mesh scale='1e300 1 1'"),
+    "scale of 0": (one_joint(arm=INERTIAL + SCALED.format("0 1 1")), "link 'arm'.*mesh scale='0 1 1'"),
+    "scale of one number": (one_joint(arm=INERTIAL + SCALED.format("1")), "link 'arm'.*mesh scale='1'.*3 finite"),
+    "limit": (one_joint(LIMIT.replace('"1"', '"1e300"')), "joint 'hinge'.*limit upper='1e300'"),
+    "effort limit": (one_joint(LIMIT.replace('"10"', '"1e300"')), "joint 'hinge'.*limit effort='1e300'"),
+    "damping": (one_joint(LIMIT + '<dynamics damping="1e300"/>'), "joint 'hinge'.*dynamics damping='1e300'"),
+    "mimic": (one_joint(LIMIT + '<mimic joint="hinge" offset="1e300"/>'), "joint 'hinge'.*mimic offset='1e300'"),
+    "digits of another script": (one_joint(LIMIT.replace('"10"', '"1_0"')), "joint 'hinge'.*limit effort='1_0'"),
+}
+BAD |= {f"{name} that PhysX cannot hold": case for name, case in UNHOLDABLE.items()}
+
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_urdf_has_its_error(case, tmp_path):
     text, message = BAD[case]
     path = write(tmp_path, text)
+    write(tmp_path, "solid facet endsolid", "any.stl")
     with pytest.raises(RobotError) as info:
         Robot.load(path)
     assert re.search(message, str(info.value), re.DOTALL), str(info.value)
@@ -104,9 +142,60 @@ def test_a_bad_urdf_has_its_error(case, tmp_path):
 def test_a_missing_file_and_an_unknown_name_are_not_found():
     with pytest.raises(RobotNotFoundError, match=r"no robot 'pandaa'.*jaco2, panda.*check the spelling"):
         Robot.load("pandaa")
-    for path in ("/no/such.urdf", "~nobody-at-all/arm.urdf", "x" * 1000):
+    for path in ("/no/such.urdf", "~nobody-at-all/arm.urdf", "x" * 1000, "x" * 5000):
         with pytest.raises(FileNotFoundError, match=path):
             Robot.load(path)
+
+
+def test_as_many_links_as_physx_holds_are_simulated(tmp_path):
+    chain = (link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}", origin="0 0 0.01") for n in range(254))
+    long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))
+    with Runner(long, 1, workers=0, control="effort", substeps=1, ground=False) as runner:
+        assert runner.step(np.zeros(254)).ok.all()
+
+
+def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):
+    """SAPIEN's parser fails on each of these; none has a meaning for the simulation."""
+    inertial = INERTIAL.replace('ixy="0" ixz="0" ', "").replace('iyz="0" ', "")
+    parts = link("base", '<inertial><mass value="1"/></inertial>'), link("arm", inertial + "<visual/>"), link("tip")
+    joints = HINGE.replace("</joint>", "<calibration rising='x'/><safety_controller/></joint>"), "<material/>"
+    fixed = joint("f", "arm", "tip", "fixed", '<limit lower="x"/>').replace("0 1 0", "x")
+    odd = Robot.load(write(tmp_path, robot(*parts, *joints, fixed, "<transmission/>", "<sensor><camera/></sensor>")))
+    assert [link.inertial for link in odd.links] == [False, True, True]
+    with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
+        assert runner.step([0.1]).ok.all()
+
+
+PAIR = '<disable_collisions link1="base" link2="arm" reason="Default"/>'
+APART = "".join(link(f"l{n}") + joint(f"j{n}", "arm", f"l{n}") for n in range(9))
+BAD_SRDF = {
+    "no reason": (PAIR.replace(' reason="Default"', ""), "link1='base' link2='arm'> has no reason.*add"),
+    "unknown link": (PAIR.replace("arm", "leg"), "link2='leg'> needs two links of the URDF"),
+    "no link": (PAIR.replace('link1="base"', ""), "link1=None.*needs two links of the URDF"),
+    "one link twice": (PAIR.replace("arm", "base"), "link2='base'> needs two links of the URDF"),
+    "too many pairs": (
+        "".join(PAIR.replace("base", f"l{a}").replace("arm", f"l{b}") for a in range(9) for b in range(a)),
+        "disables 36 pairs with reason 'Default'; SAPIEN takes 31",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SRDF)
+def test_a_bad_srdf_has_its_error_with_its_own_name(case, tmp_path):
+    pairs, message = BAD_SRDF[case]
+    path = write(tmp_path, robot(BASE, ARM, HINGE, APART))
+    srdf = write(tmp_path, robot(pairs), "test.srdf")
+    with pytest.raises(RobotError, match=message) as info:
+        Robot.load(path)
+    assert str(srdf) in str(info.value)
+    assert "correct the URDF" not in str(info.value)
+
+
+def test_pairs_that_sapien_does_not_apply_need_no_links(tmp_path):
+    path = write(tmp_path, one_joint())
+    write(tmp_path, robot(PAIR, PAIR.replace("Default", "Never").replace("arm", "leg")), "test.srdf")
+    paired = Robot.load(path)
+    assert paired.dynamics(ground=False).mass_matrix(np.zeros((1, 1))) > 0
 
 
 def test_a_binary_file_is_refused(tmp_path):

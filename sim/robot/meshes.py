@@ -1,0 +1,94 @@
+"""Mesh files of a URDF: the search for them, and a check of their headers and sizes.
+
+SAPIEN silently drops a collision shape whose file it cannot read, and trusts what a header claims: 20 bytes can cost
+gigabytes. Formats other than those checked here are refused: in some, a truncated file ends the process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from lxml import etree
+
+from sim.robot.xml import LARGEST
+
+SIZE_LIMIT = 2**27
+"""Largest mesh file that is read [bytes]."""
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+
+
+def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
+    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist."""
+    relative = name.removeprefix("package://").removeprefix("file://")
+    own = path.absolute().parents
+    folders = [*package_dirs, *own] if name.startswith("package://") else [own[0], *package_dirs]
+    for folder in folders:
+        candidate = (folder / relative).absolute()
+        if relative and os.path.isfile(candidate):
+            return candidate
+    return None
+
+
+def mesh_problem(path: Path) -> str | None:
+    """Return the reason for which SAPIEN cannot use a mesh file, or None if the check of its format finds none."""
+    check = _CHECKS.get(path.suffix.lower())
+    if check is None:
+        return f"format not among {', '.join(_CHECKS)}"
+    try:
+        with open(path, "rb") as file:
+            data = file.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    if data.startswith(b"version https://git-lfs"):
+        return "a git-lfs pointer instead of the mesh: run git lfs pull"
+    if not data or len(data) > SIZE_LIMIT:
+        return f"larger than {SIZE_LIMIT >> 20} MiB" if data else "empty"
+    try:
+        return None if check(data) else "damaged or truncated"
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, etree.XMLSyntaxError):
+        return "damaged"
+
+
+def _stl(data: bytes) -> bool:
+    """84 bytes with the number of triangles and 50 for each; or text, to its last keyword."""
+    count = int.from_bytes(data[80:84], "little")
+    if count and len(data) == 84 + 50 * count:
+        return bool((np.abs(np.frombuffer(data, _TRIANGLE, offset=84)["corners"]) <= LARGEST).all())
+    return data.lstrip().startswith(b"solid") and b"facet" in data and b"endsolid" in data[-1024:]
+
+
+def _obj(data: bytes) -> bool:
+    """Three vertices and a face."""
+    return len(re.findall(rb"^\s*v\s", data, re.M)) >= 3 and re.search(rb"^\s*f\s", data, re.M) is not None
+
+
+def _dae(data: bytes) -> bool:
+    """Well-formed, with coordinates and faces, and no count above what the file can hold."""
+    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    faces = [kind for kind in ("triangles", "polylist", "polygons", "tristrips", "trifans") if _first(root, kind)]
+    counts = [int(element.get("count", 0)) for element in root.iter(etree.Element)]
+    return bool(faces) and _first(root, "float_array") and 0 <= min(counts) <= max(counts) <= len(data)
+
+
+def _first(root: etree._Element, kind: str) -> bool:
+    return root.find(f"{{*}}library_geometries//{{*}}{kind}") is not None
+
+
+def _glb(data: bytes) -> bool:
+    """Header and chunks within the file; meshes; no other file. glTF 2.0 specification, section 4."""
+    words = np.frombuffer(data[:20], "<u4")
+    size, end = int(words[2]), 20 + int(words[3])
+    if data[:4] != b"glTF" or words[1] != 2 or size > len(data) or end > size or data[16:20] != b"JSON":
+        return False
+    content = json.loads(data[20:end])
+    inside = all(buffer.get("uri", "data:").startswith("data:") for buffer in content.get("buffers", []))
+    binary = end == size or end + 8 + int.from_bytes(data[end : end + 4], "little") <= size
+    return bool(content["meshes"]) and inside and binary
+
+
+_CHECKS: dict[str, Callable[[bytes], bool]] = {".stl": _stl, ".obj": _obj, ".dae": _dae, ".glb": _glb}

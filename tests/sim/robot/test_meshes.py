@@ -1,0 +1,144 @@
+"""Collision meshes that SAPIEN would silently drop, or that claim more than there is, are found at load."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+
+import numpy as np
+import pytest
+from tiny_urdf import INERTIAL, one_joint, write
+
+from batchpid.errors import RobotError
+from sim import Robot, Runner
+from sim.robot.meshes import SIZE_LIMIT, mesh_problem
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")
+
+
+def stl() -> bytes:
+    """Tetrahedron as binary STL."""
+    facets = (np.zeros(3, "<f4").tobytes() + CORNERS[face].tobytes() + bytes(2) for face in FACES)
+    return bytes(80) + struct.pack("<I", len(FACES)) + b"".join(facets)
+
+
+def ascii_stl() -> bytes:
+    lines = ["solid tetrahedron"]
+    for face in FACES:
+        lines += ["facet normal 0 0 0", " outer loop"]
+        lines += ["  vertex {} {} {}".format(*CORNERS[corner]) for corner in face]
+        lines += [" endloop", "endfacet"]
+    return "\n".join([*lines, "endsolid tetrahedron\n"]).encode()
+
+
+def obj() -> bytes:
+    lines = [*("v {} {} {}".format(*corner) for corner in CORNERS), *("f {} {} {}".format(*face + 1) for face in FACES)]
+    return "\n".join(lines).encode()
+
+
+def dae() -> bytes:
+    coordinates, indices = (" ".join(map(str, table.ravel().tolist())) for table in (CORNERS, FACES))
+    return f"""<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">{coordinates}</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y"
+type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices><triangles count="4"><input semantic="VERTEX"
+source="#v" offset="0"/><p>{indices}</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
+
+
+def glb(**changed: object) -> bytes:
+    binary = FACES.tobytes() + CORNERS.tobytes()
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 1}, "indices": 0}]}],
+        "accessors": [
+            {"componentType": 5125, "type": "SCALAR", "bufferView": 0, "count": 12},
+            {"componentType": 5126, "type": "VEC3", "bufferView": 1, "count": 4, "min": [0] * 3, "max": [1] * 3},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 48}],
+        "buffers": [{"byteLength": 96}],
+    }
+    text = json.dumps(content | changed).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+GOOD = {"a.stl": stl(), "b.STL": stl(), "c.stl": ascii_stl(), "d.obj": obj(), "e.dae": dae(), "f.glb": glb()}
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+CLAIM = 4_000_000_000
+BAD = {f"{kind} {name}": (name, data) for name in GOOD for kind, data in {"git-lfs": LFS, "empty": b""}.items()}
+BAD |= {
+    f"{share} of {name}": (name, data[: int(len(data) * share)]) for name, data in GOOD.items() for share in (0.1, 0.5)
+}
+BAD |= {f"all but the end of {name}": (name, GOOD[name][:-20]) for name in GOOD if name != "d.obj"}
+BAD |= {
+    "STL that claims 200 GB": ("a.stl", stl()[:80] + struct.pack("<I", CLAIM) + stl()[84:]),
+    "STL without triangles": ("a.stl", bytes(84)),
+    "STL with a NaN": ("a.stl", stl()[:96] + struct.pack("<f", np.nan) + stl()[100:]),
+    "STL with an infinity": ("a.stl", stl()[:96] + struct.pack("<f", np.inf) + stl()[100:]),
+    "STL of 1e30 m": ("a.stl", stl()[:96] + struct.pack("<f", 1e30) + stl()[100:]),
+    "OBJ without faces": ("d.obj", obj().split(b"\nf")[0]),
+    "STL named OBJ": ("d.obj", stl()),
+    "DAE that claims 16 GB": ("e.dae", dae().replace(b'count="12"', b'count="%d"' % CLAIM)),
+    "DAE of 4 billion triangles": ("e.dae", dae().replace(b'triangles count="4"', b'triangles count="%d"' % CLAIM)),
+    "DAE with a negative count": ("e.dae", dae().replace(b'count="12"', b'count="-12"')),
+    "DAE without geometry": ("e.dae", dae().replace(b"library_geometries", b"library_nothings")),
+    "GLB of 20 bytes that claims 4 GB": ("f.glb", struct.pack("<4sIIII", b"glTF", 2, CLAIM, CLAIM - 20, 0x4E4F534A)),
+    "GLB of 20 bytes with a JSON of 4 GB": ("f.glb", struct.pack("<4sIIII", b"glTF", 2, 20, CLAIM, 0x4E4F534A)),
+    "GLB without meshes": ("f.glb", glb(meshes=[])),
+    "GLB with another file": ("f.glb", glb(buffers=[{"byteLength": 96, "uri": "/dev/zero"}])),
+    "GLB of deep JSON": ("f.glb", glb().replace(b'"2.0"', b"[[[[[")),
+    "other format": ("g.ply", b"ply\n"),
+    "no format": ("mesh", stl()),
+}
+
+
+def arm(name: str) -> str:
+    return one_joint(arm=INERTIAL + f'<collision><geometry><mesh filename="{name}"/></geometry></collision>')
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_a_sound_mesh_is_simulated(name, tmp_path):
+    (tmp_path / name).write_bytes(GOOD[name])
+    loaded = Robot.load(write(tmp_path, arm(name)))
+    assert loaded.missing_meshes == ()
+    touching = loaded.dynamics().in_contact(np.array([[0.0], [np.pi]]), clearance=0.01)  # above the ground, and on it
+    assert touching.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_an_unreadable_mesh_is_an_error_or_skipped_and_reported(case, tmp_path):
+    name, data = BAD[case]
+    (tmp_path / name).write_bytes(data)
+    path = write(tmp_path, arm(name))
+    with pytest.raises(RobotError, match=rf"not readable: {name} \(.*missing_meshes='skip'"):
+        Robot.load(path)
+    loaded = Robot.load(path, missing_meshes="skip")
+    assert loaded.missing_meshes[0].startswith(f"{name} (")
+    assert "missing-mesh" in {finding.code for finding in loaded.check()}
+    with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:
+        assert runner.step([0.0]).ok.all()
+
+
+def test_a_mesh_too_large_to_be_read_is_refused_without_reading_it_all(tmp_path):
+    path = tmp_path / "large.stl"
+    path.touch()
+    os.truncate(path, SIZE_LIMIT + 1)
+    assert "larger than" in str(mesh_problem(path))
+
+
+def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path):
+    (tmp_path / "odd.obj").write_bytes(obj().replace(b"1.0", b"nan"))
+    loaded = Robot.load(write(tmp_path, arm("odd.obj")))
+    for use in (loaded.check, lambda: Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0))):
+        with pytest.raises(RobotError, match=r"link 'arm'.*collision shape from .*odd\.obj; repair"):
+            use()
