@@ -29,7 +29,7 @@ Float32 = NDArray[np.float32]
 
 
 class Pack:
-    """M scenes of one robot, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
+    """M scenes of ``spec``, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Pack:
         system_size: int = 8,
         isolates: bool = True,
     ) -> None:
-        self._builder, self._spec = builder, spec
+        self._builder, self.spec = builder, spec
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates
@@ -77,7 +77,7 @@ class Pack:
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``."""
-        return build_scene(self._builder, self._spec, system)
+        return build_scene(self._builder, self.spec, system)
 
     def _bind(self) -> None:
         """Store the bound methods that every sim step calls, which is cheaper than looking them up."""
@@ -116,20 +116,20 @@ class Pack:
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
-        self._rebuild({row: new_system(self._spec) for row in rows if self._isolates and not self.isolated[row]})
+        self._rebuild({row: new_system(self.spec) for row in rows if self._isolates and not self.isolated[row]})
 
     def _assign_systems(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
         """Assign systems to robots that were placed: the shared one, or a new one where contact is predicted.
 
         No contact before the placement then has any influence.
         """
-        dynamics, predicted, systems = scene_dynamics(self._spec), dict[bytes, bool](), {}
+        dynamics, predicted, systems = scene_dynamics(self.spec), dict[bytes, bool](), {}
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
             state = position.tobytes() + velocity.tobytes()
             if state not in predicted:
                 predicted[state] = self._predictor.predicts_contact(dynamics.near_pairs(position), velocity)
             if predicted[state]:
-                systems[row] = new_system(self._spec)
+                systems[row] = new_system(self.spec)
             elif self.isolated[row]:
                 systems[row] = self._shared_systems[row]
         self._rebuild(systems)

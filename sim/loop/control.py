@@ -14,6 +14,7 @@ from sim.engine.building import SceneSpec
 from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
+from sim.options import ControlMode
 
 Float64 = NDArray[np.float64]
 
@@ -190,9 +191,5 @@ class EffortControl(Control):
         return effort
 
 
-_CONTROLS = {"pid": PIDControl, "drive": DriveControl, "effort": EffortControl}
-
-
-def make_control(name: str, scene: SceneSpec, params: bp.PIDParams, pack: Pack) -> Control:
-    """Return the control of that name for ``pack``, with ``params`` of one row or one per env."""
-    return _CONTROLS[name](scene, params, pack)
+CONTROLS: dict[ControlMode, type[Control]] = {"pid": PIDControl, "drive": DriveControl, "effort": EffortControl}
+"""Class of each control."""

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command
-from sim.loop.control import make_control
+from sim.loop.control import CONTROLS
 from sim.loop.faults import FaultContainment, finite
 from sim.loop.snapshot import EnvStates
+from sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 
@@ -19,26 +19,15 @@ Float64 = NDArray[np.float64]
 class EnvGroup:
     """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
 
-    ``envs`` are its rows of the loop's arrays, ``compensate`` whether gravity and Coriolis forces are compensated.
+    ``envs`` are its rows of the loop's arrays, ``params`` those of these envs.
     """
 
-    def __init__(
-        self,
-        pack: Pack,
-        envs: slice,
-        scene: SceneSpec,
-        params: bp.PIDParams,
-        *,
-        control: str,
-        compensate: tuple[bool, bool],
-        on_fault: str,
-        speed_limit: Float64 | None,
-    ) -> None:
-        self.pack, self.envs = pack, envs
-        self._scene, self._kind = scene, control
-        self._gravity, self._coriolis = compensate
-        self._control = make_control(control, scene, params, pack)
-        self._containment = FaultContainment(pack.size, pack.dof, on_fault, speed_limit)
+    def __init__(self, pack: Pack, envs: slice, params: bp.PIDParams, options: RunnerOptions) -> None:
+        self.pack, self.envs, self._options = pack, envs, options
+        self._gravity, self._coriolis = options.compensate != "none", options.compensate == "gravity+coriolis"
+        self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
+        self._control = CONTROLS[options.control](pack.spec, params, pack)
+        self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._qpos = pack.read_qpos()
         self._steps = 0
 
@@ -105,7 +94,7 @@ class EnvGroup:
     def write(self, pack: Pack, states: EnvStates) -> None:
         """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
-        self._control = make_control(self._kind, self._scene, self._control.params, pack)
+        self._control = CONTROLS[self._options.control](pack.spec, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
         pack.isolate(np.flatnonzero(states.isolated).tolist())
@@ -152,7 +141,7 @@ class EnvGroup:
 
     def _sound(self, state: Float64 | None) -> bool:
         """Return whether no robot has failed, judged by ``state``, an array that depends on all their positions."""
-        limit = self._containment.speed_limit
+        limit = self._speed_limit
         return finite(state) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
 
     def _contain(self, qpos: Float64, done: int) -> None:
@@ -163,8 +152,8 @@ class EnvGroup:
         # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
         source = ~np.isfinite(self.pack.qf) & bad.any(1, keepdims=True)
         containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
-        if containment.speed_limit is not None:
-            fast = (np.abs(qvel) > containment.speed_limit) & ~bad.any(1, keepdims=True)
+        if self._speed_limit is not None:
+            fast = (np.abs(qvel) > self._speed_limit) & ~bad.any(1, keepdims=True)
             containment.fail(fast, "speed", step, self._qpos)
         self._qpos = np.where(bad, self._qpos, qpos)
         self._place_failed()
@@ -176,7 +165,10 @@ class EnvGroup:
             if rows is not None:
                 containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._place_failed()
-        neutral, failed = (0.0 if self._kind == "effort" else self._qpos, 0.0, 0.0), containment.failed[:, None]
+        neutral, failed = (
+            (0.0 if self._options.control == "effort" else self._qpos, 0.0, 0.0),
+            containment.failed[:, None],
+        )
         both = zip(command, neutral, strict=True)
         return Command._make(None if rows is None else np.where(failed, value, rows) for rows, value in both)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.loop.arrays import Arrays
+from sim.options import FaultAction
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel")
 """Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite."""
@@ -36,7 +37,7 @@ class Fault(NamedTuple):
     cause: str
     """One of :data:`CAUSES`."""
     action: str
-    """One of :data:`ACTIONS`."""
+    """``on_fault`` of the runner: "hold" or "reset"."""
 
     def __str__(self) -> str:
         cause = {
@@ -105,14 +106,12 @@ class FaultContainment:
 
     _STATE = ("suspended", "failed", "start_qpos", "start_qvel", "suspended_qpos", "step", "joint", "cause")
 
-    def __init__(self, size: int, dof: int, action: str, speed_limit: NDArray[np.float64] | None) -> None:
-        self.suspends, self.speed_limit = action == "hold", speed_limit
-        self.suspended: Bool = np.zeros(size, bool)
-        self.failed: Bool = np.zeros(size, bool)
+    def __init__(self, size: int, dof: int, action: FaultAction) -> None:
+        self.suspends = action == "hold"
+        self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
         self.start_qpos, self.start_qvel, self.suspended_qpos = (np.zeros((size, dof)) for _ in range(3))
         self.step = np.full(size, -1)
         self.joint, self.cause = np.zeros(size, int), np.zeros(size, int)
-        self._unplaced: Bool = np.zeros(size, bool)
 
     def clear(self, mask: Bool) -> None:
         """Clear the faults of the envs of ``mask`` (M,), which are reset."""

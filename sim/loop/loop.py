@@ -62,19 +62,7 @@ class Loop:
         count, pack_size = envs.stop - envs.start, options.scenes_per_system
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
-        self.groups = [
-            EnvGroup(
-                self._build(group),
-                group,
-                self._scene,
-                params.for_envs(group),
-                control=options.control,
-                compensate=(options.compensate != "none", options.compensate == "gravity+coriolis"),
-                on_fault=options.on_fault,
-                speed_limit=None if options.speed_limit is None else np.asarray(options.speed_limit),
-            )
-            for group in slices
-        ]
+        self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
 
     def _build(self, envs: slice) -> Pack:
         variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start

@@ -78,7 +78,7 @@ class EnvStates:
             isolated=row,
             saturated=table > 0,
             controller={name: leaf for name, leaf in bp.init(params, table)._asdict().items() if leaf is not None},
-            containment=FaultContainment(num_envs, dof, "hold", None).read(),
+            containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = _flatten(vars(expected)), _flatten(vars(self))
         for name in sorted(ours | theirs):
