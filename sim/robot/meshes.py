@@ -17,8 +17,7 @@ from lxml import etree
 
 from sim.robot.xml import LARGEST
 
-SIZE_LIMIT = 2**27
-"""Largest mesh file that is read [bytes]."""
+SIZE_LIMIT = 2**27  # bytes of a mesh file
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 

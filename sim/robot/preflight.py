@@ -73,12 +73,8 @@ def check(
     if params is not None:
         instance("params", params, bp.PIDParams, "use robot.params()")
         if params.num_joints != robot.dof:
-            raise InvalidArgumentError(
-                "params",
-                f"must have {robot.dof} joints",
-                value=params.num_joints,
-                remedy="build them with robot.params()",
-            )
+            problem, remedy = f"must have {robot.dof} joints", "build them with robot.params()"
+            raise InvalidArgumentError("params", problem, value=params.num_joints, remedy=remedy)
         findings += _params(robot, params, control)
         if control == "pid":
             findings += _stability(robot, params, start, timestep)
@@ -97,37 +93,25 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             effect = "SAPIEN makes it a link of 1e-6 kg, which costs time in every step"
         else:
             effect = "SAPIEN makes it a link of 1e-6 kg: the joint that moves it is all but impossible to control"
-        yield Finding(
-            "note" if fixed else "warning",
-            "no-inertia",
-            f"no mass and inertia; {effect}",
-            "add <inertial> with mass and inertia, or merge it into its parent",
-            link=link.name,
-        )
+        severity, text = "note" if fixed else "warning", f"no mass and inertia; {effect}"
+        remedy = "add <inertial> with mass and inertia, or merge it into its parent"
+        yield Finding(severity, "no-inertia", text, remedy, link=link.name)
 
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
     if robot.missing_meshes:
-        yield Finding(
-            "warning",
-            "missing-mesh",
-            f"collision meshes not found or not readable, simulated without: {', '.join(robot.missing_meshes)}",
-            "repair the files, or pass package_dirs=[...] to Robot.load",
-        )
+        text = f"collision meshes not found or not readable, simulated without: {', '.join(robot.missing_meshes)}"
+        remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
+        yield Finding("warning", "missing-mesh", text, remedy)
     if not robot.fixed_base:
-        yield Finding(
-            "warning",
-            "floating-base",
-            "SAPIEN's passive force does not compensate gravity on a floating base",
-            "load with fixed_base=True, or expect no compensation",
-        )
+        text = "SAPIEN's passive force does not compensate gravity on a floating base"
+        yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
     if robot.dynamics().in_contact(start[None])[0]:
-        yield Finding(
-            "warning",
-            "touching",
-            "links overlap each other or the ground at the start pose: SAPIEN pushes them apart",
-            "use another start pose, correct the collision shapes, or disable the pair in an .srdf next to the URDF",
+        text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
+        remedy = (
+            "use another start pose, correct the collision shapes, or disable the pair in an .srdf next to the URDF"
         )
+        yield Finding("warning", "touching", text, remedy)
 
 
 def _poses(robot: RobotDescription, what: str, qpos: NDArray[np.float64]) -> Iterator[Finding]:
@@ -145,12 +129,9 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
     imposed = DISSIPATION[robot.dissipation].joint_friction
     friction = f"friction {joint.friction:g}"
     if joint.friction and imposed is None:
-        yield found(
-            "warning",
-            "friction",
-            f"{friction}: the URDF means {joint.effort_unit}, PhysX a coefficient that multiplies the joint's load",
-            "expect another steady-state error than from Coulomb friction, or set it to 0",
-        )
+        text = f"{friction}: the URDF means {joint.effort_unit}, PhysX a coefficient that multiplies the joint's load"
+        remedy = "expect another steady-state error than from Coulomb friction, or set it to 0"
+        yield found("warning", "friction", text, remedy)
     if imposed is not None and joint.friction != imposed:
         text = f"{friction} of the URDF is replaced by SAPIEN's default {imposed:g}"
         yield found("note", "friction", text, "load with dissipation='urdf' to keep it")

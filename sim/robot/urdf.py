@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,11 @@ from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic, Urdf
 from sim.robot.meshes import find_mesh, mesh_problem
 from sim.robot.xml import number, numbers, parse_xml
 
-MAX_LINKS = 255
-"""PhysX counts the links of an articulation in a byte."""
-MAX_PAIRS = 31
-"""SAPIEN has a bit for each pair of links that may not collide."""
-SMALLEST = 1e-30
-"""Smallest mass [kg] and principal moment of inertia [kg m^2] above 0, whose reciprocal PhysX can hold."""
-SIZES = 1e-6, 1e6
-"""Sizes of shapes [m] and scales of meshes, by PhysX's limits of the latter."""
-
-_SIZES = {  # of the shapes that SAPIEN knows: their attributes, each with as many numbers as it has
+MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
+MAX_PAIRS = 31  # SAPIEN has a bit for each pair of links that may not collide
+SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
+SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6  # of shapes [m] and scales of meshes, by PhysX's limits of the latter
+_SHAPES = {  # that SAPIEN knows: their attributes, each with as many numbers as it has
     "box": {"size": "0 0 0"},
     "sphere": {"radius": "0"},
     "cylinder": {"radius": "0", "length": "0"},
@@ -49,16 +45,13 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -
 
     Parameters
     ----------
-    package_dirs
-        Folders searched for ``package://NAME/...`` before the folders above the file.
-    missing_meshes
-        ``"error"``, or ``"skip"`` to leave out the shapes whose mesh file is not found or cannot be read.
+    package_dirs, missing_meshes
+        See :meth:`sim.Robot.load`.
 
     Raises
     ------
     RobotError
-        Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a missing or
-        unreadable mesh.
+        Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a bad mesh.
     """
     root = parse_xml(path)
     if root.tag != "robot":
@@ -79,27 +72,25 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -
     links = [_read_link(element, path) for element in root.findall("link")]
     ordered = _breadth_first(links, joints, path)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
-        _repair(element, joint, joints, path)
-    for element, link in zip(root.findall("link"), links, strict=True):
-        for inertial in element.findall("inertial") if not link.inertial else []:
-            element.remove(inertial)  # SAPIEN does not use it, and fails where a part is missing
-        for inertia in element.findall("inertial/inertia"):
-            for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
-                inertia.set(key, inertia.get(key, "0"))
+        if joint.mimic is not None and joint.mimic.joint not in (other.name for other in joints):
+            problem = f"joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}"
+            raise RobotError(f"{path}: {problem}; correct the name")
+        if joint.mimic is not None and not mimic_works(joint, joints):
+            element.remove(element.find("mimic"))  # SAPIEN would mis-simulate it; the preflight reports it
     text = etree.tostring(root, encoding="unicode")
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing))
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
     """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their names and why."""
-    missing = []
-    for collision in list(root.iter("collision")):
+    missing, check = [], cache(mesh_problem)
+    for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
         if mesh is None:
             continue
         name = mesh.get("filename", "")
         found = find_mesh(name, path, package_dirs)
-        problem = None if found is None else mesh_problem(found)
+        problem = None if found is None else check(found)
         if found is None or problem is not None:
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
@@ -109,47 +100,52 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
 
 
 def _read_joint(element: etree._Element, path: Path) -> Joint:
+    """Return a joint, and write out or remove what SAPIEN fails on.
+
+    SAPIEN reads a missing limit as NaN, fails on ``<dynamics>`` without damping, and parses what it does not use.
+    """
     name, kind = element.get("name", ""), element.get("type", "")
-    where = f"{path}: joint {name!r}"
+    where, ranged = f"{path}: joint {name!r}", kind in ("revolute", "prismatic")
     if not name:
         raise RobotError(f"{where}: has no name; add name=")
     if kind not in (*MOVING_TYPES, "fixed"):
-        raise RobotError(
-            f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; "
-            "use revolute, continuous, prismatic or fixed"
-        )
+        remedy = "use revolute, continuous, prismatic or fixed"
+        raise RobotError(f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; {remedy}")
     parent, child = (None if end is None else end.get("link") for end in map(element.find, ("parent", "child")))
     if not parent or not child:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
+    axis, limit, dynamics, mimic = map(element.find, ("axis", "limit", "dynamics", "mimic"))
     fields: dict[str, Any] = _origin(element, where)
-    axis = element.find("axis")
-    if kind != "fixed" and axis is not None:
+    if axis is not None and kind == "fixed":
+        element.remove(axis)
+    elif axis is not None:
         fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
         if math.hypot(*fields["axis"]) < 1e-3:
             raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
-    limit, dynamics, mimic = element.find("limit"), element.find("dynamics"), element.find("mimic")
-    limits: dict[str, float] = {}
+    if limit is None and ranged:
+        raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
     if limit is not None:
         limits = {f"{key}_limit": number(limit, key, "inf", where, limit=True) for key in ("effort", "velocity")}
-        if kind in ("revolute", "prismatic"):
-            limits |= {key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")}
-    elif kind in ("revolute", "prismatic"):
-        raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
-    if limits.get("lower", -math.inf) > limits.get("upper", math.inf):
-        raise RobotError(
-            f"{where}: lower limit {limits['lower']:g} is above upper limit {limits['upper']:g}; swap them"
-        )
-    if limits.get("effort_limit", 0.0) < 0 or limits.get("velocity_limit", 0.0) < 0:
-        raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
-    if dynamics is not None:
-        passive = {key: number(dynamics, key, "0", where) for key in ("damping", "friction")}
-        if min(passive.values()) < 0:
-            raise RobotError(f"{where}: damping and friction must be >= 0 ({passive}); correct the URDF")
-        fields |= passive
+        if min(limits.values()) < 0:
+            raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
+        for key in ("lower", "upper") if ranged else ():
+            limits[key] = number(limit, key, "0", where, limit=True)
+            limit.set(key, repr(limits[key]))
+        if ranged and limits["lower"] > limits["upper"]:
+            text = f"lower limit {limits['lower']:g} is above upper limit {limits['upper']:g}"
+            raise RobotError(f"{where}: {text}; swap them")
+        if not ranged:
+            element.remove(limit)
+        fields |= limits
+    for key in ("damping", "friction") if dynamics is not None else ():
+        fields[key] = number(dynamics, key, "0", where)
+        if fields[key] < 0:
+            raise RobotError(f"{where}: damping and friction must be >= 0 ({key} is {fields[key]}); correct the URDF")
+        dynamics.set(key, repr(fields[key]))
     if mimic is not None:
         multiplier, offset = number(mimic, "multiplier", "1", where), number(mimic, "offset", "0", where)
         fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
-    return Joint(name, kind, parent, child, **(limits | fields))
+    return Joint(name, kind, parent, child, **fields)
 
 
 def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
@@ -167,34 +163,8 @@ def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
     return joint.parent_link in (other.child_link, other.parent_link)
 
 
-def _repair(element: etree._Element, joint: Joint, joints: Sequence[Joint], path: Path) -> None:
-    """Write out default values, and remove a mimic that SAPIEN would mis-simulate (the preflight reports it).
-
-    SAPIEN reads a missing limit as NaN, and fails on ``<dynamics>`` without damping; a limit or axis that it does not
-    use is not checked and removed.
-    """
-    limit, dynamics, axis = element.find("limit"), element.find("dynamics"), element.find("axis")
-    if limit is not None and joint.moves and not joint.continuous:
-        limit.set("lower", repr(joint.lower))
-        limit.set("upper", repr(joint.upper))
-    elif limit is not None:
-        element.remove(limit)
-    if axis is not None and not joint.moves:
-        element.remove(axis)
-    if dynamics is not None:
-        dynamics.set("damping", repr(joint.damping))
-        dynamics.set("friction", repr(joint.friction))
-    if joint.mimic is None:
-        return
-    if joint.mimic.joint not in {other.name for other in joints}:
-        raise RobotError(
-            f"{path}: joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}; correct the name"
-        )
-    if not mimic_works(joint, joints):
-        element.remove(element.find("mimic"))
-
-
 def _read_link(element: etree._Element, path: Path) -> Link:
+    """Return a link, and write out or remove those parts of its ``<inertial>`` that SAPIEN fails on."""
     name = element.get("name", "")
     where = f"{path}: link {name!r}"
     if not name:
@@ -205,27 +175,32 @@ def _read_link(element: etree._Element, path: Path) -> Link:
         raise RobotError(f"{where}: mass {value} must be 0 or at least {SMALLEST:g} kg; correct the URDF")
     tensor = np.zeros((3, 3))
     if inertia is not None:
-        keys = ("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz")
-        tensor = np.array([[number(inertia, key, "0", where) for key in row] for row in keys])
+        for row, column, key in zip(*np.triu_indices(3), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), strict=True):
+            tensor[row, column] = tensor[column, row] = number(inertia, key, "0", where)
+            inertia.set(key, inertia.get(key, "0"))
         if tensor.any() and np.linalg.eigvalsh(tensor)[0] < SMALLEST:
-            raise RobotError(
-                f"{where}: no body has the inertia {dict(inertia.attrib)}, whose principal moments are not all at "
-                f"least {SMALLEST:g} kg m^2; correct the URDF"
-            )
-    for part in element.findall("inertial") + element.findall("collision"):
+            problem = f"whose principal moments are not all at least {SMALLEST:g} kg m^2"
+            raise RobotError(f"{where}: no body has the inertia {dict(inertia.attrib)}, {problem}; correct the URDF")
+    for part in [*element]:
         _origin(part, where)
-    for collision in element.findall("collision"):
-        shapes = [shape for shape in collision.iterfind("geometry/*") if shape.tag in _SIZES]
-        if not shapes:
-            raise RobotError(f"{where}: a <collision> has none of {', '.join(_SIZES)}; add <geometry> with a shape")
-        for shape in shapes:
-            for key, default in _SIZES[shape.tag].items():
-                sizes = np.array(numbers(shape, key, default, where))
-                sizes = np.abs(sizes) if key == "scale" else sizes  # a negative scale mirrors the mesh
-                if sizes.min() < SIZES[0] or sizes.max() > SIZES[1]:
-                    need = f"must be > 0, from {SIZES[0]:g} to {SIZES[1]:g}"
-                    raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> {need}; correct the URDF")
+        if part.tag == "inertial" and not (value and tensor.any()):
+            element.remove(part)  # SAPIEN does not use it
+        elif part.tag == "collision":
+            _check_shapes(part, where)
     return Link(name, value, len(element.findall("collision")), bool(value) and bool(tensor.any()))
+
+
+def _check_shapes(collision: etree._Element, where: str) -> None:
+    shapes = [shape for shape in collision.iterfind("geometry/*") if shape.tag in _SHAPES]
+    if not shapes:
+        raise RobotError(f"{where}: a <collision> has none of {', '.join(_SHAPES)}; add <geometry> with a shape")
+    for shape in shapes:
+        for key, default in _SHAPES[shape.tag].items():
+            sizes = numbers(shape, key, default, where)
+            sizes = tuple(map(abs, sizes)) if key == "scale" else sizes  # a negative scale mirrors the mesh
+            if min(sizes) < SMALLEST_SIZE or max(sizes) > LARGEST_SIZE:
+                need = f"must be > 0, from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
+                raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> {need}; correct the URDF")
 
 
 def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
@@ -237,8 +212,9 @@ def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
     """Return the joints level by level from the root, siblings in file order, if they form one tree."""
     known, children = [link.name for link in links], [joint.child_link for joint in joints]
-    linked = set(known)
+    linked, moved, below = set(known), set(children), defaultdict(list)
     for joint in joints:
+        below[joint.parent_link].append(joint)
         for link in {joint.parent_link, joint.child_link} - linked:
             raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
     for problem, names, remedy in (
@@ -248,19 +224,12 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[J
     ):
         if twice := sorted(name for name, count in Counter(names).items() if count > 1):
             raise RobotError(f"{path}: {problem}: {', '.join(twice)}; {remedy}")
-    below = defaultdict(list)
-    for joint in joints:
-        below[joint.parent_link].append(joint)
-    moved = set(children)
     roots = [name for name in known if name not in moved]
     if len(roots) != 1:
         raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
-    ordered: list[Joint] = []
-    level = roots
-    while level:
-        found = [joint for link in level for joint in below[link]]
-        ordered += found
-        level = [joint.child_link for joint in found]
+    ordered = below[roots[0]].copy()
+    for joint in ordered:
+        ordered += below[joint.child_link]
     if len(ordered) != len(joints):
         raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")
     return ordered
@@ -272,7 +241,7 @@ def read_srdf(path: Path, urdf: Urdf) -> str:
     Raises
     ------
     RobotError
-        Unreadable file, malformed XML, an entity or DTD, a pair without reason or of unknown links, too many pairs.
+        What :func:`sim.robot.xml.parse_xml` refuses, a pair without reason or of unknown links, too many pairs.
     """
     root = parse_xml(path)
     names = {link.name for link in urdf.links}

@@ -13,12 +13,9 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 
-SIZE_LIMIT = 2**25
-"""Largest file that is parsed [bytes]: the tree takes about ten times as much memory."""
-LARGEST = 1e18
-"""Largest magnitude of a number: PhysX computes in single precision, in which its square is still finite."""
-LARGEST_LIMIT = 3.4e38
-"""Largest magnitude of a finite joint limit, which is compared and not multiplied."""
+SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
+LARGEST = 1e18  # magnitude of a number, whose square single precision, that of PhysX, can hold
+LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
 
 
 def parse_xml(path: Path) -> etree._Element:
