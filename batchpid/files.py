@@ -4,16 +4,37 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 
-def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callable[[BinaryIO], object]) -> None:
-    """Write the file at ``path`` as a whole or not at all; an existing file is replaced.
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a path to write a file to, which then replaces the file at ``path``.
 
-    The content goes to a temporary file in the same folder, to the disk, and then takes the place of ``path``: a
-    crash or a kill leaves the older file as it was.
+    It is in the same folder and has the same suffix. After an exception, a crash or a kill the older file is unchanged;
+    a link stays a link. The caller's file is on the disk before it takes its place.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    path = Path(os.path.realpath(path))
+    temporary = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callable[[BinaryIO], object]) -> None:
+    """Write the file at ``path`` as a whole or not at all, as :func:`replacing` does.
 
     Parameters
     ----------
@@ -26,16 +47,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callab
     OSError
         The file cannot be written.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        with temporary.open("x+b") as file:
-            if callable(content):
-                content(file)
-            else:
-                file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary, temporary.open("x+b") as file:
+        if callable(content):
+            content(file)
+        else:
+            file.write(content.encode() if isinstance(content, str) else content)

@@ -39,7 +39,8 @@ class PlotCommand:
         from sim import plots
 
         every = integer("every", self.every, 1, 10**9)
-        picture = flags.output_path("picture", self.picture, plots.FORMATS)
+        named_alike = self.recording.parent / f"{self.recording.name.partition('.')[0]}.png"
+        picture = flags.output_path("picture", self.picture or named_alike, plots.FORMATS)
         rollout = _read(self.recording, every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)
@@ -47,8 +48,7 @@ class PlotCommand:
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
             figure = draw(rollout, joints=self.joints)
-        named_alike = self.recording.with_name(f"{self.recording.name.partition('.')[0]}.png")
-        print(f"picture: {plots.save(figure, picture or named_alike)}")
+        print(f"picture: {plots.save(figure, picture)}")
 
 
 def _read(path: Path, every: int) -> Rollout:

@@ -21,6 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.files import write_atomically
 from batchpid.validate import file_path
 from sim.observation import Rollout
 from sim.plots import drawing
@@ -127,24 +128,27 @@ def comparison(
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
-    """Write ``figure`` to ``path`` (.png or .svg), making its folder, and return the path.
+    """Write ``figure`` to ``path`` (.png or .svg) as a whole or not at all, making its folder, and return the path.
 
     Raises
     ------
     InvalidArgumentError
         Another suffix.
+    OSError
+        The file cannot be written.
     """
     path = file_path("path", path, FORMATS)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".svg":
-        figure.savefig(path, dpi=dpi)
+        write_atomically(path, lambda file: figure.savefig(file, dpi=dpi, format="svg"))
         return path
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     # A palette of 256 colours cannot be told from the original, and takes a third of the bytes.
-    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True, dpi=(dpi, dpi))
+    image = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    write_atomically(path, lambda file: image.save(file, "PNG", optimize=True, dpi=(dpi, dpi)))
     return path
 
 

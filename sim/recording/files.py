@@ -2,15 +2,19 @@
 
 A file is .npz (NumPy) or .h5 (HDF5). Both hold the arrays of a :class:`sim.Rollout` under their names, ticks first, and
 what is known of its :class:`sim.RunInfo`: as further arrays in an .npz file, as attributes of an .h5 file. ``params``,
-``versions`` and ``faults`` are JSON text.
+``versions`` and ``faults`` are JSON text. An .h5 file has checksums too: the attribute ``checksum`` of all others, and
+the dataset ``checksum`` of each tick's rows. (HDF5's own Fletcher-32 is of whole chunks. A kill while a chunk is
+written once more, with further rows, would make its older rows unreadable.)
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +28,7 @@ from batchpid.files import write_atomically
 from batchpid.validate import file_path, instance, integer
 from sim.loop.faults import Fault
 from sim.observation import RECORDED, Observation, Rollout, RunInfo
+from sim.recording.hdf5 import NOT_WRITTEN, read_hdf5
 
 if TYPE_CHECKING:
     import h5py
@@ -32,6 +37,8 @@ FORMAT = "batchpid-recording-1"
 HDF5 = (".h5", ".hdf5")
 CHUNK_BYTES = 1 << 18
 """Approximate size of a chunk of an .h5 file."""
+DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
+"""Dtype of each array of a recording."""
 
 
 class RecordingError(BatchPIDError, OSError):
@@ -71,8 +78,10 @@ def write_recording(
             tables: dict[str, Any] = rollout.arrays() | _attributes(info, rollout.num_envs, rollout.tick)
             np.savez_compressed(file, **tables)
             return
-        with h5py.File(file, "w", libver="latest") as opened:
+        whole = io.BytesIO()  # HDF5 can crash the process after a write that failed
+        with h5py.File(whole, "w", libver="latest") as opened:
             append_rows(create_datasets(opened, info, rollout.num_envs, rollout.tick), rollout.arrays())
+        file.write(whole.getbuffer())
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,43 +91,59 @@ def write_recording(
     return path
 
 
-def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
+def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: int | None = None) -> Rollout:
     """Read a recording: complete, cut short by a kill (``NAME.h5.partial``), or one that is still being written.
 
-    ``info.complete`` of the result says whether the run came to its end.
+    ``info.complete`` of the result says whether the run came to its end. The file may come from a stranger: nothing in
+    it is executed, no other file is opened, and checksums are verified.
 
     Parameters
     ----------
     path
-        An .npz file, or an .h5 file of any name.
+        An .npz or .h5 file of any name.
     every
         Keep every n-th tick.
+    max_bytes
+        Largest size of the arrays in the file; default 1 GiB, or eight times the size of the file if that is more.
 
     Raises
     ------
     RecordingError
-        The file is missing, or no recording.
+        The file is missing, damaged, too large, or no recording.
     MissingDependencyError
         h5py is not installed, which .h5 files need.
     """
     path, every = file_path("path", path), integer("every", every, 1, 10**9)
+    max_bytes = None if max_bytes is None else integer("max_bytes", max_bytes, 0, 2**63 - 1)
     try:
+        if path.is_dir():
+            raise RecordingError(f"{path}: is a folder, not a recording")
         if not path.is_file():
             raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
-        with _open(path) as (arrays, attributes):
-            info = _info(attributes)
-            tick = attributes.get("tick")  # older files may lack it
-            tick = float(attributes["timestep"] * attributes["substeps"] if tick is None else tick)
-            time = arrays["time"][:]
-            ticks = slice(0, int(np.isfinite(time).sum()), every)  # times that are not written yet are NaN
-            tables = {name: arrays[name][ticks] for name in RECORDED}
-            _check_shapes(tables, len(time[ticks]), len(info.joint_names))
-            setpoint, *seen = (tables[name].astype(RECORDED[name].dtype, casting="same_kind") for name in RECORDED)
+        limit = max(1 << 30, 8 * path.stat().st_size) if max_bytes is None else max_bytes
+        with path.open("rb") as file:
+            zipped = file.read(2) == b"PK"
+        if zipped:
+            attributes = _read_npz(path, limit)
+            arrays = {name: attributes.pop(name)[::every] for name in DTYPES if name in attributes}
+        else:
+            load_h5py()
+            arrays, attributes = read_hdf5(path, ("checksum", *DTYPES), every, limit)
+        checksums = arrays.pop("checksum", None)
+        if lacking := DTYPES.keys() - arrays:
+            raise ValueError(f"it does not hold {', '.join(sorted(lacking))}")
+        arrays = {name: arrays[name].astype(dtype, casting="same_kind", copy=False) for name, dtype in DTYPES.items()}
+        info = _info(attributes)
+        tick = float(attributes["tick"] if "tick" in attributes else attributes["timestep"] * attributes["substeps"])
+        _check(arrays, tick, info)
+        if checksums is not None and not np.array_equal(checksums, row_checksums(arrays)):
+            raise ValueError("its data are damaged: a checksum differs")
     except (RecordingError, MissingDependencyError):
         raise
     except Exception as error:  # a damaged file can make the libraries raise anything
-        raise RecordingError(f"{path}: cannot be read as a recording: {error}") from error
-    return Rollout(time[ticks], setpoint, Observation(*seen), tick * every, info)
+        raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
+    time, setpoint, *seen = arrays.values()
+    return Rollout(time, setpoint, Observation(*seen), tick * every, info)
 
 
 def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overwrite: bool) -> Path:
@@ -130,7 +155,7 @@ def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overw
         It ends in none of ``suffixes``, or the file exists and ``overwrite`` is False.
     """
     path = file_path("path", path, suffixes)
-    if path.exists() and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise InvalidArgumentError(
             "path", "exists already", value=str(path), remedy="choose another name, or pass overwrite=True"
         )
@@ -159,17 +184,36 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
         datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
         if quantity.per_joint:
             datasets[name].attrs["unit"] = [info.quantity(name).unit_for(unit) for unit in info.units]
+    datasets["checksum"] = file.create_dataset(
+        "checksum", (0,), "i8", maxshape=(None,), chunks=(1024,), fillvalue=NOT_WRITTEN
+    )
     return datasets
 
 
 def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Append ``arrays``, ticks first, to the datasets of their names; to time, which readers count, last."""
-    for name in (*RECORDED, "time"):
-        dataset, rows = datasets[name], arrays[name]
+    """Append ``arrays``, ticks first, to the datasets of their names; their checksums, which readers count, last."""
+    arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items()}
+    for name, rows in (arrays | {"checksum": row_checksums(arrays)}).items():
+        dataset = datasets[name]
         done = len(dataset)
         dataset.resize(done + len(rows), axis=0)
         dataset[done:] = rows
         dataset.flush()
+
+
+def row_checksums(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+    """Return the CRC-32 of each tick's rows of all ``arrays``, (ticks,)."""
+    sums = np.zeros(len(arrays["time"]), np.int64)
+    for tick, rows in enumerate(zip(*map(np.ascontiguousarray, arrays.values()), strict=True)):
+        for row in rows:
+            sums[tick] = zlib.crc32(row, sums[tick])
+    return sums
+
+
+def attribute_checksum(attributes: Mapping[str, Any]) -> int:
+    """Return the CRC-32 of all ``attributes`` but the checksum."""
+    values = {name: np.asarray(value).tolist() for name, value in attributes.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
 
 
 def faults_text(faults: Iterable[Fault]) -> str:
@@ -185,23 +229,25 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
     if info.versions is not None:
         known["versions"] = json.dumps(dict(info.versions))
-    return {"format": FORMAT, "num_envs": num_envs, "tick": tick} | known
+    known |= {"format": FORMAT, "num_envs": num_envs, "tick": tick}
+    return known | {"checksum": attribute_checksum(known)}
 
 
-@contextmanager
-def _open(path: Path) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Open a recording; its arrays, which can be sliced, and its attributes."""
-    if path.suffix == ".npz":
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            yield arrays, arrays
-        return
-    h5py = load_h5py()
-    try:
-        file = h5py.File(path, "r")
-    except OSError:
-        file = h5py.File(path, "r", swmr=True, libver="latest")  # it is being written, or its writer was killed
-    with file:
-        yield file, file.attrs
+def _read_npz(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
+    """Return all arrays of an .npz file, each read to its end, where its checksum is verified."""
+    tables = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if (total := sum(member.file_size for member in members)) > max_bytes:
+            raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")
+        for member in members:
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"its {member.filename} is compressed in an unknown way")
+            with archive.open(member) as file:
+                tables[member.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+                if file.read(1):
+                    raise ValueError(f"its {member.filename} is longer than it says")
+    return tables
 
 
 def _info(attributes: Mapping[str, Any]) -> RunInfo:
@@ -211,24 +257,43 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}
     if lacking := [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]:
         raise ValueError(f"it does not say its {', '.join(lacking)}")
+    if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
+        raise ValueError("its attributes are damaged: the checksum differs")
     names = tuple(map(str, known["joint_names"]))
+    texts = ("robot", "urdf", "dissipation", "control", "compensate", "physics", "begun")
     decode: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(texts, str),
         **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
-        **dict.fromkeys(("lower", "upper", "effort_limit", "start"), np.asarray),
+        **dict.fromkeys(("lower", "upper", "effort_limit", "start"), _numbers),
+        "timestep": float,
+        "substeps": int,
+        "complete": bool,
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
-        "versions": lambda text: json.loads(str(text)),
+        "versions": lambda text: dict(json.loads(str(text))),
         "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
     }
     for name in ("units", "lower", "upper", "effort_limit"):
         if np.shape(known[name]) != (len(names),):
             raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
-    return RunInfo(**{name: decode.get(name, lambda one: np.asarray(one).item())(known[name]) for name in known})
+    return RunInfo(**{name: decode[name](value) for name, value in known.items()})
 
 
-def _check_shapes(tables: Mapping[str, NDArray[Any]], ticks: int, dof: int) -> None:
-    envs = tables["ok"].shape[1]
-    for name, quantity in RECORDED.items():
-        shape = (ticks, envs, dof) if quantity.per_joint else (ticks, envs)
-        if tables[name].shape != shape:
-            raise ValueError(f"its {name} has shape {tables[name].shape}, not {shape}")
+def _numbers(value: NDArray[Any]) -> NDArray[Any]:
+    if value.dtype.kind not in "iuf":
+        raise ValueError(f"it has {value.dtype} where numbers belong")
+    return value
+
+
+def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> None:
+    """Check that shapes agree and times are numbers."""
+    ticks, dof = len(arrays["time"]), len(info.joint_names)
+    envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0
+    shapes = {name: (ticks, envs, dof) if quantity.per_joint else (ticks, envs) for name, quantity in RECORDED.items()}
+    for name, shape in ({"time": (ticks,)} | shapes).items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"its {name} has shape {arrays[name].shape}, not {shape}")
+    if not (0 < tick < np.inf and np.isfinite(arrays["time"]).all()):
+        raise ValueError("its times are not finite")
+    if info.start is not None and info.start.shape != (envs, dof):
+        raise ValueError(f"its start has shape {info.start.shape}, not {(envs, dof)}")

@@ -9,6 +9,7 @@ is not touched before. See :mod:`sim.recording.files` for what it holds.
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import re
@@ -36,6 +37,8 @@ WRITE_PERIOD = 0.5
 """Time from one write to the next [s]."""
 MAX_LAG = 0.75
 """Age of the oldest row that is not on disk at which the next tick waits for it [s]."""
+METADATA_BYTES = 1 << 18
+"""Disk space that is kept for what HDF5 notes about the next rows."""
 MAX_BUFFER = 64 << 20
 """Bytes that may wait to be written."""
 
@@ -118,10 +121,11 @@ class Recorder:
         if self._file is None:
             return
         file, self._file = self._file, None
+        end = file.id.get_filesize()
         with contextlib.suppress(Exception):  # the writer's error, if any, is the one to raise
             file.close()
         self._check()
-        self._finish(complete)
+        self._finish(complete, end)
 
     def __enter__(self) -> Recorder:
         return self
@@ -142,17 +146,30 @@ class Recorder:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=files.CHUNK_BYTES, rdcc_w0=1.0)
             try:
+                self._reserve(0)
                 datasets = files.create_datasets(file, info, runner.num_envs, runner.timestep * runner.substeps)
                 file.flush()
                 file.swmr_mode = True
             except BaseException:
                 _redirect_to_memory(file)
-                file.close()
+                with contextlib.suppress(Exception):
+                    file.close()
                 self.partial.unlink()
                 raise
         except (OSError, RuntimeError) as error:
             raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
         return file, datasets
+
+    def _reserve(self, end: int, size: int = 0) -> None:
+        """Allocate disk space after ``end`` for ``size`` bytes of rows: HDF5 can crash after a write that failed."""
+        chunk = max(files.CHUNK_BYTES, 8 * self._runner.num_envs * self._runner.robot.dof)
+        size += 2 * len(files.DTYPES) * chunk + METADATA_BYTES  # a chunk of each dataset is not full
+        with self.partial.open("r+b") as disk:
+            try:
+                os.posix_fallocate(disk.fileno(), end, size)
+            except OSError as error:
+                if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
+                    raise  # with another error the file system does not offer it
 
     def _write_rows(self) -> None:
         """Write the recorded rows every half second, in a thread, until the recorder is closed."""
@@ -166,7 +183,11 @@ class Recorder:
             try:
                 if rows:
                     columns = map(np.array, zip(*rows, strict=True))
-                    files.append_rows(self._datasets, dict(zip(("time", *RECORDED), columns, strict=True)))
+                    arrays = dict(zip(("time", *RECORDED), columns, strict=True))
+                    self._reserve(
+                        self._datasets["time"].file.id.get_filesize(), sum(array.nbytes for array in arrays.values())
+                    )
+                    files.append_rows(self._datasets, arrays)
             except Exception as error:
                 _redirect_to_memory(self._file)
                 self._error = error
@@ -176,13 +197,16 @@ class Recorder:
             if closing or self._error is not None:
                 return
 
-    def _finish(self, complete: bool) -> None:
+    def _finish(self, complete: bool, end: int) -> None:
         try:
+            faults = files.faults_text(self._runner.faults)
+            self._reserve(end, len(faults))
             # Without a lock, because a reader may hold one.
             with files.load_h5py().File(self.partial, "r+", locking=False) as file:
                 try:
                     file.attrs["complete"] = complete
-                    file.attrs["faults"] = files.faults_text(self._runner.faults)
+                    file.attrs["faults"] = faults
+                    file.attrs["checksum"] = files.attribute_checksum(file.attrs)
                     file.flush()
                 except BaseException:
                     _redirect_to_memory(file)
@@ -208,7 +232,7 @@ class Recorder:
 def _cause(error: Exception) -> str:
     """Return the system's message, out of HDF5's long one."""
     found = re.search(r"error message = '([^']+)'", str(error))
-    return found[1] if found else str(error)
+    return found[1] if found else getattr(error, "strerror", None) or str(error)
 
 
 def _redirect_to_memory(file: h5py.File | None) -> None:
@@ -225,4 +249,4 @@ def _redirect_to_memory(file: h5py.File | None) -> None:
 def _free_name(path: Path) -> Path:
     """Return the first of ``NAME.partial``, ``NAME.partial2``, ... that does not exist."""
     names = (path.with_name(f"{path.name}.partial{number}") for number in ("", *range(2, 10**6)))
-    return next(name for name in names if not name.exists())
+    return next(name for name in names if not os.path.lexists(name))

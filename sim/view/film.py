@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError, MissingDependencyError
+from batchpid.files import replacing
 from batchpid.validate import file_path, integer, number
 from sim.engine import sapien
 from sim.observation import Rollout
@@ -121,7 +122,7 @@ def write_film(
     path.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {"macro_block_size": 2} if path.suffix.lower() == ".mp4" else {"loop": 0}
     writer: Any
-    with imageio.get_writer(path, fps=rate, **options) as writer:
+    with replacing(path) as temporary, imageio.get_writer(temporary, fps=rate, **options) as writer:
         for row in rows if progress is None else progress(rows):
             scene.place(rollout.qpos[row])
             camera.take_picture()

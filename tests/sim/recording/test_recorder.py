@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,9 @@ from robots import load_bundled
 h5py = pytest.importorskip("h5py")
 
 from batchpid.errors import ClosedError, InvalidArgumentError  # noqa: E402
-from sim import FaultWarning, Recorder, RecordingError, Runner, read_recording  # noqa: E402
+from sim import FaultWarning, Recorder, RecordingError, Runner, read_recording, write_recording  # noqa: E402
 from sim.cli import main  # noqa: E402
+from sim.recording import files  # noqa: E402
 from sim.recording import recorder as recorder_module  # noqa: E402
 
 ROBOT = load_bundled("panda")
@@ -222,6 +225,74 @@ def test_a_file_that_cannot_be_made_leaves_none(tmp_path, monkeypatch):
             Recorder(tmp_path / "run.h5", runner)
         assert not os.listdir(tmp_path)
         assert runner.recorder is None
+
+
+@contextmanager
+def limited_disk(folder, kind, size):
+    """Make ``folder`` a disk of ``size`` bytes, or let this process write files of that size at most."""
+    if kind == "file size":
+        old = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, old)
+        return
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
+    if os.geteuid() or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("this process cannot mount a small disk")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("kind", ["disk", "file size"])
+def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "CHUNK_BYTES", 2048)
+    monkeypatch.setattr(recorder_module, "METADATA_BYTES", 1 << 15)
+    ticks, outcomes = 40, set()
+    for size in range(4096, 260_000, 12_288):
+        folder = tmp_path / str(size)
+        folder.mkdir()
+        path, rollouts, message = folder / "run.h5", [], ""
+        with make() as runner, limited_disk(folder, kind, size):
+            try:
+                with Recorder(path, runner):
+                    rollouts.append(runner.rollout(table(ticks)))
+            except RecordingError as error:
+                message = str(error)
+                assert "No space left" in message or "File too large" in message
+            outcomes.add(message.partition(": ")[2].partition(":")[0])
+            found = os.listdir(folder)
+            if "cannot be made" in message:
+                assert found == []
+                continue
+            recording = read_recording(folder / found[0])
+            count = len(recording.time)
+            assert_identical(recording, rollouts[0].for_ticks(slice(0, count)))
+            assert count == ticks or "cannot be written" in message
+            assert found == ["run.h5.partial" if message else "run.h5"]
+    assert outcomes >= {"", "cannot be made", "cannot be written"}
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+@pytest.mark.parametrize("kind", ["disk", "file size"])
+def test_a_rollout_that_does_not_fit_leaves_the_older_file(kind, suffix, tmp_path):
+    with make() as runner:
+        rollout = runner.rollout(table(200))
+    for size in range(16384, 300_000, 65_536):
+        with limited_disk(tmp_path, kind, size):
+            path = tmp_path / f"run{suffix}"
+            path.write_text("older")
+            try:
+                write_recording(rollout, path, overwrite=True)
+                assert_identical(read_recording(path), rollout)
+            except RecordingError as error:
+                assert "No space left" in str(error) or "File too large" in str(error)  # noqa: PT017
+                assert path.read_text() == "older"
+            assert os.listdir(tmp_path) == [path.name]
+            path.unlink()
 
 
 @pytest.mark.parametrize("path", ["run.csv", "run.npz", "run", 3, None])

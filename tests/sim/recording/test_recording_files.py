@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import shutil
+import sys
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
 import numpy as np
@@ -12,6 +17,8 @@ from identical import assert_identical
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from sim import FaultWarning, RecordingError, RunInfo, Runner, read_recording, write_recording
+from sim.recording import files, hdf5
+from sim.recording.files import attribute_checksum
 
 SUFFIXES = (".npz", ".h5")
 
@@ -120,7 +127,7 @@ def test_h5_files_of_earlier_versions_are_read(tmp_path, rollout, panda):
         fault = {"env": 1, "step": 10, "time": 0.005, "joint": "panda_joint4", "cause": "setpoint", "action": "hold"}
         file.attrs["faults"] = json.dumps([fault])
         file.attrs["complete"] = False
-        del file["saturated"].attrs["unit"]
+        del file["saturated"].attrs["unit"], file["checksum"], file.attrs["checksum"]
     read = read_recording(path)
     assert_identical(read, rollout)
     assert read.tick == rollout.tick
@@ -196,7 +203,7 @@ DAMAGE = {
     "other params": (lambda file: file.attrs.create("params", "{}"), "params"),
     "no JSON": (lambda file: file.attrs.create("faults", "}"), "JSON|Expecting"),
     "other faults": (lambda file: file.attrs.create("faults", json.dumps([{"a": 1}])), "unexpected keyword"),
-    "a group": (lambda file: (file.pop("qpos"), file.create_group("qpos")), "slice"),
+    "a group": (lambda file: (file.pop("qpos"), file.create_group("qpos")), "qpos is not a dataset"),
     "other joints": (
         lambda file: file.attrs.create("joint_names", ["a", "b"]),
         r"units are \(9,\), not one for each of 2",
@@ -206,7 +213,23 @@ DAMAGE = {
         lambda file: (file.pop("qvel"), file.create_dataset("qvel", data=np.zeros((6, 2, 9), "f4"))),
         r"qvel has shape \(6, 2, 9\), not \(6, 3, 9\)",
     ),
-    "text": (lambda file: (file.pop("ok"), file.create_dataset("ok", data=[["a", "b", "c"]] * 6)), "Cannot cast"),
+    "text": (
+        lambda file: (file.pop("ok"), file.create_dataset("ok", data=[["a", "b", "c"]] * 6)),
+        "not an array of numbers",
+    ),
+    "complex": (
+        lambda file: (file.pop("qvel"), file.create_dataset("qvel", (6, 3, 9), "c16")),
+        "not an array of numbers",
+    ),
+    "one dimension": (lambda file: (file.pop("ok"), file.create_dataset("ok", (6,), "?")), "setpoint has shape"),
+    "no time": (lambda file: file.pop("time"), "does not hold time"),
+    "other start": (lambda file: file.attrs.create("start", np.zeros(9)), r"start has shape \(9,\), not \(3, 9\)"),
+    "text for limits": (lambda file: file.attrs.create("upper", ["a"] * 9), "where numbers belong"),
+    "no tick": (lambda file: file.attrs.create("tick", np.nan), "times are not finite"),
+    "other data": (
+        lambda file: file["qpos"].write_direct(np.zeros((6, 3, 9), "f4")),
+        "data are damaged: a checksum differs",
+    ),
 }
 
 
@@ -217,5 +240,179 @@ def test_a_damaged_h5_file_is_refused(case, tmp_path, rollout):
     path = write_recording(rollout, tmp_path / "run.h5")
     with h5py.File(path, "r+") as file:
         damage(file)
+        file.attrs["checksum"] = attribute_checksum(file.attrs)
     with pytest.raises(RecordingError, match=rf"run\.h5: cannot be read as a recording: .*({message})"):
+        read_recording(path)
+
+
+def virtual(h5py, file, elsewhere):
+    layout = h5py.VirtualLayout((6, 3, 9), "f4", maxshape=(None, 3, 9))
+    source = h5py.VirtualSource(elsewhere, "qpos", (6, 3, 9), maxshape=(None, 3, 9))
+    layout[0 : h5py.h5s.UNLIMITED : 1] = source[0 : h5py.h5s.UNLIMITED : 1]
+    file.create_virtual_dataset("qpos", layout)
+
+
+STRANGE = {
+    "external link": (
+        lambda h5py, file, elsewhere: file.__setitem__("qpos", h5py.ExternalLink(elsewhere, "/qpos")),
+        "qpos is a link",
+    ),
+    "soft link": (lambda h5py, file, elsewhere: file.__setitem__("qpos", h5py.SoftLink("/qvel")), "qpos is a link"),
+    "virtual dataset": (virtual, "qpos lies in other files"),
+    "external storage": (
+        lambda h5py, file, elsewhere: file.create_dataset("qpos", (6, 3, 9), "f4", external=[(elsewhere, 0, 648)]),
+        "qpos lies in other files",
+    ),
+    "huge shape": (
+        lambda h5py, file, elsewhere: file.create_dataset("qpos", (10**12, 3, 9), "f4", chunks=(1, 3, 9)),
+        "more than max_bytes",
+    ),
+    "huge times": (
+        lambda h5py, file, elsewhere: (
+            file.pop("checksum"),
+            file.pop("time"),
+            file.create_dataset("time", (10**12,), "f8", chunks=(8,), fillvalue=1.0),
+        ),
+        "more than max_bytes",
+    ),
+    "huge chunk": (
+        lambda h5py, file, elsewhere: file.create_dataset("qpos", (2**26, 3), "u1", chunks=(2**26, 3)),
+        "qpos has shape",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STRANGE)
+def test_h5_files_of_strangers_open_no_other_file_and_take_no_memory(case, tmp_path, rollout):
+    h5py = pytest.importorskip("h5py")
+    change, message = STRANGE[case]
+    path = write_recording(rollout, tmp_path / "run.h5")
+    os.mkfifo(elsewhere := str(tmp_path / "elsewhere"))  # who opens it waits for good
+    with h5py.File(path, "r+") as file:
+        del file["qpos"]
+        change(h5py, file, elsewhere)
+    before = peak_memory()
+    with pytest.raises(RecordingError, match=rf"run\.h5: cannot be read as a recording: .*{message}"):
+        read_recording(path)
+    assert peak_memory() < before + (1 << 30)
+
+
+def peak_memory():
+    """Return the largest resident memory of this process and of its children so far [B]."""
+    return 1024 * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def npy_header(shape, dtype="<f4"):
+    text = str({"descr": dtype, "fortran_order": False, "shape": shape}).encode()
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+@pytest.mark.parametrize("case", ["claimed shape", "claimed size", "unpacked size", "huge item", "lzma", "longer"])
+def test_npz_files_of_strangers_take_no_memory(case, tmp_path, rollout):
+    path = write_recording(rollout, tmp_path / "run.npz")
+    options = {"max_bytes": 100_000} if case == "unpacked size" else {}
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["qpos.npy"] = {
+        "claimed shape": npy_header((10**8, 3, 9)),
+        "huge item": npy_header((1,), "<U500000000"),
+        "longer": npy_header((1, 3, 9)) + members["qpos.npy"][-108:] * 6,
+        "unpacked size": bytes(200_000),
+    }.get(case, members["qpos.npy"])
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA if case == "lzma" else zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+        if case == "claimed size":
+            archive.getinfo("qpos.npy").file_size = 10**12
+    before = peak_memory()
+    with pytest.raises(RecordingError, match=r"run\.npz: cannot be read as a recording"):
+        read_recording(path, **options)
+    assert peak_memory() < before + (1 << 30)
+
+
+def test_a_limit_of_size_can_be_given(tmp_path, rollout):
+    path = write_recording(rollout, tmp_path / "run.npz")
+    assert_identical(read_recording(path, max_bytes=10**6), rollout)
+    with pytest.raises(RecordingError, match="more than max_bytes=1,000"):
+        read_recording(path, max_bytes=1000)
+    with pytest.raises(InvalidArgumentError, match="max_bytes"):
+        read_recording(path, max_bytes=-1)
+
+
+def test_hdf5_that_hangs_or_crashes_is_ended(tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    os.mkfifo(path := tmp_path / "run.h5")
+    with pytest.raises(ValueError, match="takes too long"):
+        hdf5.read_hdf5(path, ["time"], 1, 10**9)
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    with pytest.raises(ValueError, match="crashed"):
+        hdf5.read_hdf5(path, ["time"], 1, 10**9)
+
+
+@pytest.fixture(params=[".npz", ".h5", ".h5.partial"])
+def small_file(request, tmp_path, rollout, monkeypatch):
+    """A small recording, for the tests that damage it: whole, or as a kill leaves it."""
+    skip_without_h5py(request.param)
+    monkeypatch.setattr(files, "CHUNK_BYTES", 256)
+    if request.param != ".h5.partial":
+        return write_recording(rollout, tmp_path / f"run{request.param}")
+    import h5py
+
+    path = tmp_path / "run.h5.partial"
+    with h5py.File(tmp_path / "growing.h5", "w", libver="latest") as file:
+        datasets = files.create_datasets(file, rollout.info, rollout.num_envs, rollout.tick)
+        file.swmr_mode = True
+        files.append_rows(datasets, rollout.arrays())
+        shutil.copy(tmp_path / "growing.h5", path)
+    return path
+
+
+def assert_refused_or_equal(path, contents):
+    """Read each of the ``contents`` as a file like ``path``; it is refused, at once, or read as ``path`` is."""
+    whole = read_recording(path)
+
+    def read(case):
+        number, content = case
+        damaged = path.with_name(f"damaged{number}{path.suffix}")
+        damaged.write_bytes(content)
+        try:
+            found = read_recording(damaged)
+        except RecordingError as error:
+            assert "too long" not in str(error)  # noqa: PT017
+            return True
+        assert_identical(found, whole)
+        assert_same_info(found.info, whole.info)
+        return False
+
+    with ThreadPoolExecutor(4) as pool:
+        return sum(pool.map(read, enumerate(contents)))
+
+
+def flips(content, count, seed):
+    random = np.random.default_rng(seed)
+    for place, bit in random.integers(0, (len(content), 8), (count, 2)):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << bit
+        yield bytes(damaged)
+
+
+def test_a_file_with_a_flipped_bit_is_refused_or_equal(small_file):
+    count = 50 if small_file.suffix == ".partial" else 200
+    assert 0 < assert_refused_or_equal(small_file, flips(small_file.read_bytes(), count, 0)) < count
+
+
+@pytest.mark.slow
+def test_a_file_with_any_of_many_flipped_bits_is_refused_or_equal(small_file):
+    assert assert_refused_or_equal(small_file, flips(small_file.read_bytes(), 1000, 1)) > 0
+
+
+def test_a_truncated_file_is_refused_or_equal(small_file):
+    content = small_file.read_bytes()
+    lengths = [0, 1, 7, 48, 200, *np.linspace(1000, len(content) - 1, 15).astype(int)]
+    assert assert_refused_or_equal(small_file, (content[:length] for length in lengths)) > 10
+
+
+@pytest.mark.parametrize("path", [".", "", "/", "..", "a" * 5000, "/dev/null", "run.h5/more"])
+def test_paths_of_no_file_are_refused(path):
+    with pytest.raises(RecordingError):
         read_recording(path)
