@@ -13,7 +13,7 @@ from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
 LARGE = 2**18
-"""Number of envs from which JAX's CPU backend steps block by block: there its own buffers are mapped anew each time."""
+"""Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
 
 
 class NumPyBackend:

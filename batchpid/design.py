@@ -183,16 +183,13 @@ def _filter_time(
     worst = np.argsort(at_low)[-10:]  # the critical pose is among these
     mass, scale = mass[worst], scale[worst]
 
-    def ratio(filter_time: float) -> float:
-        return float(ratios(filter_time).max())
-
     # The filter passes dt / (dt + 2 tau), so the ratio falls about as 1 / tau down to kp's own share of it.
     high = low
-    while ratio(high) > margin:
+    while ratios(high).max() > margin:
         high *= 2
         if high > 1e3:
             return math.inf
     for _ in range(40):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if ratio(middle) > margin else (low, middle)
+        low, high = (middle, high) if ratios(middle).max() > margin else (low, middle)
     return high

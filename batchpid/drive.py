@@ -22,8 +22,8 @@ def drive_target(
     ``effort_min`` and ``effort_max`` are the drive's force limit, and anti-windup works against it. Where kp is 0 the
     target is the setpoint.
 
-    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort that acts besides
-    the drive, inside the same limit) are those of :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
+    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
+    the drive's, inside the same limit) are those of :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
     state, _, terms = step(params, state, setpoint, measurement, dt, **inputs, terms=True)

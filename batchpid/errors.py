@@ -5,6 +5,7 @@ A message says what is wrong, where (argument, joint, env), the value, and the r
 
 from __future__ import annotations
 
+import copyreg
 import reprlib
 from typing import Any
 
@@ -41,7 +42,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by message and fields, so that the error crosses process borders whole."""
-        return (_rebuild, (type(self), self.args, self.__dict__))
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class RobotError(BatchPIDError, ValueError):
@@ -73,10 +74,3 @@ class ClosedError(BatchPIDError, RuntimeError):
 
 class InUseError(BatchPIDError, RuntimeError):
     """The object is in use: by another thread, a signal handler, or the process from which this one was forked."""
-
-
-def _rebuild(cls: type[Exception], args: tuple[Any, ...], fields: dict[str, Any]) -> Exception:
-    error = cls.__new__(cls)
-    error.args = args
-    error.__dict__.update(fields)
-    return error

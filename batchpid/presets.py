@@ -73,7 +73,7 @@ def control_toolbox(
     """Return params of ros-controls/control_toolbox 6.3.0, src/pid.cpp, on the error alone.
 
     Outputs first, then integrates; ``antiwindup`` is "none", "back_calculation" or "conditional_integration"; the
-    integral is clamped to [i_min, i_max] besides. ``tracking_time=None`` is its rule for 0: sqrt(d/i), or p/i. Its
+    integral is clamped to [i_min, i_max] too. ``tracking_time=None`` is its rule for 0: sqrt(d/i), or p/i. Its
     first derivative is taken from an error of 0; not with ``kick=False``. Not reproduced: NaN for I alone with
     back-calculation, and the oscillation of a tracking time below dt.
     """

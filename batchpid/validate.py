@@ -125,17 +125,19 @@ def read_array(argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: b
     return result
 
 
-def broadcast(argument: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def broadcast(
+    argument: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    remedy: str = "give one value, one per joint, or one per env and joint",
+) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape``."""
     result = read_array(argument, value).astype(np.float64, copy=False)
     try:
-        return np.broadcast_to(result, shape)
+        return result if result.shape == shape else np.broadcast_to(result, shape)
     except ValueError:
-        raise InvalidArgumentError(
-            argument,
-            f"has shape {result.shape}, which does not broadcast to {shape}",
-            remedy="give one value, one per joint, or one per env and joint",
-        ) from None
+        problem = f"has shape {result.shape}, which does not broadcast to {shape}"
+        raise InvalidArgumentError(argument, problem, remedy=remedy) from None
 
 
 def array(
@@ -145,17 +147,11 @@ def array(
 
     A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
     """
-    result = read_array(argument, value).astype(np.float64, copy=False)
-    try:
-        if result.ndim and result.shape[-1] != shape[-1]:
-            raise ValueError  # one number for all joints is a scalar, and not an array of one
-        result = result if result.shape == shape else np.broadcast_to(result, shape)
-    except ValueError:
-        raise InvalidArgumentError(
-            argument,
-            f"has shape {result.shape}, needs {shape} or ({shape[-1]},)",
-            remedy=f"the last axis counts the joints {', '.join(joint_names)}",
-        ) from None
+    remedy = f"the last axis counts the joints {', '.join(joint_names)}"
+    result = read_array(argument, value)
+    if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
+        raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
+    result = broadcast(argument, result, shape, remedy)
     if finite:
         entries(argument, result, np.isfinite(result), "is not finite", joint_names, remedy="pass finite numbers")
     return result

@@ -1,4 +1,4 @@
-"""The law block by block is the law."""
+"""Steps in blocks on JAX's CPU backend equal plain steps."""
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +35,8 @@ def compare(params, inputs, rows):
 
 
 @pytest.mark.parametrize("case", ["p", "per env", "mixed per env", "zero effort", "everything"])
-def test_blocks_are_the_law(case, inputs):
-    """Four envs in blocks of three: the second block does two of the first's rows again."""
+def test_steps_in_blocks_equal_plain_steps(case, inputs):
+    """Four envs in blocks of three: the second block repeats two rows of the first."""
     compare(bp.make_params(JOINTS, **OPTIONS[case], dtype=np.float32), inputs, rows=3)
 
 
@@ -46,7 +46,7 @@ def test_blocks_of_any_size(rows, inputs):
     compare(params, inputs, rows)
 
 
-def test_blocks_have_the_law_s_gradients(inputs):
+def test_gradients_through_blocks_equal_plain_gradients(inputs):
     params = bp.make_params(JOINTS, **GAINS, dtype=np.float32)
     r, y = (jnp.asarray(x[0], jnp.float32) for x in (inputs.setpoint, inputs.measurement))
 
@@ -61,8 +61,8 @@ def test_blocks_have_the_law_s_gradients(inputs):
     np.testing.assert_allclose(*slopes, rtol=1e-5)
 
 
-def test_a_large_batch_goes_in_blocks(monkeypatch, inputs):
-    """Through reset, track and a change of params, where the state that is written over must not be in use."""
+def test_a_large_batch_is_stepped_in_blocks_with_equal_results(monkeypatch, inputs):
+    """Through reset, track and a change of params, after which the overwritten state must not be in use."""
     params = bp.make_params(JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32)
     pids, traced = [], []
 
@@ -90,7 +90,7 @@ def test_a_large_batch_goes_in_blocks(monkeypatch, inputs):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
 
 
-def test_a_batch_that_asks_for_terms_gets_them(monkeypatch):
+def test_a_large_batch_returns_terms_on_request(monkeypatch):
     monkeypatch.setattr(backends, "LARGE", ENVS)
     pid = bp.BatchPID(bp.make_params(JOINTS, 3.0), ENVS, DT, "jax", terms=True)
     pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))

@@ -100,7 +100,7 @@ def test_per_inertia_scales_every_gain_and_nothing_else():
         np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
 
 
-def test_jax_gives_what_numpy_gives():
+def test_jax_and_numpy_agree():
     jnp = pytest.importorskip("jax.numpy")
     rng = np.random.default_rng(0)
     p = params(3, effort_limit=4.0)
@@ -114,7 +114,7 @@ def test_jax_gives_what_numpy_gives():
     np.testing.assert_allclose(on_numpy[1], on_jax[1], rtol=1e-5, atol=1e-5)
 
 
-def test_options_without_meaning_are_refused_by_name():
+def test_options_without_meaning_for_accelerations_are_refused():
     for options in (
         {"anti_windup": "back_calculation", "effort_limit": 1.0},
         {"effort_rate_limit": 3.0},

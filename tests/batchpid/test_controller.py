@@ -1,4 +1,4 @@
-"""BatchPID: the shell checks, remembers, and is the law on either backend."""
+"""BatchPID: checks of arguments, the state between calls, and agreement with the law on either backend."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ def kind(request):
     return request.param
 
 
-def test_calls_are_the_law(kind, options, inputs):
+def test_calls_equal_steps_of_the_law(kind, options, inputs):
     params = bp.make_params(JOINTS, **options)
     pid = bp.BatchPID(params, ENVS, DT, kind, terms=True)
     state = bp.init(params, inputs.measurement[0])
@@ -33,7 +33,7 @@ def test_calls_are_the_law(kind, options, inputs):
     assert [leaf is None for leaf in pid.state] == [leaf is None for leaf in state]
 
 
-def test_jax_compiles_once_and_leaves_what_it_was_given(inputs, x64, caplog):
+def test_jax_compiles_once_and_donates_the_state_but_no_input(inputs, x64, caplog):
     pid = bp.BatchPID(PARAMS, ENVS, DT, "jax")
     y = jax.numpy.asarray(inputs.measurement[0])
     pid(inputs.setpoint[0], y)
@@ -51,7 +51,7 @@ def test_jax_compiles_once_and_leaves_what_it_was_given(inputs, x64, caplog):
     assert y.shape == np.asarray(y).shape, "the caller's array is alive"
 
 
-def test_float32_comes_out_where_it_is_asked_for(kind):
+def test_efforts_have_the_dtype_of_the_params(kind):
     pid = bp.BatchPID(PARAMS.replace(dtype=np.float32), ENVS, DT, kind)
     assert pid(1.0, np.zeros((ENVS, JOINTS))).dtype == np.float32
 
@@ -72,8 +72,8 @@ def test_reset_and_track(kind, inputs):
     assert not np.asarray(pid.state.integral).any()
 
 
-def test_a_change_of_gains_with_track_has_no_bump(kind, inputs):
-    """A larger kp would jump; track with the last effort carries it over."""
+def test_track_makes_a_change_of_gains_bumpless(kind, inputs):
+    """A larger kp alone would make the effort jump."""
     pid = bp.BatchPID(bp.make_params(JOINTS, 4.0, 1.0, 0.1), ENVS, DT, kind)
     r, y = inputs.setpoint[0], inputs.measurement[0]
     before = np.array(pid(r, y))
@@ -148,12 +148,12 @@ def test_wrong_controllers_are_refused(arguments, said):
         bp.BatchPID(*arguments)
 
 
-def test_jax_is_named_where_it_is_missing(monkeypatch):
+def test_a_missing_jax_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(bp.MissingDependencyError, match=r"batchpid\[jax\]"):
         bp.BatchPID(PARAMS, ENVS, DT, "jax")
 
 
-def test_import_is_light():
+def test_import_loads_no_optional_package():
     code = "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -43,7 +43,7 @@ def random_chain(seed, joints=4, poses=5):
 @given(
     inertia=st.floats(1e-6, 1e3), hertz=st.floats(0.1, 20), zeta=st.floats(0.2, 2), ti=st.none() | st.floats(0.05, 5)
 )
-def test_gains_are_the_textbooks(inertia, hertz, zeta, ti):
+def test_gains_follow_the_equations(inertia, hertz, zeta, ti):
     w = 2 * np.pi * hertz
     gains = pid_from_inertia([inertia], hertz, zeta, integral_time=ti)
     np.testing.assert_allclose(gains["kp"], inertia * w**2)
@@ -84,7 +84,7 @@ def test_designed_gains_are_stable_at_every_pose(seed, units):
     assert (tau <= np.maximum(FILTER_SHARE / w, FILTER_STEPS * DT) * 1.01).all()
 
 
-def test_a_step_settles_as_said_without_overshoot():
+def test_a_step_settles_within_two_periods_without_overshoot():
     robot = Chain(np.diag([0.01, 3.0])[None])
     params = bp.design_gains(robot, 2.0, gain_units="effort")
     q, v = np.zeros((1, 2)), np.zeros((1, 2))

@@ -10,7 +10,7 @@ from batchpid.metrics import step_metrics
 from batchpid.trajectories import minimum_jerk
 
 
-def test_params_show_what_is_on():
+def test_params_show_the_options_that_are_on():
     params = bp.make_params(7, [40, 50, 60, 70, 80, 87, 87], 5, 2, effort_limit=87, anti_windup="conditional")
     assert repr(params) == "PIDParams(7 joints, kp 40 to 87, ki 5, kd 2, effort within ±87, anti-windup conditional)"
     limited = bp.make_params(
@@ -50,7 +50,7 @@ def test_figures_and_trajectories_show_their_ranges():
 
 
 @pytest.mark.filterwarnings("error")
-def test_trees_of_other_leaves_have_a_representation():
+def test_trees_of_any_leaves_have_a_representation():
     params = bp.make_params(2, 1.0, effort_limit=2.0, continuous=True)
     for tree in (
         jax.tree.map(lambda leaf: object(), params),

@@ -1,4 +1,4 @@
-"""drive_target: a PD drive whose target the integral moves is a PID."""
+"""drive_target: a PD drive with a target moved by the integral is a PID."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from law_cases import DT, ENVS, JOINTS
 import batchpid as bp
 
 
-def test_the_drive_gives_the_law_s_effort(inputs):
+def test_a_drive_with_a_moving_target_gives_the_effort_of_the_law(inputs):
     params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="conditional")
     state = other = bp.init(params, inputs.measurement[0])
     for t in range(20):
@@ -17,7 +17,7 @@ def test_the_drive_gives_the_law_s_effort(inputs):
         np.testing.assert_allclose(np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12)
 
 
-def test_no_stiffness_moves_no_target():
+def test_without_stiffness_the_target_is_the_setpoint():
     params = bp.make_params(JOINTS, [0.0, 1.0, 2.0], 5.0)
     y = np.zeros((ENVS, JOINTS))
     state = bp.init(params, y)
@@ -29,7 +29,7 @@ def test_no_stiffness_moves_no_target():
 
 
 @pytest.mark.parametrize("ki", [0.0, 20.0])
-def test_integral_action_takes_the_sag_away(ki):
+def test_integral_action_removes_the_sag_under_load(ki):
     """A mass on an implicit spring-damper under a constant load: PD leaves load/stiffness, PID nothing."""
     params = bp.make_params(1, 30.0, ki, 8.0, effort_limit=50.0, anti_windup="conditional")
     x, v = np.zeros((1, 1)), np.zeros((1, 1))

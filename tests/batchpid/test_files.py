@@ -32,6 +32,6 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_versions_are_of_what_is_installed():
+def test_versions_are_those_of_installed_packages():
     versions = package_versions(("numpy", "no-such-package"))
     assert versions == {"python": platform.python_version(), "numpy": np.__version__}

@@ -83,7 +83,7 @@ def test_terms_add_up(options, inputs):
         assert terms.finite.all()
 
 
-def test_a_dropped_option_is_the_law_without_it(inputs):
+def test_an_option_with_a_neutral_value_is_off(inputs):
     """Neutral values are off: same structure and same bits as leaving the option out."""
     plain = bp.make_params(JOINTS, kp=3.0, ki=1.0, kd=0.2)
     neutral = bp.make_params(
@@ -104,7 +104,7 @@ def test_a_dropped_option_is_the_law_without_it(inputs):
     assert sum(isinstance(leaf, np.ndarray) for leaf in plain) == 3
 
 
-def test_an_option_that_is_on_matters(options, inputs):
+def test_every_option_that_is_on_changes_the_efforts(options, inputs):
     """Every case of the table changes the efforts of a plain PID, so that no test of it is empty."""
     if set(options) <= {"kp", "ki", "kd"}:
         pytest.skip("a plain PID")

@@ -1,4 +1,4 @@
-"""What must hold of the law for all numbers."""
+"""Properties of the law for all numbers."""
 
 import math
 
@@ -52,7 +52,7 @@ def test_effort_stays_within_its_limits_and_rate(case, run):
 @given(seeds)
 @settings(max_examples=20)
 def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
-    """However long the error pushes; the bound is what the limits and the other terms allow."""
+    """For an error of any duration, by the limits and the other terms."""
     rng = np.random.default_rng(seed)
     kp, ki, limit = rng.uniform(0, 10), rng.uniform(0.1, 50), rng.uniform(0.1, 10)
     params = bp.make_params(1, kp, ki, effort_limit=limit, anti_windup=strategy)
@@ -97,8 +97,8 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
 
 
 @given(runs, st.sampled_from([np.nan, np.inf, -np.inf]), st.integers(0, 2), st.sampled_from(["zero", "hold"]))
-def test_a_non_finite_input_stays_where_it_is(run, bad, which, policy):
-    """Its state is kept, its effort is 0 or the last, the mask says so, and the others change by no bit."""
+def test_a_non_finite_input_affects_its_joint_alone(run, bad, which, policy):
+    """Its state is kept, its effort is 0 or the last, the mask marks it, and the others are bit-identical."""
     params = bp.make_params(
         JOINTS, **LIMITED, anti_windup="back_calculation", derivative_filter_time=0.02, non_finite=policy
     )
@@ -117,7 +117,7 @@ def test_a_non_finite_input_stays_where_it_is(run, bad, which, policy):
     assert all(a is None or a[1, 2] == b[1, 2] for a, b in zip(ill[2], ill[3], strict=True))
 
 
-def test_opposite_infinities_and_huge_numbers_are_told_apart():
+def test_huge_finite_numbers_do_not_count_as_non_finite():
     params = bp.make_params(2, 1e-9, non_finite="zero")
     r, y = np.array([[np.inf, 1e308]]), np.array([[np.inf, 1e308]])
     _, effort, terms = bp.step(params, bp.init(params, np.ones((1, 2))), r, y, DT, terms=True)
@@ -125,7 +125,7 @@ def test_opposite_infinities_and_huge_numbers_are_told_apart():
     assert effort.tolist() == [[0, 0]]
 
 
-def test_without_the_option_a_nan_is_passed_on():
+def test_without_the_option_a_nan_propagates_in_its_joint():
     params = bp.make_params(2, 1.0, 1.0, 1.0, effort_limit=3.0, anti_windup="conditional")
     y = np.array([[0.0, np.nan]])
     _, effort, terms = bp.step(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT, terms=True)
@@ -155,7 +155,7 @@ def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates)
     np.testing.assert_allclose(again, effort, rtol=1e-6, atol=1e-6)
 
 
-def test_track_needs_an_integral_and_where_it_integrates_first_a_time_step():
+def test_track_needs_an_integral_and_a_time_step_to_integrate_first():
     y = np.zeros((1, 2))
     params = bp.make_params(2, 1.0)
     with pytest.raises(bp.InvalidArgumentError, match=r"ki.*no integral can carry"):
@@ -176,7 +176,7 @@ def test_a_change_of_ki_is_bumpless(run, ki):
 
 @pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
 @pytest.mark.parametrize("weights", [{}, {"setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}], ids=str)
-def test_a_turn_more_or_less_is_no_event(turns, weights):
+def test_whole_turns_of_a_continuous_joint_change_no_term(turns, weights):
     """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or D."""
     params = bp.make_params(1, 3.0, 2.0, 0.5, continuous=True, **weights)
     rng = np.random.default_rng(3)
@@ -234,7 +234,7 @@ def test_the_first_step_has_no_derivative_kick():
 
 
 @given(cases, runs, npst.arrays(bool, ENVS), st.booleans())
-def test_reset_starts_the_chosen_envs_anew_and_no_other(case, run, mask, keep):
+def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):
     params = bp.make_params(JOINTS, **OPTIONS[case])
     state = roll(params, *run)[0][-1]
     fresh = bp.init(params, run[1][0])
@@ -247,8 +247,8 @@ def test_reset_starts_the_chosen_envs_anew_and_no_other(case, run, mask, keep):
 
 
 @given(cases, runs)
-def test_nothing_given_is_written_to_or_kept(case, run):
-    """Read-only arrays will do, and a caller may reuse its buffers."""
+def test_arguments_are_neither_written_to_nor_kept(case, run):
+    """Read-only arrays are accepted, and a caller may reuse its buffers."""
     params = bp.make_params(JOINTS, **OPTIONS[case])
     r, y, ff = (x.copy() for x in run)
     expected = roll(params, r, y, ff)[1][-1]
@@ -269,7 +269,7 @@ def test_nothing_given_is_written_to_or_kept(case, run):
 
 
 @pytest.mark.parametrize("dt", [0, 0.0, -1e-3, math.nan, math.inf])
-def test_a_time_step_that_is_none_is_refused(dt):
+def test_a_time_step_that_is_not_positive_and_finite_is_refused(dt):
     params = bp.make_params(1, 1.0)
     y = np.zeros((1, 1))
     with pytest.raises(bp.InvalidArgumentError, match="dt: must be positive"):

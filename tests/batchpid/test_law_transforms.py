@@ -39,7 +39,7 @@ def rollout(params, setpoint, measurement):
     return jax.lax.scan(body, bp.init(params, measurement[0]), (setpoint, measurement))[1]
 
 
-def test_every_transform(options, inputs, dtype):
+def test_jit_scan_vmap_and_grad_over_every_option(options, inputs, dtype):
     params = on_jax(bp.make_params(JOINTS, **options, dtype=dtype), dtype)
     r, y = (jnp.asarray(x, dtype) for x in (inputs.setpoint, inputs.measurement))
     tolerance = {"rtol": 1e-12, "atol": 1e-11} if dtype == np.float64 else {"rtol": 1e-4, "atol": 3e-4}
@@ -133,7 +133,7 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
     [{"anti_windup": "clamp"}, {"anti_windup": "back_calculation"}, {"anti_windup": "conditional", "ki": 0.0}],
     ids=str,
 )
-def test_gains_may_be_traced_while_the_params_are_built(build, strategy, inputs, x64):
+def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, inputs, x64):
     """The gradient through make_params and replace is that through the leaves, eager, compiled and vectorised."""
     options = {"ki": 5.0, "kd": [0.0, 2.0, 1.0], "effort_limit": 9.0, "derivative_filter_time": 0.01} | strategy
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
@@ -204,7 +204,7 @@ def test_an_option_that_is_traced_is_on():
     assert traced == [build(0.5)]
 
 
-def test_numpy_params_may_meet_traced_arrays_anywhere(inputs, x64):
+def test_numpy_and_traced_arguments_may_be_mixed(inputs, x64):
     """Each of params, state and inputs may be NumPy while another is traced."""
     params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="back_calculation")
     r, y = inputs.setpoint[0], inputs.measurement[0]

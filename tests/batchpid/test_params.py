@@ -1,4 +1,4 @@
-"""make_params: broadcasting, what is off, and errors that name the culprit."""
+"""make_params: broadcasting, options that are off, and errors that name option, joint, env and value."""
 
 import copy
 import pickle
@@ -22,7 +22,7 @@ def test_scalars_and_vectors_broadcast():
     assert params.for_envs(slice(1, 2)).kp is params.kp
 
 
-def test_params_are_values():
+def test_params_are_read_only_copies():
     """Read-only, not views of what was given, and they survive pickle and copy."""
     gains = np.ones(3)
     params = bp.make_params(3, gains, anti_windup="conditional", effort_limit=1.0, ki=1.0)
@@ -41,7 +41,7 @@ def test_options_build_the_same_params(options):
         assert all(np.array_equal(a, b) for a, b in zip(params, again, strict=True) if isinstance(a, np.ndarray))
 
 
-def test_replace_changes_what_it_says():
+def test_replace_changes_the_given_options_alone():
     params = bp.make_params(2, 1.0, 1.0, effort_limit=5.0, anti_windup="back_calculation")
     changed = params.replace(kp=[3.0, 4.0], effort_limit=2.0)
     assert changed.kp.tolist() == [[3, 4]]
@@ -97,14 +97,14 @@ def test_bad_options_are_named(options, said):
         bp.make_params(**({"joints": 3, "kp": 1.0, "ki": 1.0} | options))
 
 
-def test_joints_are_named_where_names_are_known():
+def test_errors_use_the_joint_names():
     with pytest.raises(bp.InvalidArgumentError, match="kp, joint 'elbow'") as caught:
         bp.make_params(2, [1.0, -1.0], joint_names=["shoulder", "elbow"])
     error = caught.value
     assert (error.argument, error.joint, error.env, error.value) == ("kp", "elbow", None, -1.0)
 
 
-def test_every_env_has_its_row():
+def test_params_for_another_number_of_envs_are_refused():
     params = bp.make_params(JOINTS, np.ones((ENVS, JOINTS)))
     params.check(ENVS)
     with pytest.raises(bp.InvalidArgumentError, match=r"params\.kp: has shape"):

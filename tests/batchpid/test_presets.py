@@ -90,8 +90,8 @@ def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, di
 
 
 @given(series, gain, gain)
-def test_simple_pid_maps_the_errors_of_angles_as_ours_wraps_them(path, kp, ki):
-    """P and I; its D spikes, see below."""
+def test_simple_pid_with_an_error_map_equals_a_continuous_joint_without_d(path, kp, ki):
+    """P and I alone: its D spikes, see below."""
     assume(all(abs(math.remainder(r - y, 2 * math.pi)) < math.pi - 1e-6 for r, y in path))
     peer = simple_pid.PID(kp, ki, sample_time=None, error_map=lambda e: math.remainder(e, 2 * math.pi))
     expected = []
@@ -101,8 +101,8 @@ def test_simple_pid_maps_the_errors_of_angles_as_ours_wraps_them(path, kp, ki):
     close(run(presets.simple_pid(1, kp, ki, continuous=True), path), expected)
 
 
-def test_simple_pid_goes_from_manual_to_automatic_as_ours():
-    """Its way, an integral of the last output, is a state of ours; track is the bumpless one."""
+def test_simple_pid_from_manual_to_automatic_is_a_state_with_that_integral():
+    """It sets the integral to the last output; track makes the change bumpless."""
     peer = simple_pid.PID(2.0, 1.0, 0.0, setpoint=1.0, sample_time=None, output_limits=(-3, 3), auto_mode=False)
     peer.set_auto_mode(True, last_output=2.5)
     params = presets.simple_pid(1, 2.0, 1.0, 0.0, output_limits=(-3, 3))
@@ -113,7 +113,7 @@ def test_simple_pid_goes_from_manual_to_automatic_as_ours():
     assert bp.step(params, tracked, y * 0 + 1, y, DT)[1].item() == pytest.approx(2.5, abs=1e-9)
 
 
-def test_simple_pid_spikes_where_an_angle_wraps_and_ours_does_not():
+def test_a_continuous_joint_has_no_derivative_spike_where_simple_pid_has_one():
     def shortest(error):
         return math.remainder(error, 2 * math.pi)
 
@@ -182,11 +182,11 @@ def test_newton(path, kp, ki, kd, integral_max, limit):
     close(run(params, path, measurement_rate=v, setpoint_rate=v_d, feedforward=ff), expected)
 
 
-# What control_toolbox's changelog lists as regressions, each as a promise of ours.
+# Regressions that control_toolbox's changelog lists.
 
 
 def test_the_integral_does_not_wind_up_behind_its_clamp():
-    """Clamped is the state itself, so that it comes back at once (control_toolbox #34)."""
+    """The state is clamped, so that it leaves its limit at once (control_toolbox #34)."""
     params = bp.make_params(1, 0.0, 10.0, integral_limit=1.0)
     efforts = run(params, [(1.0, 0.0)] * 500 + [(-1.0, 0.0)] * 21)
     assert efforts[499] == 1.0
@@ -208,8 +208,8 @@ def test_integral_gain_alone_with_back_calculation_is_finite():
     assert efforts[-1] == pytest.approx(1.0 - 5.0 * DT), "it leaves saturation in the step after"
 
 
-def test_garbage_leaves_the_state_alone():
-    """A time step of 0 raises, a NaN is stepped over, and neither comes back later (control_toolbox #326)."""
+def test_a_refused_time_step_and_a_nan_leave_the_state_unchanged():
+    """A time step of 0 raises, a NaN is skipped, and neither has a later effect (control_toolbox #326)."""
     params = bp.make_params(1, 1.0, 2.0, 0.5, effort_limit=9.0, non_finite="hold")
     y = np.zeros((1, 1))
     state, _ = bp.step(params, bp.init(params, y), y + 1, y, DT)

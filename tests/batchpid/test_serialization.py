@@ -1,4 +1,4 @@
-"""Params survive a file exactly, and a file from a stranger is at worst refused."""
+"""Params survive a file exactly, and a malformed or malicious file is refused."""
 
 import json
 
@@ -24,7 +24,7 @@ def same(a, b):
 
 @pytest.mark.parametrize("suffix", [".yaml", ".yml", ".json"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_every_option_survives(options, dtype, suffix, tmp_path):
+def test_every_option_survives_a_file(options, dtype, suffix, tmp_path):
     params = bp.make_params(JOINTS, **options, dtype=dtype)
     path = tmp_path / f"params{suffix}"
     bp.save_params(path, params, NAMES)
@@ -35,7 +35,7 @@ def test_every_option_survives(options, dtype, suffix, tmp_path):
 
 
 @given(npst.arrays(float, (2, JOINTS), elements=st.floats(0, 1e300)), st.sampled_from([".yaml", ".json"]))
-def test_numbers_survive_exactly(tmp_path_factory, gains, suffix):
+def test_numbers_survive_a_file_exactly(tmp_path_factory, gains, suffix):
     path = tmp_path_factory.mktemp("params") / f"params{suffix}"
     params = bp.make_params(JOINTS, gains)
     bp.save_params(path, params, NAMES)
@@ -128,7 +128,7 @@ def test_yaml_executes_nothing_and_expands_nothing(text, tmp_path):
     assert not marker.exists()
 
 
-def test_what_cannot_be_saved_changes_no_file(tmp_path):
+def test_a_save_that_is_refused_changes_no_file(tmp_path):
     path = tmp_path / "params.json"
     path.write_text("precious")
     params = bp.make_params(JOINTS, 1.0)
@@ -142,7 +142,7 @@ def test_what_cannot_be_saved_changes_no_file(tmp_path):
         bp.load_params(tmp_path / "none.yaml")
 
 
-def test_json_is_json(tmp_path):
+def test_json_has_no_nonstandard_constants(tmp_path):
     path = tmp_path / "params.json"
     bp.save_params(path, bp.make_params(JOINTS, **OPTIONS["one limit"], dtype=np.float32), NAMES)
 
@@ -175,7 +175,7 @@ def test_bad_texts_are_refused():
 
 
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
-def test_about_comes_back_and_does_not_touch_the_params(tmp_path, suffix):
+def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     params = bp.make_params(2, [1.0, 2.0], 0.5, gain_units="mass_matrix")
     about = {"seed": 3, "versions": {"numpy": "2"}, "moves": ["a", "b"], "measurement_rate": True}
     with_about, without = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"

@@ -1,4 +1,4 @@
-"""The laws of point-to-point moves: they begin and end at rest where they should, and keep their limits."""
+"""Point-to-point moves begin and end at rest at the given positions, and keep their limits."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_minimum_jerk_is_symmetric_and_peaks_at_fifteen_eighths():
     np.testing.assert_allclose(t.acceleration.max(), 10 / np.sqrt(3), rtol=1e-5)
 
 
-def test_envs_are_independent_of_their_company():
+def test_an_env_moves_alone_as_it_does_among_others():
     rng = np.random.default_rng(0)
     start, target = rng.normal(size=(2, 5, 3))
     both = trapezoidal(start, target, DT, **LIMITS)
@@ -99,7 +99,7 @@ def test_envs_are_independent_of_their_company():
 
 
 @each_move
-def test_no_way_to_go_is_one_tick_of_rest(move):
+def test_a_move_of_no_distance_rests(move):
     t = move(np.ones((2, 3)), np.ones(3))
     if t.ticks > 1:  # a duration was asked for
         assert np.isclose(t.time[-1], 0.77, atol=DT)
@@ -107,7 +107,7 @@ def test_no_way_to_go_is_one_tick_of_rest(move):
     assert not t.velocity.any()
 
 
-def test_moves_follow_one_another_and_hold():
+def test_trajectories_can_be_joined_and_held():
     there = minimum_jerk([0.0, 0.0], [1.0, 2.0], DT, duration=0.1)
     back = minimum_jerk([1.0, 2.0], [0.0, 0.0], DT, duration=0.1)
     t = there.hold(0.02).then(back)
@@ -160,7 +160,7 @@ class TestJerkLimited:
         jerk = np.diff(t.acceleration, axis=0, prepend=0) / DT
         assert (np.abs(jerk) <= 40 + 1e-6).all()
 
-    def test_it_is_no_faster_than_the_trapezoid_that_ignores_jerk(self):
+    def test_it_is_no_faster_than_the_trapezoid_without_a_jerk_limit(self):
         loose = {name: limit for name, limit in JERK_LIMITS.items() if name != "max_jerk"}
         target = np.array([1.0, -2.0])
         smooth = jerk_limited(np.zeros(2), target, DT, **JERK_LIMITS)

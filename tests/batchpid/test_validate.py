@@ -1,4 +1,4 @@
-"""Checks of arguments: what passes comes back in its canonical form, what does not is named."""
+"""Checks of arguments: a good value is returned in its canonical form, a bad one is named."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def test_a_good_value_comes_back_in_its_canonical_form(checked, expected):
         (lambda: validate.file_path("out", "a\0b"), "out: must be a path"),
         (lambda: validate.file_path("out", "run.txt", (".npz", ".h5")), "out: unknown file .* end it in .npz or .h5"),
         (lambda: validate.array("qpos", "a", (3, 2), JOINTS), "qpos: cannot be read as an array of numbers"),
-        (lambda: validate.array("qpos", [1], (3, 2), JOINTS), r"qpos: has shape \(1,\), needs \(3, 2\) or \(2,\)"),
+        (lambda: validate.array("qpos", [1], (3, 2), JOINTS), r"qpos: has shape \(1,\), not \(3, 2\) or \(2,\)"),
         (lambda: validate.array("qpos", [1, np.inf], (3, 2), JOINTS), "qpos, joint 'elbow', env 0: is not finite"),
         (lambda: validate.array("qpos", [1, np.inf], (1, 2), JOINTS), "qpos, joint 'elbow': is not finite .got inf."),
         (lambda: validate.broadcast("kp", [1, 2, 3], (2, 2)), r"kp: has shape \(3,\), which does not broadcast"),
@@ -74,7 +74,7 @@ def test_a_bad_value_is_named_with_its_remedy(checked, said):
         checked()
 
 
-def test_traced_arrays_are_told_from_concrete_ones():
+def test_is_traced_is_true_for_traced_arrays_alone():
     seen = []
     jax.jit(lambda x: seen.append(validate.is_traced(x)))(jnp.ones(2))
     assert seen == [True]
