@@ -67,15 +67,18 @@ def _obj(data: bytes) -> bool:
 
 
 def _dae(data: bytes) -> bool:
-    """Well-formed, with coordinates and faces, and no count above what the file can hold."""
+    """Well-formed, with faces, as many coordinates as it says, and no count beyond them."""
     root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
-    faces = [kind for kind in ("triangles", "polylist", "polygons", "tristrips", "trifans") if _first(root, kind)]
-    counts = [int(element.get("count", 0)) for element in root.iter(etree.Element)]
-    return bool(faces) and _first(root, "float_array") and 0 <= min(counts) <= max(counts) <= len(data)
-
-
-def _first(root: etree._Element, kind: str) -> bool:
-    return root.find(f"{{*}}library_geometries//{{*}}{kind}") is not None
+    geometry = "{*}library_geometries//{*}"
+    arrays, accessors = root.findall(geometry + "float_array"), root.findall(geometry + "accessor")
+    faces = [face for kind in ("triangles", "polylist", "polygons") for face in root.findall(geometry + kind)]
+    sizes = {"#" + array.attrib["id"]: len((array.text or "").split()) for array in arrays}
+    complete = all(int(array.attrib["count"]) == sizes["#" + array.attrib["id"]] for array in arrays)
+    ends = [int(each.attrib["count"]) * int(each.get("stride", 1)) + int(each.get("offset", 0)) for each in accessors]
+    inside = all(0 <= end <= sizes[each.attrib["source"]] for end, each in zip(ends, accessors, strict=True))
+    counted = all(0 < int(face.attrib["count"]) <= len(data) for face in faces)
+    counted &= all("".join((index.text or "").split()).isdigit() for face in faces for index in face.iter("{*}p"))
+    return bool(arrays and faces) and complete and inside and counted
 
 
 def _glb(data: bytes) -> bool:
