@@ -1,12 +1,12 @@
-"""What holds for every test."""
+"""Settings of every test."""
 
 import signal
 
 from hypothesis import HealthCheck, settings
 
-# How long an example takes tells how busy the machine is, and nothing about the code.
+# No deadline: the time of an example depends on the load of the machine.
 settings.register_profile("patient", settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
-# Where tests run in the background of a script, Ctrl-C comes ignored, and so it would for the programs they start.
+# A background job of a script ignores SIGINT, and so would the programs that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
