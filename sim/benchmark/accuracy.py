@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
-from sim.engine.building import SceneSpec, parse
+from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS, Physics
 from sim.loop.arrays import Command
@@ -139,7 +139,7 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     if solver is None:
         plant = EquationOfMotion(robot.dynamics(), robot.damping, moves.start, finer.timestep)
     else:
-        plant = Pack(parse(finer), finer, len(moves.start), system_size=4)
+        plant = Pack(finer, len(moves.start), system_size=4)
         plant.write_state(range(plant.size), moves.start, np.zeros_like(moves.start))
     control = PIDControl(spec, robot.tuned(), plant)
     control.begin(Command(moves.target), steps)

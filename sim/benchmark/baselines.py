@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from sim.benchmark.workload import Case, Workload
-from sim.engine.building import parse
 from sim.engine.pack import Pack
 from sim.workers.pool import pinned_cores
 from sim.workers.worker import ONE_THREAD
@@ -117,9 +116,8 @@ class _DriveLoop:
         spec, settings = workload.scene(gravity=False), tutorial_settings(workload.robot)
         size, self._in_turn = ENGINES[name]
         self._start, self._substeps = workload.start, workload.substeps
-        builder = parse(spec)
         sizes = [min(size, share - first) for first in range(0, share, size)]
-        self._packs = [Pack(builder, spec, count, system_size=size, isolates=False) for count in sizes]
+        self._packs = [Pack(spec, count, system_size=size, isolates=False) for count in sizes]
         for pack in self._packs:
             pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
             pack.write_drive_target(np.tile(workload.target, (pack.size, 1)))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.reference import SimplePID
-from sim.engine.building import headless_scene
+from sim.engine.user_content import HeadlessScene
 from sim.robot.description import Settings
 from sim.robot.robot import Robot
 
@@ -47,7 +47,7 @@ class TutorialLoop:
         start: Float64 | None = None,
     ) -> None:
         settings = tutorial_settings(robot)
-        self.scene = headless_scene()
+        self.scene = HeadlessScene()
         self.scene.set_timestep(1 / settings.rate_hz)
         self.scene.add_ground(0, render=False)
         loader = self.scene.create_urdf_loader()

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,17 +40,18 @@ class SceneSpec:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
+@lru_cache(maxsize=8)
 def parse(spec: SceneSpec) -> ArticulationBuilder:
-    """Return a builder that makes any number of copies of the robot.
+    """Return a builder that makes any number of copies of the robot, the same object for equal specs.
 
     Raises
     ------
     RobotError
         SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
-    loader = headless_scene().create_urdf_loader()
+    loader = HeadlessScene().create_urdf_loader()
     loader.fix_root_link = spec.fixed_base
-    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf) as srdf:
+    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf or "<robot/>") as srdf:
         try:
             builders, actors, _ = loader.parse(urdf, srdf)
         except Exception as error:
@@ -90,24 +92,12 @@ def _ignore_contacts_within_bodies(builder: ArticulationBuilder) -> None:
 
 
 @contextmanager
-def _in_memory(text: str | None) -> Iterator[str]:
-    """Provide ``text`` under a path, which SAPIEN's loader requires; the file is in memory and ends with the process.
-
-    The path is empty where there is no text.
-    """
-    if text is None:
-        yield ""
-        return
+def _in_memory(text: str) -> Iterator[str]:
+    """Provide ``text`` under a path, as SAPIEN's loader requires; the file is in memory and ends with the process."""
     with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         yield f"/proc/self/fd/{file.fileno()}"
-
-
-def headless_scene(system: Any = None) -> HeadlessScene:
-    """Return a scene without a render system, in ``system`` or in a new PhysX system under the present settings."""
-    # sapien.Scene() would build a render system, which fails (and can crash the process) without a device.
-    return HeadlessScene([physx.PhysxCpuSystem() if system is None else system])
 
 
 @contextmanager
@@ -141,7 +131,7 @@ def new_system(spec: SceneSpec) -> Any:
     return system
 
 
-def build_scene(builder: ArticulationBuilder, spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
+def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of ``spec``.
 
     Raises
@@ -150,9 +140,10 @@ def build_scene(builder: ArticulationBuilder, spec: SceneSpec, system: Any) -> t
         SAPIEN cannot build a collision shape, which it would silently leave out, or numbers the joints in another order
         than ours.
     """
-    scene = headless_scene(system)
+    scene, builder = HeadlessScene(system), parse(spec)
     with engine_settings(spec):
         robot = builder.set_scene(scene).build()
+        builder.set_scene(None)  # the scene can be freed
         if spec.ground:
             scene.add_ground(0.0, render=False)
     asked = {link.name: link.collision_records for link in builder.link_builders}

@@ -24,11 +24,11 @@ class Dynamics:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        builder, self._system = parse(spec), new_system(replace(spec, timestep=1e-6))
-        self._scene, self._robot = build_scene(builder, spec, self._system)
+        self._system = new_system(replace(spec, timestep=1e-6))
+        self._scene, self._robot = build_scene(spec, self._system)
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
-        bodies = rigid_bodies(builder)
+        bodies = rigid_bodies(parse(spec))
         # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
 

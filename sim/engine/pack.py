@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from sim.engine.building import SceneSpec, build_scene, engine_settings, link_extents, new_system, set_collision_group
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
@@ -42,15 +41,9 @@ class Pack:
     """
 
     def __init__(
-        self,
-        builder: ArticulationBuilder,
-        spec: SceneSpec,
-        size: int,
-        first_env: int = 0,
-        system_size: int = 8,
-        isolates: bool = True,
+        self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
     ) -> None:
-        self._builder, self.spec = builder, spec
+        self.spec = spec
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates
@@ -77,7 +70,7 @@ class Pack:
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``."""
-        return build_scene(self._builder, self.spec, system)
+        return build_scene(self.spec, system)
 
     def _bind(self) -> None:
         """Store the bound methods that every sim step calls, which is cheaper than looking them up."""

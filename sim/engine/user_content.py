@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import sapien
 from numpy.typing import NDArray
-from sapien.physx import PhysxArticulationLinkComponent, PhysxRigidDynamicComponent
+from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRigidDynamicComponent
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
@@ -24,7 +24,14 @@ class _HeadlessBuilder(ActorBuilder):
 
 
 class HeadlessScene(sapien.Scene):
-    """Scene whose visuals and lights are left out, so that code written for a screen runs without a render device."""
+    """Scene in ``system``, or in a new PhysX system under the present settings, that needs no render device.
+
+    Visuals and lights are left out, so that code written for a screen runs.
+    """
+
+    def __init__(self, system: PhysxCpuSystem | None = None) -> None:
+        # Without a list of systems SAPIEN builds a render system, which fails without a device, or ends the process.
+        super().__init__([PhysxCpuSystem() if system is None else system])
 
     def create_actor_builder(self) -> Any:
         """Return a builder of actors for this scene."""

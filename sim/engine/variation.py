@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import scene_dynamics
@@ -43,17 +42,9 @@ class Variation:
 class VariedPack(Pack):
     """Pack whose robots differ from the model by ``variation``, one entry for each of its scenes."""
 
-    def __init__(
-        self,
-        builder: ArticulationBuilder,
-        spec: SceneSpec,
-        size: int,
-        first_env: int,
-        system_size: int,
-        variation: Variation,
-    ) -> None:
+    def __init__(self, spec: SceneSpec, size: int, first_env: int, system_size: int, variation: Variation) -> None:
         self._variation, self._model, self._resolution = variation, scene_dynamics(spec), variation.resolution
-        super().__init__(builder, spec, size, first_env, system_size)
+        super().__init__(spec, size, first_env, system_size)
         self._pending = np.zeros((size, self.dof)) if variation.late else None
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from sim.engine.building import SceneSpec, parse
+from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.engine.variation import VariedPack
 from sim.loop.arrays import Arrays, Command
@@ -57,7 +57,6 @@ class Loop:
             fixed_base=robot.fixed_base,
             build=options.build,
         )
-        self._builder = parse(self._scene)
         self._steps = 0
         count, pack_size = envs.stop - envs.start, options.scenes_per_system
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
@@ -68,9 +67,9 @@ class Loop:
         variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start
         first = self._first_env + envs.start
         if variation is None:
-            return Pack(self._builder, self._scene, size, first, pack_size)
+            return Pack(self._scene, size, first, pack_size)
         varied = variation.for_envs(slice(first, first + size))
-        return VariedPack(self._builder, self._scene, size, first, pack_size, varied)
+        return VariedPack(self._scene, size, first, pack_size, varied)
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""

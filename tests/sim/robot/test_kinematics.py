@@ -11,7 +11,7 @@ from tiny_urdf import link, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.engine.building import SceneSpec, build_scene, new_system, parse
+from sim.engine.building import SceneSpec, build_scene, new_system
 from sim.engine.physics import PHYSICS
 from sim.robot.kinematics import Kinematics
 from sim.robot.rotations import about, from_rpy, multiply, rotate
@@ -46,7 +46,7 @@ def random_qpos(robot, count):
 
 def test_link_poses_are_those_of_sapien(robot):
     spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
-    _scene, reference = build_scene(parse(spec), spec, new_system(spec))
+    _scene, reference = build_scene(spec, new_system(spec))
     kinematics = Kinematics(robot)
     qpos = random_qpos(robot, 40)
     ours = kinematics.poses(qpos)
