@@ -236,16 +236,19 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
 def _read_npz(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Return all arrays of an .npz file, each read to its end, where its checksum is verified."""
     tables = {}
-    with zipfile.ZipFile(path) as archive:
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
+        file.seek(-22 - len(archive.comment), os.SEEK_END)  # to the end record, whose count zipfile does not check
+        if int.from_bytes(file.read(12)[10:], "little") != len(members):
+            raise ValueError("its list of arrays is damaged")
         if (total := sum(member.file_size for member in members)) > max_bytes:
             raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")
         for member in members:
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError(f"its {member.filename} is compressed in an unknown way")
-            with archive.open(member) as file:
-                tables[member.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
-                if file.read(1):
+            with archive.open(member) as array:
+                tables[member.filename.removesuffix(".npy")] = np.lib.format.read_array(array, allow_pickle=False)
+                if array.read(1):
                     raise ValueError(f"its {member.filename} is longer than it says")
     return tables
 
