@@ -193,7 +193,8 @@ def default_params(robot: Robot, control: ControlMode = "pid") -> bp.PIDParams:
     """Return the params of a runner that is given none.
 
     - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
-    - ``"drive"``: the drive gains of a bundled robot's settings, else ``robot.designed("effort")``;
+    - ``"drive"``: the drive gains of a bundled robot's settings, else those of ``robot.designed("effort")`` without
+      ki: a drive has no setpoint weight, so that the integral would overshoot;
     - ``"effort"``: zero gains and the robot's effort limits.
 
     Raises
@@ -206,6 +207,6 @@ def default_params(robot: Robot, control: ControlMode = "pid") -> bp.PIDParams:
     settings = robot.settings
     if control == "drive":
         if settings is None:
-            return robot.designed("effort")
+            return robot.designed("effort").replace(ki=0.0)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
     return robot.designed() if settings is None else robot.tuned()

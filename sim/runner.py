@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
+from operator import methodcaller
 from pathlib import Path
 from time import strftime
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,7 +20,6 @@ from batchpid.validate import array, env_mask, instance, integer, read_array, wi
 from batchpid.versions import package_versions
 from sim.loop.arrays import Arrays, Command
 from sim.loop.faults import Fault, FaultLog
-from sim.loop.loop import Loop
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
@@ -121,6 +121,8 @@ class Runner:
         self.robot, self.num_envs, self.control = options.robot, options.num_envs, options.control
         self.timestep, self.substeps = options.timestep, options.substeps
         self._params = options.check_params(default_params(robot, control) if params is None else params)
+        self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
+        self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
         self._steps = self._steps_since_checkpoint = 0
         self._faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
@@ -189,16 +191,13 @@ class Runner:
         substeps
             Sim steps of this tick; default the runner's.
         """
-        self._open_pool()
+        pool = self._open_pool()
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
         command = self._command(
-            (self.num_envs, self.robot.dof),
-            ("setpoint", setpoint),
-            ("setpoint_rate", setpoint_rate),
-            ("feedforward", feedforward),
-        )
-        self._run(command.map(lambda rows: rows[None]), count)
-        return self.observe()
+            self._shape, setpoint=setpoint, setpoint_rate=setpoint_rate, feedforward=feedforward
+        ).map(lambda rows: rows[None])
+        self._run(pool, command, count)
+        return _copy(pool.present)
 
     def rollout(
         self,
@@ -230,19 +229,16 @@ class Runner:
             )
         ticks = shape[0]
         command = self._command(
-            (ticks, self.num_envs, dof),
-            ("setpoints", setpoints),
-            ("setpoint_rates", setpoint_rates),
-            ("feedforwards", feedforwards),
+            (ticks, *self._shape), setpoints=setpoints, setpoint_rates=setpoint_rates, feedforwards=feedforwards
         )
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
         for tick in range(ticks) if progress is None else progress(range(ticks)):
             if tick == done:
-                done = min(ticks, tick + self._max_ticks())
+                done = min(ticks, tick + self._max_ticks(pool))
                 part = slice(tick, done)
-                self._run(command.map(lambda rows, part=part: rows[part]), self.substeps)
+                self._run(pool, command.map(lambda rows, part=part: rows[part]), self.substeps)
                 for table, rows in zip(seen, pool.arrays.observation, strict=True):
                     table[part] = rows[: done - tick]
         info = replace(info, faults=tuple(self.faults))
@@ -357,11 +353,6 @@ class Runner:
         workers = [] if self._pool is None else self._pool.workers
         return tuple(worker.pid for worker in workers if worker.pid is not None)
 
-    @property
-    def loop(self) -> Loop | None:
-        """Loop of a runner with ``workers=0``, for inspection; None where it is in worker processes."""
-        return self._open_pool().workers[0].loop
-
     def close(self) -> None:
         """End the workers and free the scenes. May be called again."""
         if self._pool is not None:
@@ -384,9 +375,9 @@ class Runner:
 
     # -- inside --------------------------------------------------------------------------------------------------
 
-    def _run(self, command: Command, substeps: int) -> None:
+    def _run(self, pool: WorkerPool, command: Command, substeps: int) -> None:
         """Run ticks under ``command`` (ticks, envs, dof)."""
-        pool, every = self._open_pool(), self.options.checkpoint_steps
+        every = self.options.checkpoint_steps
         if every is not None and self._steps_since_checkpoint >= every:
             self.snapshot()
         ticks = len(command.setpoint)
@@ -399,9 +390,9 @@ class Runner:
                 time = (before + done * substeps) * self.timestep
                 self.recorder.append(time, command.setpoint[done - 1], _copy(arrays))
 
-    def _max_ticks(self) -> int:
+    def _max_ticks(self, pool: WorkerPool) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
-        most, every = len(self._open_pool().ticks), self.options.checkpoint_steps
+        most, every = len(pool.ticks), self.options.checkpoint_steps
         if every is None:
             return most
         left = every - self._steps_since_checkpoint % every
@@ -423,30 +414,29 @@ class Runner:
         self._pool.settle()
         return self._pool
 
-    def _command(
-        self, shape: tuple[int, ...], setpoint: tuple[str, ArrayLike], *optional: tuple[str, ArrayLike | None]
-    ) -> Command:
-        """Return the command of ``shape`` (..., envs, dof) given by arguments with their names, checked."""
-
-        def read(name: str, value: ArrayLike) -> NDArray[np.float64]:
-            rows = read_array(name, value)
-            rows = rows[:, None] if rows.ndim == len(shape) - 1 == 2 else rows  # (ticks, dof): for all envs alike
-            return array(name, rows, shape, self.robot.joint_names, finite=self.options.on_invalid_input == "raise")
-
-        rows = (None if value is None else read(name, value) for name, value in optional)
-        command = Command(read(*setpoint), *rows)
+    def _command(self, shape: tuple[int, ...], **given: ArrayLike | None) -> Command:
+        """Return the command of ``shape`` (..., envs, dof), checked; the first argument, a setpoint, is required."""
+        rows: list[NDArray[np.float64] | None] = []
+        for name, value in given.items():
+            if value is None and rows:
+                rows.append(None)
+                continue
+            table: Any = value
+            if len(shape) == 3 and np.ndim(read_array(name, table)) == 2:
+                table = np.asarray(table)[:, None]  # (ticks, dof): for all envs alike
+            rows.append(array(name, table, shape, self._joint_names, finite=self._finite))
+        command = Command(*rows)
         if self.control != "effort":
             self._limits.check("setpoint", command.setpoint, stacklevel=4)
         return command
 
     def _state(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         """Return positions or velocities (envs, dof) to reset to, checked."""
-        names, shape = self.robot.joint_names, (self.num_envs, self.robot.dof)
-        if self.options.on_invalid_input == "raise":
-            return within(name, array(name, value, shape, names), _FARTHEST, names)
-        rows = array(name, value, shape, names, finite=False)
+        rows = array(name, value, self._shape, self._joint_names, finite=self._finite)
+        if self._finite:
+            return within(name, rows, _FARTHEST, self._joint_names)
         return np.where(np.abs(rows) > _FARTHEST, np.nan, rows)
 
 
 def _copy(arrays: Arrays) -> Observation:
-    return Observation._make(rows.copy() for rows in arrays.observation)
+    return Observation._make(map(methodcaller("copy"), arrays.observation))

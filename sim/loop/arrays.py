@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,9 +68,6 @@ class Arrays(NamedTuple):
 
     def at(self, index: Any) -> Arrays:
         """Return views at an index of the leading axes, such as a tick or a slice of envs."""
-        command, observation, fault = self
-        return Arrays(
-            Command(*(rows[index] for rows in command)),
-            Observation(*(rows[index] for rows in observation)),
-            FaultArrays(*(rows[index] for rows in fault)),
-        )
+        part = itemgetter(index)
+        command, observation, fault = (map(part, group) for group in self)
+        return Arrays(Command._make(command), Observation._make(observation), FaultArrays._make(fault))

@@ -42,8 +42,7 @@ class RecoveryWarning(UserWarning):
 class _Slot:
     """Worker, its env slice and its pending requests."""
 
-    index: int
-    envs: slice
+    start: Start
     worker: Worker
     queue: deque[Request] = field(default_factory=deque)
     phase: Literal["idle", "transfer", "waiting"] = "waiting"
@@ -61,7 +60,7 @@ class WorkerPool:
     """
 
     def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
-        self._options, self._params = options, params
+        self._options = options
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
         self._kind = ProcessWorker if count else LocalWorker
         slices = split_envs(options.num_envs, count, options.scenes_per_system)
@@ -69,7 +68,7 @@ class WorkerPool:
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
         self._poller = select.poll()
-        self._request: Request = Start()
+        self._request: Request | None = None
         self._warning: str | None = None
         self._closing = False
         self._owner, self._user = os.getpid(), 0  # the process, and the thread in a call
@@ -85,9 +84,9 @@ class WorkerPool:
         """The tick that holds the present observation."""
         try:
             for index, envs in enumerate(slices):
-                slot = _Slot(index, envs, self._make_worker(index, envs))
-                self._slots.append(slot)
-                self._await_start(slot)
+                start = Start(index, envs, options, params.for_envs(envs))
+                self._slots.append(_Slot(start, self._kind(start, self._shared)))
+                self._await_start(self._slots[-1])
             self._finish()
         except BaseException:
             self.close()
@@ -156,7 +155,7 @@ class WorkerPool:
     def start_replay_from(self, request: Request) -> None:
         """Drop the requests kept so far: ``request`` brings a new worker to the present state."""
         if self._options.recover:
-            self._replay = [request]
+            self._replay = [request.copy()]
 
     def close(self) -> None:
         """End all workers: processes at once if they have a request, a loop in this process after the running call."""
@@ -216,8 +215,9 @@ class WorkerPool:
             raise ClosedError("this Runner was closed during a call")
         if errors:
             raise next((error for error in errors if not _left_unchanged(error)), errors[0])
-        if self._request.observed_tick is not None:
-            self.present = self.ticks[self._request.observed_tick]
+        tick = None if self._request is None else self._request.observed_tick
+        if tick is not None:
+            self.present = self.ticks[tick]
 
     def _attempt(self, slot: _Slot, act: Callable[[_Slot], None], errors: list[Exception]) -> None:
         try:
@@ -231,7 +231,7 @@ class WorkerPool:
 
     def _send(self, slot: _Slot) -> None:
         slot.phase = "transfer"
-        slot.worker.send(slot.queue[0].for_envs(slot.envs))
+        slot.worker.send(slot.queue[0].for_envs(slot.start.envs))
         slot.phase = "waiting"
 
     def _receive(self, slot: _Slot) -> None:
@@ -246,8 +246,8 @@ class WorkerPool:
             slot.losses = 0
 
     def _check_alive(self, slot: _Slot) -> None:
-        request, num_envs = slot.queue[0], slot.envs.stop - slot.envs.start
-        slot.worker.check_alive(request.idle_limit, self._options.timeout + request.limit(num_envs))
+        request, envs = slot.queue[0], slot.start.envs
+        slot.worker.check_alive(request.idle_limit, self._options.timeout + request.limit(envs.stop - envs.start))
 
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
         """Wait briefly; return the busy slots whose worker has answered or died."""
@@ -265,8 +265,8 @@ class WorkerPool:
             raise ClosedError("this Runner was closed during a call") from error
         if not self._options.recover:
             raise WorkerLost(
-                f"{str(error) or f'worker {slot.index} was interrupted'}; its envs are lost, because recovery is off: "
-                "pass recover=True"
+                f"{str(error) or f'worker {slot.start.index} was interrupted'}; its envs are lost, because recovery is "
+                "off: pass recover=True"
             ) from error
         slot.losses += 1
         if slot.losses >= MAX_LOSSES:
@@ -276,20 +276,17 @@ class WorkerPool:
         if slot.losses == 1:
             slot.cause, slot.lost_at = str(error), time.monotonic()
         slot.worker.close(0.0)
-        slot.worker = self._make_worker(slot.index, slot.envs)
+        slot.worker = self._kind(slot.start, self._shared)
         self._await_start(slot)
         slot.queue.extend(self._replay)
-        if not self._request.is_replayed:
+        if self._request is not None and not self._request.is_replayed:
             slot.queue.append(self._request)
-
-    def _make_worker(self, index: int, envs: slice) -> Worker:
-        return self._kind(self._options, self._params.for_envs(envs), envs, index, self._shared)
 
     def _await_start(self, slot: _Slot) -> None:
         """Wait for the loop of a new worker first."""
-        slot.phase, slot.queue = "waiting", deque([Start()])
+        slot.phase, slot.queue = "waiting", deque([slot.start])
         if self._cores:
-            slot.worker.pin(self._cores[slot.index])
+            slot.worker.pin(self._cores[slot.start.index])
         self._poller = select.poll()
         for descriptor in (worker.fileno() for worker in self.workers):
             if descriptor is not None:

@@ -16,6 +16,7 @@ import batchpid as bp
 from sim.loop.arrays import Arrays, Command
 from sim.loop.loop import Loop
 from sim.loop.snapshot import EnvStates, Snapshot
+from sim.options import RunnerOptions
 
 _RUN = struct.Struct("<cII??")  # b"R", ticks, substeps, use_rate, use_feedforward
 
@@ -68,14 +69,24 @@ def decode(message: bytes) -> Request:
 
 @dataclass(frozen=True)
 class Start(Request):
-    """Build the loop. A new worker does it without being asked."""
+    """Build the loop of ``envs``; a new worker does it before any other request, without being sent it."""
+
+    index: int
+    """Of the worker."""
+    envs: slice
+    options: RunnerOptions
+    params: bp.PIDParams
+    """Of these envs."""
 
     def limit(self, num_envs: int) -> float:
-        """Return an upper bound of the seconds: mostly imports, from a disk that may be slow."""
-        return 60.0 + super().limit(num_envs)
+        return 60.0 + super().limit(num_envs)  # mostly imports, from a disk that may be slow
 
     def apply(self, loop: Loop) -> None:
-        """Do nothing more."""
+        pass
+
+    def build(self, arrays: Arrays) -> Loop:
+        """Return the loop, with the shared arrays (ticks, envs, ...) of all envs."""
+        return Loop(self.options, self.params, self.envs, arrays.at((slice(None), self.envs)))
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,6 @@ class Reset(Request):
     observed_tick = 0
 
     def apply(self, loop: Loop) -> None:
-        """Reset the loop."""
         loop.reset(self.mask, self.qpos, self.qvel)
 
 
@@ -111,36 +121,29 @@ class Run(Request):
 
     @property
     def observed_tick(self) -> int:
-        """The last tick."""
         return self.ticks - 1
 
     def _with(self, command: Command) -> Self:
         return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
 
     def limit(self, num_envs: int) -> float:
-        """Return an upper bound of the seconds: a sim step of an env takes about 20 us."""
-        return 1e-3 * self.ticks * self.substeps * num_envs
+        return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
     def for_envs(self, envs: slice) -> Self:
-        """Return the part of some envs."""
         return self._with(self.command.map(lambda rows: rows[:, envs]))
 
     def copy(self) -> Self:
-        """Return a copy that later writes to the caller's arrays do not change."""
         return self._with(self.command.map(np.copy))
 
     def write(self, arrays: Arrays) -> None:
-        """Write the commands to the arrays of their ticks."""
         for table, rows in zip(arrays.command, self.command, strict=True):
             if rows is not None:
                 table[: self.ticks] = rows
 
     def encode(self) -> bytes:
-        """Return the message, without the commands."""
         return _RUN.pack(b"R", self.ticks, self.substeps, self.use_rate, self.use_feedforward)
 
     def apply(self, loop: Loop) -> float:
-        """Run the ticks; return the seconds of work."""
         return loop.run(self.ticks, self.substeps, self.use_rate, self.use_feedforward)
 
 
@@ -151,7 +154,6 @@ class SetParams(Request):
     params: bp.PIDParams
 
     def apply(self, loop: Loop) -> None:
-        """Set the loop's params."""
         loop.set_params(self.params)
 
 
@@ -160,7 +162,6 @@ class TakeSnapshot(Request):
     """Read the state of every env, and go on as if restored from it."""
 
     def apply(self, loop: Loop) -> EnvStates:
-        """Return the states."""
         return loop.snapshot()
 
 
@@ -172,7 +173,6 @@ class Restore(Request):
     observed_tick = 0
 
     def apply(self, loop: Loop) -> None:
-        """Restore the loop."""
         loop.restore(self.snapshot)
 
 
@@ -183,7 +183,6 @@ class ReadContentSizes(Request):
     is_replayed = False
 
     def apply(self, loop: Loop) -> list[int]:
-        """Return one number per env."""
         return loop.content_sizes()
 
 
@@ -194,5 +193,4 @@ class ReadPoses(Request):
     is_replayed = False
 
     def apply(self, loop: Loop) -> list[NDArray[np.float32]]:
-        """Return (entities, 7) per env."""
         return loop.poses()

@@ -19,7 +19,6 @@ from typing import Any
 
 from batchpid.errors import BatchPIDError
 from sim.loop.arrays import Arrays
-from sim.loop.loop import Loop
 from sim.workers.channel import Channel
 from sim.workers.requests import decode
 from sim.workers.shared_memory import SharedArrays
@@ -55,10 +54,9 @@ def _exit_with(parent: int) -> None:
 
 
 def _serve(connection: Channel, memory: int) -> None:
-    options, params, envs, layout = pickle.loads(connection.receive())
-    arrays = Arrays.from_fields(SharedArrays(layout, memory).arrays).at((slice(None), envs))
+    start, layout = pickle.loads(connection.receive())
     try:
-        loop = Loop(options, params, envs, arrays)
+        loop = start.build(Arrays.from_fields(SharedArrays(layout, memory).arrays))
     except Exception as error:
         connection.send(_failure(error))
         return

@@ -24,14 +24,11 @@ from typing import Any
 
 import cloudpickle
 
-import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 from sim.loop.arrays import Arrays
-from sim.loop.loop import Loop
-from sim.options import RunnerOptions
 from sim.workers.channel import Channel
 from sim.workers.liveness import Liveness
-from sim.workers.requests import Request
+from sim.workers.requests import Request, Start
 from sim.workers.serve import DONE
 from sim.workers.shared_memory import SharedArrays
 
@@ -54,8 +51,6 @@ class Worker(ABC):
 
     pid: int | None = None
     """Process id; None: this process."""
-    loop: Loop | None = None
-    """The loop, if it is in this process."""
 
     @abstractmethod
     def send(self, request: Request) -> None:
@@ -75,7 +70,7 @@ class Worker(ABC):
 
     @abstractmethod
     def close(self, patience: float) -> None:
-        """Free the scenes; a process that has not ended after ``patience`` seconds is killed."""
+        """Free the scenes, and end the process; one that has not ended after ``patience`` seconds is killed."""
 
     def fileno(self) -> int | None:
         """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""
@@ -98,25 +93,19 @@ class Worker(ABC):
 class LocalWorker(Worker):
     """Loop in this process."""
 
-    def __init__(
-        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, index: int, shared: SharedArrays
-    ) -> None:
-        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), envs))
-        self.loop: Loop = Loop(options, params, envs, self._arrays)
+    def __init__(self, start: Start, shared: SharedArrays) -> None:
+        self._loop = start.build(Arrays.from_fields(shared.arrays))
         self._result: Any = None
 
     def send(self, request: Request) -> None:
-        """Execute a request."""
-        request.write(self._arrays)
-        self._result = request.apply(self.loop)
+        request.write(self._loop.arrays)
+        self._result = request.apply(self._loop)
 
     def receive(self) -> Any:
-        """Return the result of the last request."""
         return self._result
 
     def close(self, patience: float) -> None:
-        """Free the scenes."""
-        self.loop.close()
+        self._loop.close()
 
 
 class ProcessWorker(Worker):
@@ -124,13 +113,18 @@ class ProcessWorker(Worker):
 
     pid: int
 
-    def __init__(
-        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, index: int, shared: SharedArrays
-    ) -> None:
-        message = _encode_loop(options, params, envs, shared)
-        self._name = f"worker {index} (%senvs {envs.start} to {envs.stop - 1})"
+    def __init__(self, start: Start, shared: SharedArrays) -> None:
+        try:
+            message = cloudpickle.dumps((start, shared.layout))  # it includes a ``build`` that cannot be imported
+        except Exception as error:
+            raise InvalidArgumentError(
+                "build",
+                f"cannot be sent to a worker process: {error}",
+                remedy="let the function use nothing that cannot be pickled, or pass workers=0",
+            ) from error
+        self._name = f"worker {start.index} (%senvs {start.envs.start} to {start.envs.stop - 1})"
         self._owner = os.getpid()
-        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), envs))
+        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), start.envs))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
         try:
             with contextlib.ExitStack() as undo:
@@ -156,11 +150,9 @@ class ProcessWorker(Worker):
             raise
 
     def fileno(self) -> int:
-        """Return the file descriptor that becomes readable when there is a result, or the process has ended."""
         return self._channel.fileno()
 
     def send(self, request: Request) -> None:
-        """Send a request."""
         request.write(self._arrays)
         self._liveness.begin()
         try:
@@ -169,7 +161,6 @@ class ProcessWorker(Worker):
             raise self._death() from error
 
     def receive(self) -> Any:
-        """Wait for the result of the last request and return it."""
         try:
             message = self._channel.receive()
         except (EOFError, OSError) as error:
@@ -184,7 +175,6 @@ class ProcessWorker(Worker):
         return result
 
     def check_alive(self, idle_limit: float, limit: float) -> None:
-        """Check a process that has not answered yet."""
         liveness = self._liveness
         liveness.sample(time.monotonic())
         if liveness.idle > (_STOP_LIMIT if liveness.stopped else idle_limit):
@@ -194,7 +184,6 @@ class ProcessWorker(Worker):
             raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 
     def close(self, patience: float) -> None:
-        """End the process: close its socket, and kill it if it has not ended after ``patience`` seconds."""
         self._channel.close()
         if os.getpid() == self._owner:  # a fork of the parent must not end the parent's workers
             try:
@@ -207,7 +196,6 @@ class ProcessWorker(Worker):
             self._trace = -1
 
     def pin(self, core: int) -> None:
-        """Run on one core only."""
         with contextlib.suppress(OSError):  # it died, or the core is no longer ours
             os.sched_setaffinity(self.pid, {core})
 
@@ -224,18 +212,6 @@ class ProcessWorker(Worker):
             time.sleep(0.05)
         trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
         return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
-
-
-def _encode_loop(options: RunnerOptions, params: bp.PIDParams, envs: slice, shared: SharedArrays) -> bytes:
-    """Return the first message; cloudpickle includes a ``build`` that the worker cannot import."""
-    try:
-        return cloudpickle.dumps((options, params, envs, shared.layout))
-    except Exception as error:
-        raise InvalidArgumentError(
-            "build",
-            f"cannot be sent to a worker process: {error}",
-            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
-        ) from error
 
 
 def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:

@@ -1,4 +1,4 @@
-"""Messages arrive whole and in order, and whoever waits for the other side can end the wait."""
+"""Messages arrive whole and in order, and a callback can end the wait for the other side."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from sim.workers.channel import Channel
 
 
-class Enough(Exception):
+class WaitEnded(Exception):
     pass
 
 
@@ -22,8 +22,8 @@ def ends():
         yield ours, theirs
 
 
-def give_up():
-    raise Enough
+def end_wait():
+    raise WaitEnded
 
 
 def messages():
@@ -32,9 +32,9 @@ def messages():
     return [random.bytes(size) for size in sizes]
 
 
-@pytest.mark.parametrize("patient", [True, False])
-def test_messages_of_any_size_arrive_as_they_were_sent(ends, patient):
-    first, second = Channel(ends[0], (lambda: None) if patient else None), Channel(ends[1])
+@pytest.mark.parametrize("on_wait", [None, lambda: None])
+def test_messages_of_any_size_arrive_unchanged(ends, on_wait):
+    first, second = Channel(ends[0], on_wait), Channel(ends[1])
 
     def echo():
         for _ in messages():
@@ -48,23 +48,23 @@ def test_messages_of_any_size_arrive_as_they_were_sent(ends, patient):
     thread.join()
 
 
-def test_some_messages_at_once(ends):
-    first, second = Channel(ends[0], give_up), Channel(ends[1])
+def test_messages_sent_together_are_received_one_by_one(ends):
+    first, second = Channel(ends[0], end_wait), Channel(ends[1])
     for text in (b"a", b"", b"bc"):
         second.send(text)
     assert [first.receive() for _ in range(3)] == [b"a", b"", b"bc"]
 
 
-def test_waits_can_be_ended(ends):
-    channel = Channel(ends[0], give_up)
-    with pytest.raises(Enough):
+def test_the_callback_ends_a_wait(ends):
+    channel = Channel(ends[0], end_wait)
+    with pytest.raises(WaitEnded):
         channel.receive()
-    with pytest.raises(Enough):
+    with pytest.raises(WaitEnded):
         channel.send(bytes(10_000_000))  # which nobody takes
 
 
-def test_a_gone_other_side_is_told(ends):
-    channel = Channel(ends[0], give_up)
+def test_a_closed_other_side_raises(ends):
+    channel = Channel(ends[0], end_wait)
     ends[1].sendall(b"half a h")
     ends[1].close()
     with pytest.raises(EOFError):

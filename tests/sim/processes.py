@@ -1,0 +1,18 @@
+"""Processes of tests: waiting for their end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+import psutil
+
+
+def have_ended(pids: Iterable[int], seconds: float = 5.0) -> bool:
+    """Wait for processes to end, so long at most; return whether they have."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if not any(psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie" for pid in pids):
+            return True
+        time.sleep(0.02)
+    return False

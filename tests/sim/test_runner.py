@@ -1,0 +1,105 @@
+"""Runner: its options, its params where none are given, and its repr."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import tiny_urdf
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner, RunnerOptions
+from sim.options import default_params
+from sim.tuning.randomization import draw_variation
+
+
+def same(first, second):
+    return first.options().keys() == second.options().keys() and all(
+        np.array_equal(value, second.options()[name]) for name, value in first.options().items()
+    )
+
+
+@pytest.fixture
+def hinge(tmp_path):
+    """A robot that is not bundled: one joint."""
+    return Robot.load(tiny_urdf.write(tmp_path, tiny_urdf.one_joint()))
+
+
+def test_a_bundled_robot_is_given_its_tuned_params(panda):
+    with Runner(panda, 1, workers=0) as runner:
+        assert same(runner.params, panda.tuned())
+
+
+def test_another_robot_is_given_designed_params(hinge):
+    with Runner(hinge, 1, workers=0) as runner:
+        assert same(runner.params, hinge.designed())
+
+
+def test_a_drive_is_given_the_bundled_gains_or_designed_ones(panda, hinge):
+    bundled = default_params(panda, "drive")
+    assert (bundled.kp == panda.settings.drive_stiffness).all()
+    assert (bundled.kd == panda.settings.drive_damping).all()
+    assert same(default_params(hinge, "drive"), hinge.designed("effort").replace(ki=0.0))
+
+
+@pytest.mark.parametrize("name", ["panda", "hinge"])
+def test_control_by_effort_is_given_effort_limits(name, request):
+    robot = request.getfixturevalue(name)
+    params = default_params(robot, "effort")
+    assert not params.kp.any()
+    np.testing.assert_array_equal(params.effort_max, np.atleast_2d(robot.effort_limit))
+
+
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_a_robot_that_is_not_bundled_reaches_its_setpoint_without_params(hinge, control):
+    with Runner(hinge, 2, workers=0, control=control, ground=False) as runner:
+        rollout = runner.rollout(np.full((200, 1), 0.5))
+    np.testing.assert_allclose(rollout.qpos[-1], 0.5, atol=1e-3)
+    assert rollout.qpos.max() < 0.55
+
+
+def test_a_bundled_robot_reaches_the_tutorials_target_without_params(panda):
+    with Runner(panda, 1, workers=0) as runner:
+        rollout = runner.rollout(np.broadcast_to(panda.settings.target, (200, panda.dof)))
+    np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=1e-3)
+
+
+def test_a_floating_robot_needs_no_params():
+    with Runner(Robot.load("panda", fixed_base=False), 1, workers=0) as runner:
+        assert runner.step(runner.robot.start).ok.all()
+
+
+def test_the_runner_takes_every_option_by_its_name_and_default():
+    parameters = dict(inspect.signature(Runner).parameters)
+    del parameters["params"]
+    options = inspect.signature(RunnerOptions).parameters
+    assert list(parameters) == list(options) == [field.name for field in fields(RunnerOptions)]
+    for name, parameter in parameters.items():
+        assert parameter.default == options[name].default, name
+        assert parameter.kind == options[name].kind, name
+
+
+def test_options_are_plain_values_of_their_documented_type(panda):
+    options = RunnerOptions(panda, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2)
+    assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (int, int, float)
+    np.testing.assert_array_equal(options.speed_limit, np.full(panda.dof, 2.0))
+
+
+def test_a_variation_turns_off_recovery_and_checkpoints(panda):
+    options = RunnerOptions(panda, 3, variation=draw_variation(panda, 3))
+    assert not options.recover
+    assert options.checkpoint_steps is None
+    with pytest.raises(InvalidArgumentError, match="variation: is for 3 envs, not 4"):
+        RunnerOptions(panda, 4, variation=draw_variation(panda, 3))
+
+
+def test_its_repr_fits_two_lines(panda):
+    with Runner(panda, 2, params=panda.params(), workers=0) as runner:
+        runner.step(panda.start)
+        assert repr(runner) == (
+            "Runner(panda, 2 envs, in this process, control 'pid', compensate 'gravity+coriolis',\n"
+            "       physics 'accurate', timestep 0.0005 s, 20 substeps, at 0.01 s)"
+        )
+    assert "closed" in repr(runner)

@@ -1,0 +1,121 @@
+"""No worker process and no shared memory remains when a program ends, whatever ends it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from processes import have_ended
+
+PROGRAM = """
+import sys, numpy as np, warnings
+warnings.simplefilter("ignore")
+from sim import Robot, Runner
+robot = Robot.load("panda")
+runner = Runner(robot, 8, params=robot.params(), workers=2)
+print(*runner.pids, flush=True)
+{body}
+"""
+
+
+def start(body, **options):
+    """Start a program with a runner; return its process and the pids of its workers."""
+    text = PROGRAM.format(body=textwrap.dedent(body))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+    process = subprocess.Popen(
+        [sys.executable, "-c", text],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        **options,
+    )
+    pids = [int(pid) for pid in process.stdout.readline().split()]
+    assert len(pids) == 2, process.communicate()[1]
+    return process, pids
+
+
+LONG = "while True: runner.step(robot.settings.target, substeps=1000000)"
+SHORT = "while True: runner.step(robot.settings.target)"
+ENDS = [(number, LONG) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV)]
+ENDS += [(number, SHORT) for number in (signal.SIGINT, signal.SIGKILL)]
+
+
+@pytest.mark.parametrize(("number", "body"), ENDS)
+def test_workers_end_with_a_parent_that_gets_a_signal(number, body):
+    shared = set(os.listdir("/dev/shm"))
+    process, pids = start(body)
+    with process:
+        time.sleep(0.3)
+        process.send_signal(number)
+        error = process.communicate(timeout=20)[1]
+    assert have_ended(pids)
+    assert set(os.listdir("/dev/shm")) <= shared
+    if number == signal.SIGINT:
+        assert error.rstrip().endswith("KeyboardInterrupt")
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ("raise RuntimeError('the caller')", 1),
+        ("sys.exit(7)", 7),
+        ("runner.close(); runner.close(); sys.exit(3)", 3),
+        ("import os; os._exit(9)", 9),
+        ("runner.step(robot.settings.target); del runner; print('end')", 0),
+        ("f = Runner.__exit__; f(runner, None, None, None); print(runner.closed)", 0),
+    ],
+)
+def test_workers_end_with_their_runner_or_with_the_program(body, status):
+    process, pids = start(body)
+    with process:
+        error = process.communicate(timeout=30)[1]
+    assert process.returncode == status, error
+    assert have_ended(pids)
+    assert "Exception ignored" not in error
+
+
+def test_a_forked_child_does_not_end_the_workers_of_its_parent():
+    body = """
+    import os
+    child = os.fork()
+    if child == 0:
+        runner.close()
+        os._exit(0)
+    os.waitpid(child, 0)
+    print(runner.step(robot.settings.target).ok.all())
+    """
+    process, pids = start(body)
+    with process:
+        output, error = process.communicate(timeout=30)
+    assert output.strip() == "True", error
+    assert have_ended(pids)
+
+
+@pytest.mark.parametrize("kind", ["stdin", "script", "thread"])
+def test_programs_need_no_main_guard(kind, tmp_path):
+    text = PROGRAM.format(body="print(runner.step(robot.settings.target).ok.all(), len(runner.pids))")
+    if kind == "thread":
+        text = "import threading\ndef job():\n" + textwrap.indent(text, "    ")
+        text += "\nthread = threading.Thread(target=job); thread.start(); thread.join()"
+    script = tmp_path / "script.py"
+    script.write_text(text)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+    arguments = [sys.executable, "-"] if kind == "stdin" else [sys.executable, str(script)]
+    done = subprocess.run(
+        arguments,
+        input=text if kind == "stdin" else None,
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=tmp_path,
+        timeout=60,
+    )
+    assert done.stdout.splitlines()[-1] == "True 2", done.stderr
+    assert have_ended([int(pid) for pid in done.stdout.splitlines()[0].split()])
