@@ -20,11 +20,8 @@ from sim.robot.description import DISSIPATION, Joint, RobotDescription
 from sim.robot.stability import stability_report
 from sim.robot.urdf import mimic_works
 
-SEVERITIES = ("warning", "note")
-"""Probably not what is meant; good to know."""
-
-NEAR_BOUND = 0.5
-"""Share of the stability range above which gains are reported: the range is smaller in poses of less inertia."""
+SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
+NEAR_BOUND = 0.5  # share of the stability range above which gains are reported: other poses may have less inertia
 
 
 @dataclass(frozen=True)

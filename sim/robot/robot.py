@@ -100,7 +100,7 @@ class Robot(RobotDescription):
         timestep: float = 1 / 2000,
         control: str = "pid",
     ) -> list[Finding]:
-        """Return the findings of the preflight: oddities of this robot, and of running it this way.
+        """Return the findings of the preflight, most severe first: oddities of this robot and of running it this way.
 
         Parameters
         ----------
@@ -112,10 +112,6 @@ class Robot(RobotDescription):
             Time step of control and simulation [s].
         control
             ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`sim.Runner`.
-
-        Returns
-        -------
-        Findings, most severe first.
 
         Raises
         ------

@@ -12,15 +12,9 @@ def multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
     aw, ax, ay, az = (a[..., k] for k in range(4))
     bw, bx, by, bz = (b[..., k] for k in range(4))
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
+    w, x = aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by
+    y, z = aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw
+    return np.stack([w, x, y, z], axis=-1)
 
 
 def rotate(q: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:

@@ -21,14 +21,10 @@ from sim.robot.meshes import find_mesh
 from sim.robot.rotations import from_rpy, rotate
 from sim.robot.xml import numbers, parse_xml
 
-Vertices = NDArray[np.float64]
-Faces = NDArray[np.int64]
 Rgba = tuple[float, ...]
 
-DEVIATION = 2e-3
-"""Default distance allowed between a chord and its arc [m]."""
-FEWEST, MOST = 6, 48
-"""Bounds of the number of segments of a circle."""
+DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
+FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 _CYLINDER = ((0.0, -0.5), (1.0, -0.5), (1.0, -0.5), (1.0, 0.5), (1.0, 0.5), (0.0, 0.5))  # (radius, z), rims twice
 
@@ -38,8 +34,8 @@ class Surface(NamedTuple):
 
     link: str
     rgba: Rgba
-    vertices: Vertices
-    faces: Faces
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
 
 
 def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surface]:

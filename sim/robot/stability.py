@@ -24,20 +24,19 @@ Float64 = NDArray[np.float64]
 
 
 class StabilityReport(NamedTuple):
-    """Share of the stability range that the gains use at one pose; arrays are (dof,)."""
+    """Share of the stability range that the gains use at one pose; arrays are (dof,).
+
+    ``inertia``: I of each joint, with the others free [kg m^2 or kg]; ``kd_dt``: kd dt / I, as the filter passes it;
+    ``kp_dt2``: kp dt^2 / I; ``joint_ratio``, ``robot_ratio``: of each joint alone and of the whole robot, 1 is the
+    bound; ``participation``: share of each joint in the mode that is the first to become unstable.
+    """
 
     inertia: Float64
-    """I of each joint, with the others free [kg m^2 or kg]."""
     kd_dt: Float64
-    """kd dt / I, as the filter passes it."""
     kp_dt2: Float64
-    """kp dt^2 / I."""
     joint_ratio: Float64
-    """Ratio of each joint alone: 1 is the bound."""
     robot_ratio: float
-    """Ratio of the whole robot: 1 is the bound."""
     participation: Float64
-    """Share of each joint in the mode that is the first to become unstable."""
 
 
 def stability_report(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float) -> StabilityReport:

@@ -47,12 +47,8 @@ def numbers(
 ) -> tuple[float, ...]:
     """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing one.
 
-    They are finite and at most LARGEST in magnitude; those of a joint ``limit`` at most LARGEST_LIMIT, or infinite.
-
-    Raises
-    ------
-    RobotError
-        They are not; the message begins with ``where``.
+    They are finite and at most LARGEST in magnitude, those of a joint ``limit`` at most LARGEST_LIMIT or infinite, or a
+    RobotError is raised, whose message begins with ``where``.
     """
     text, count = default if element is None else element.get(key, default), len(default.split())
     largest = LARGEST_LIMIT if limit else LARGEST
