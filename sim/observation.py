@@ -50,7 +50,7 @@ class Observation(NamedTuple):
 
     def __repr__(self) -> str:
         envs, dof = self.qpos.shape[-2:]
-        return f"Observation({envs} envs, {dof} joints, {_sound(self.ok)})"
+        return f"Observation({envs} envs, {dof} joints, {_failed_envs(self.ok)})"
 
 
 OBSERVED: dict[str, Quantity] = {
@@ -187,9 +187,9 @@ class Rollout:
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
         end = f"up to {self.time[-1]:g} s" if ticks else "empty"
-        return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_sound(self.ok)})"
+        return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_failed_envs(self.ok)})"
 
 
-def _sound(ok: Bool) -> str:
+def _failed_envs(ok: Bool) -> str:
     failed = int((~ok.reshape(-1, ok.shape[-1]).all(0)).sum()) if ok.size else 0
     return f"{failed} failed" if failed else "all ok"

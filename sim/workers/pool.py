@@ -16,13 +16,13 @@ import warnings
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, Literal
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, WorkerError
 from sim.loop.arrays import Arrays
 from sim.options import RunnerOptions
+from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
 from sim.workers.shared_memory import SharedArrays
 from sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
@@ -46,7 +46,7 @@ class _Slot:
     worker: Worker
     queue: deque[Request] = field(default_factory=deque)
     phase: Literal["idle", "transfer", "waiting"] = "waiting"
-    """Of the first request; an interrupt during the transfer of a message leaves the worker unusable."""
+    """Phase of the first request. An interrupt during the transfer of a message leaves the worker unusable."""
     result: Any = None
     losses: int = 0
     cause: str = ""
@@ -62,7 +62,7 @@ class WorkerPool:
     def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
         self._options = options
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
-        self._kind = ProcessWorker if count else LocalWorker
+        self._is_local, self._make_worker = not count, ProcessWorker if count else LocalWorker
         slices = split_envs(options.num_envs, count, options.scenes_per_system)
         self._cores = pinned_cores(len(slices))
         self._replay: list[Request] = []
@@ -85,7 +85,7 @@ class WorkerPool:
         try:
             for index, envs in enumerate(slices):
                 start = Start(index, envs, options, params.for_envs(envs))
-                self._slots.append(_Slot(start, self._kind(start, self._shared)))
+                self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
                 self._await_start(self._slots[-1])
             self._finish()
         except BaseException:
@@ -160,7 +160,7 @@ class WorkerPool:
     def close(self) -> None:
         """End all workers: processes at once if they have a request, a loop in this process after the running call."""
         self._closing = True
-        if self._user and self._kind is LocalWorker:
+        if self._user and self._is_local:
             return  # its scenes are still in use by the running call
         slots, self._slots = self._slots, []
         for slot in slots:
@@ -252,7 +252,7 @@ class WorkerPool:
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
         """Wait briefly; return the busy slots whose worker has answered or died."""
         waiting = [slot for slot in busy if slot.phase == "waiting"]
-        if self._kind is LocalWorker:
+        if self._is_local:
             return waiting
         readable = {descriptor for descriptor, _ in self._poller.poll(1e3 * _POLL_INTERVAL)}
         return [slot for slot in waiting if slot.worker.fileno() in readable]
@@ -276,7 +276,7 @@ class WorkerPool:
         if slot.losses == 1:
             slot.cause, slot.lost_at = str(error), time.monotonic()
         slot.worker.close(0.0)
-        slot.worker = self._kind(slot.start, self._shared)
+        slot.worker = self._make_worker(slot.start, self._shared)
         self._await_start(slot)
         slot.queue.extend(self._replay)
         if self._request is not None and not self._request.is_replayed:
@@ -296,21 +296,3 @@ class WorkerPool:
 def _left_unchanged(error: Exception) -> bool:
     """Whether a loop raised this before it changed anything."""
     return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)
-
-
-def pinned_cores(workers: int) -> list[int]:
-    """Return one core for each worker if there are as many workers as cores; else none.
-
-    The kernel may wake two workers on the core of the parent and leave another core idle for milliseconds. Fewer
-    workers than cores are not pinned: those of several programs could get the same cores.
-    """
-    cores = sorted(os.sched_getaffinity(0))
-    return cores if workers == len(cores) else []
-
-
-def split_envs(num_envs: int, workers: int, pack_size: int) -> list[slice]:
-    """Return contiguous slices of envs, one for each worker, that do not split a pack."""
-    packs = -(-num_envs // pack_size)
-    count = max(1, min(workers, packs))
-    cuts = [min(num_envs, pack_size * (packs * k // count)) for k in range(count + 1)]
-    return [slice(low, high) for low, high in pairwise(cuts)]

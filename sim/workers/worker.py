@@ -122,7 +122,7 @@ class ProcessWorker(Worker):
                 f"cannot be sent to a worker process: {error}",
                 remedy="let the function use nothing that cannot be pickled, or pass workers=0",
             ) from error
-        self._name = f"worker {start.index} (%senvs {start.envs.start} to {start.envs.stop - 1})"
+        envs = f"envs {start.envs.start} to {start.envs.stop - 1}"
         self._owner = os.getpid()
         self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), start.envs))
         self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
@@ -136,10 +136,10 @@ class ProcessWorker(Worker):
                 undo.pop_all()
         except OSError as error:
             raise WorkerError(
-                f"{self._name % ''} cannot be started: {error}; pass a smaller workers=, 0 for none"
+                f"worker {start.index} ({envs}) cannot be started: {error}; pass a smaller workers=, 0 for none"
             ) from error
         self.pid = self._process.pid
-        self._name %= f"pid {self.pid}, "
+        self._name = f"worker {start.index} (pid {self.pid}, {envs})"
         self._liveness = Liveness(Path(f"/proc/{self.pid}/stat"))
         self._channel = Channel(ours, lambda: self.check_alive(*_TRANSFER_LIMITS))
         try:
