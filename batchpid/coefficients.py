@@ -49,12 +49,8 @@ class Coefficients(NamedTuple):
 def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches twice as fast.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If dt is a Python number that is not positive and finite.
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches twice as fast. A dt
+    that is a Python number must be positive and finite, else InvalidArgumentError is raised.
     """
     if isinstance(dt, int | float):
         positive("dt", dt, "s")

@@ -57,11 +57,7 @@ class BatchPID:
         terms: bool = False,
         joint_names: Sequence[str] | None = None,
     ) -> None:
-        self._backend, self._dt, self._keeps_terms = (
-            choice("backend", backend, BACKENDS),
-            positive("dt", dt, "s"),
-            terms,
-        )
+        self._backend, self._dt = choice("backend", backend, BACKENDS), positive("dt", dt, "s")
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
         self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
         self._engine = BACKENDS[self._backend](self._dt, terms)
@@ -125,7 +121,7 @@ class BatchPID:
     @property
     def terms(self) -> Terms | None:
         """Terms of the last call; None before the first."""
-        if not self._keeps_terms:
+        if not self._engine.terms:
             raise InvalidArgumentError("terms", "are not kept", remedy="build the BatchPID with terms=True")
         return self._terms
 
@@ -139,21 +135,17 @@ class BatchPID:
     ) -> Any:
         """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
 
-        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that.
-
-        Raises
-        ------
-        InvalidArgumentError
-            A shape is wrong. The state is unchanged.
+        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that. Where a shape is wrong,
+        InvalidArgumentError is raised and the state is unchanged.
         """
-        r, y = self._array("setpoint", setpoint), self._measurement(measurement)
+        r, y = self._array("setpoint", setpoint), self._array("measurement", measurement, exact=True)
         rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
         self._state, effort, self._terms = self._engine.step(self._started(y), r, y, *rest.values())
         return effort
 
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
         """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
-        y = self._measurement(measurement)
+        y = self._array("measurement", measurement, exact=True)
         mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
         self._state = self._engine.call(law.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
 
@@ -167,7 +159,11 @@ class BatchPID:
         feedforward: Any = None,
     ) -> None:
         """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
-        r, y, u = self._array("setpoint", setpoint), self._measurement(measurement), self._array("effort", effort)
+        r, y, u = (
+            self._array("setpoint", setpoint),
+            self._array("measurement", measurement, exact=True),
+            self._array("effort", effort),
+        )
         rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
         self._state = self._engine.call(bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest)
 
@@ -182,29 +178,23 @@ class BatchPID:
     def _optional(self, **values: Any) -> dict[str, Any]:
         return {name: None if value is None else self._array(name, value) for name, value in values.items()}
 
-    def _measurement(self, value: Any) -> Any:
-        array = self._numbers("measurement", value)
-        if array.shape != self._shape:
-            problem = f"has shape {array.shape}, not {self._shape}"
-            raise InvalidArgumentError("measurement", problem, remedy="give (num_envs, joints)")
-        return array
-
-    def _array(self, name: str, value: Any) -> Any:
-        array = self._numbers(name, value)
+    def _array(self, name: str, value: Any, exact: bool = False) -> Any:
+        """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is ``exact``-ly that."""
+        try:
+            array = self._engine.array(value)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            problem = f"cannot be read as an array of numbers: {error}"
+            raise InvalidArgumentError(name, problem, remedy="pass an array of numbers") from None
         if array.shape == self._shape:
             return array
+        if exact:
+            problem = f"has shape {array.shape}, not {self._shape}"
+            raise InvalidArgumentError(name, problem, remedy="give (num_envs, joints)")
         envs, joints = self._shape
         if array.ndim <= 2 and all(n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)):
             return array.reshape((1,) * (2 - array.ndim) + array.shape)
         problem = f"has shape {array.shape}, which does not broadcast to {self._shape}"
         raise InvalidArgumentError(name, problem, remedy="give one value, one per joint, or one per env and joint")
-
-    def _numbers(self, name: str, value: Any) -> Any:
-        try:
-            return self._engine.array(value)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            problem = f"cannot be read as an array of numbers: {error}"
-            raise InvalidArgumentError(name, problem, remedy="pass an array of numbers") from None
 
 
 def _checked(params: Any) -> PIDParams:

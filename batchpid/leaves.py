@@ -15,7 +15,7 @@ import numpy as np
 from batchpid.choices import CHOICES
 from batchpid.elementwise import namespace
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice, entries, integer, is_traced, names, read_array
+from batchpid.validate import at_least, choice, entries, integer, is_traced, names, read_array
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
 MOST_JOINTS = 100_000
@@ -47,11 +47,7 @@ class LeafBuilder:
         with np.errstate(over="ignore"):
             array = read_array(name, value, traced=True).astype(self.dtype)
         array = self._by_env_and_joint(name, array)
-        if not is_traced(array):
-            good = ((array > low) if above else (array >= low)) & (infinite | np.isfinite(array))
-            bound = f"{'>' if above else '>='} {low:g}" if math.isfinite(low) else "a number"
-            entries(name, array, good, f"must be {'' if infinite else 'finite and '}{bound}", self.names)
-        return array
+        return array if is_traced(array) else at_least(name, array, low, self.names, above=above, infinite=infinite)
 
     def option(self, name: str, value: Any, *, neutral: float, above: bool = False) -> Any:
         """Return an option's leaf: None where it is ``neutral`` on every joint of every env."""

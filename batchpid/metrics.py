@@ -85,6 +85,7 @@ class StepMetrics(NamedTuple):
         return self.over_envs(lambda column: np.quantile(column, 0.5, method="higher"))
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def step_metrics(
     dt: float,
     setpoint: ArrayLike,
@@ -153,9 +154,8 @@ def step_metrics(
     moves = size >= floor / band
     beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
     beyond = np.maximum(beyond, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        progress = 1.0 - final_error / move
-        overshoot = np.where(moves, beyond / size, np.nan)
+    progress = 1.0 - final_error / move
+    overshoot = np.where(moves, beyond / size, np.nan)
     high, low = _first_crossing(t, progress, 0.9), _first_crossing(t, progress, 0.1)
     rise = high - np.where(np.isfinite(high), low, 0.0)
     tail_rows = max(1, round(tail * len(t)))
@@ -173,7 +173,7 @@ def step_metrics(
         iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
         itae=judged(np.trapezoid(t[:, None, None] * np.abs(error), t, axis=0)),
         effort_peak=nothing if u is None else _or_inf(np.abs(u).max(0)),
-        effort_variation=nothing if u is None else _or_inf(_variation(u)),
+        effort_variation=nothing if u is None else _or_inf(np.abs(np.diff(u, axis=0)).sum(0)),
         saturation_share=nothing if limited is None else np.mean(limited, axis=0),
     )
 
@@ -183,8 +183,7 @@ def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
     reached = progress >= level
     k = np.maximum(np.argmax(reached, 0), 1)
     before, after = _row(progress, k - 1), _row(progress, k)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip((level - before) / (after - before), 0.0, 1.0)
+    share = np.clip((level - before) / (after - before), 0.0, 1.0)
     return np.where(reached.any(0), t[k - 1] + share * (t[k] - t[k - 1]), np.inf)
 
 
@@ -195,15 +194,9 @@ def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
     k = np.minimum(last, len(t) - 2)
     before, after = _row(error, k), _row(error, k + 1)
     edge = np.copysign(tolerance, before)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip((edge - before) / (after - before), 0.0, 1.0)
+    share = np.clip((edge - before) / (after - before), 0.0, 1.0)
     settled = np.where(outside[-1], np.inf, t[k] + share * (t[k + 1] - t[k]))
     return np.where(outside.any(0), settled, 0.0)
-
-
-def _variation(u: Float64) -> Float64:
-    with np.errstate(invalid="ignore"):
-        return np.abs(np.diff(u, axis=0)).sum(0)
 
 
 def _or_inf(figure: Float64) -> Float64:

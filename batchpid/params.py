@@ -18,7 +18,7 @@ from batchpid.choices import CHOICES, Everywhere
 from batchpid.display import params_summary
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import LeafBuilder
-from batchpid.validate import entries, is_traced
+from batchpid.validate import at_least, is_traced
 
 
 class PIDParams(NamedTuple):
@@ -140,11 +140,8 @@ class PIDParams(NamedTuple):
                     f"params.{name}", f"is {leaf.dtype}, but kp is {self.dtype}", remedy="use one dtype"
                 )
             if not is_traced(leaf):
-                array = np.asarray(leaf)
-                if name in _SIGNED:
-                    entries(f"params.{name}", array, ~np.isnan(array), "is NaN", joint_names)
-                else:
-                    entries(f"params.{name}", array, array >= 0, "is negative or NaN", joint_names)
+                low = -math.inf if name in _SIGNED else 0.0
+                at_least(f"params.{name}", np.asarray(leaf), low, joint_names, infinite=True)
 
 
 def make_params(

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import broadcast, entries, positive, read_array
+from batchpid.validate import at_least, broadcast, positive, read_array
 
 Float64 = NDArray[np.float64]
 
@@ -125,7 +125,4 @@ def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[F
     if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
         remedy = "check the masses and inertias of the robot's links"
         raise InvalidArgumentError("mass_matrix", "is not positive definite", remedy=remedy)
-    spread = [broadcast(name, value, m.shape[:-1]) for name, value in columns.items()]
-    for name, column in zip(columns, spread, strict=True):
-        entries(name, column, (column >= 0) & (column < np.inf), "must be finite and >= 0")
-    return (m, *spread)
+    return (m, *(at_least(name, broadcast(name, value, m.shape[:-1]), 0.0) for name, value in columns.items()))

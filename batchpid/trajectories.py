@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.display import array_summary
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.validate import broadcast, entries, positive, read_array
+from batchpid.validate import at_least, broadcast, entries, positive, read_array
 
 Float64 = NDArray[np.float64]
 
@@ -141,16 +141,11 @@ def trapezoidal(
     Parameters
     ----------
     start, target, dt
-        As in :func:`minimum_jerk`.
+        As in :func:`minimum_jerk`, and so the errors.
     max_velocity, max_acceleration
         Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. An infinite velocity is none.
     synchronise
         All joints of an env start and arrive together, on a straight line; else each goes as fast as it may.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Naming the argument and joint.
     """
     x0, way = _move(start, target)
     v, a = _limits("max_velocity", max_velocity, way, finite=False), _limits("max_acceleration", max_acceleration, way)
@@ -206,8 +201,8 @@ def jerk_limited(
     asked = {
         "current_position": x0,
         "target_position": x0 + way,
-        "current_velocity": _finite("start_velocity", start_velocity, way.shape),
-        "current_acceleration": _finite("start_acceleration", start_acceleration, way.shape),
+        "current_velocity": _limits("start_velocity", start_velocity, way, low=-math.inf),
+        "current_acceleration": _limits("start_acceleration", start_acceleration, way, low=-math.inf),
         "max_velocity": _limits("max_velocity", max_velocity, way),
         "max_acceleration": _limits("max_acceleration", max_acceleration, way),
         "max_jerk": _limits("max_jerk", max_jerk, way),
@@ -255,22 +250,13 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
         problem = f"has shape {shapes[1]} and start {shapes[0]}"
         remedy = "give each as (joints,) or (envs, joints), with the same joints"
         raise InvalidArgumentError("target", problem, remedy=remedy)
-    x0 = _finite("start", start, shape)
-    return x0, _finite("target", target, shape) - x0
+    x0, x1 = (at_least(n, broadcast(n, x, shape), -math.inf) for n, x in (("start", start), ("target", target)))
+    return x0, x1 - x0
 
 
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
-    array = broadcast(name, value, shape)
-    entries(name, array, np.isfinite(array), "is not finite")
-    return array
-
-
-def _limits(name: str, value: ArrayLike, way: Float64, finite: bool = True) -> Float64:
-    """Return ``value`` > 0, shaped as ``way``."""
-    array = broadcast(name, value, way.shape)
-    good = (array > 0) & (np.isfinite(array) | (not finite))
-    entries(name, array, good, "must be positive and finite" if finite else "must be > 0")
-    return array
+def _limits(name: str, value: ArrayLike, way: Float64, finite: bool = True, low: float = 0.0) -> Float64:
+    """Return ``value`` > ``low``, shaped as ``way``."""
+    return at_least(name, broadcast(name, value, way.shape), low, above=True, infinite=not finite)
 
 
 def _ticks(dt: float, total: Float64) -> Float64:

@@ -184,6 +184,22 @@ def entries(
     )
 
 
+def at_least(
+    argument: str,
+    values: NDArray[Any],
+    low: float,
+    joint_names: Sequence[str] | None = None,
+    *,
+    above: bool = False,
+    infinite: bool = False,
+) -> NDArray[Any]:
+    """Return ``values`` (..., envs, joints) if every entry is >= ``low``, or > it, and finite unless ``infinite``."""
+    good = ((values > low) if above else (values >= low)) & (infinite | np.isfinite(values))
+    bounds = ["finite"] * (not infinite) + [f"{'>' if above else '>='} {low:g}"] * math.isfinite(low)
+    entries(argument, values, good, f"must be {' and '.join(bounds) or 'a number'}", joint_names)
+    return values
+
+
 def within(argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]) -> NDArray[np.float64]:
     """Return ``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN passes."""
     near = ~(np.abs(rows) > far)

@@ -120,7 +120,7 @@ def test_wrong_calls_are_refused_and_change_nothing(kind):
         (bp.make_params(2, 1.0), "params: hold 2 joints, not 3"),
         (bp.make_params(3, np.ones((2, 3))), r"params\.kp: has shape \(2, 3\)"),
         (PARAMS.replace(dtype=np.float32), "params: are float32"),
-        (PARAMS._replace(kd=np.array([[1.0, -1.0, 1.0]])), r"params\.kd, joint 'b': is negative"),
+        (PARAMS._replace(kd=np.array([[1.0, -1.0, 1.0]])), r"params\.kd, joint 'b': must be >= 0"),
         ({"kp": 1}, "params: must be a PIDParams"),
     ):
         with pytest.raises(bp.InvalidArgumentError, match=said):
