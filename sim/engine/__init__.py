@@ -1,4 +1,4 @@
-"""The gateway to SAPIEN's physics; no other room but the renderer imports SAPIEN."""
+"""Gateway to SAPIEN's physics; outside of it SAPIEN is imported only where pictures are drawn."""
 
 import warnings
 

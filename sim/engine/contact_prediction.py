@@ -36,7 +36,7 @@ class LinkExtent(NamedTuple):
     dof: int | None
     """Number of the joint above it; None if that joint is fixed."""
     slides: bool
-    """Whether that joint is prismatic."""
+    """True if that joint is prismatic."""
     offset: float
     """Largest distance of the link's frame from its parent's [m]."""
     radius: float

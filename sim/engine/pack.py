@@ -5,7 +5,7 @@ the shapes of each scene are in a collision group to themselves, so that scenes 
 system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
 (:mod:`sim.engine.contact_prediction`).
 
-The loop uses only the public methods of :class:`Pack`; another engine has to provide these.
+The loop uses only the public methods and attributes of :class:`Pack`; another engine has to provide these.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Variation:
     resolution: float = 0.0
     """Step of the position sensors [rad or m], 0 for none."""
     late: bool = False
-    """Whether every effort is applied one sim step after it was computed."""
+    """True to apply every effort one sim step after it was computed."""
 
     def for_envs(self, envs: slice | Any) -> Variation:
         """Return the variation of some envs (a slice or an index array)."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.choices import PerMassMatrix
 from batchpid.computed_torque import advance_with_mass_matrix, convert_integral, per_inertia
+from batchpid.elementwise import clip
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
@@ -182,10 +183,9 @@ class EffortControl(Control):
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
         """Add and saturate."""
-        setpoint, low, high = self._command.setpoint, self.params.effort_min, self.params.effort_max
+        setpoint = self._command.setpoint
         total = setpoint if feedforward is None else setpoint + feedforward
-        effort = total if low is None else np.maximum(total, low)
-        effort = effort if high is None else np.minimum(effort, high)
+        effort = clip(total, self.params.effort_min, self.params.effort_max, np)
         if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort

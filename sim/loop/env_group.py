@@ -107,7 +107,7 @@ class EnvGroup:
     # -- the closed loop ---------------------------------------------------------------------------------------
 
     def _run_substeps(self, substeps: int, command: Command) -> None:
-        """At every sim step: compensate, control, write, step, read."""
+        """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
         pack, control = self.pack, self._control
         control.begin(command, substeps)
         for step in range(substeps):
@@ -176,11 +176,9 @@ class EnvGroup:
         """Place the envs that have failed since the last call: suspended, or at their start."""
         containment = self._containment
         failed = containment.pop_unplaced()
-        if not failed.any():
-            return
-        if containment.suspends:
+        if failed.any() and containment.suspends:
             self._place(failed, containment.suspended_qpos, np.zeros_like(containment.suspended_qpos))
-        else:
+        elif failed.any():
             self._place(failed, containment.start_qpos, containment.start_qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:

@@ -40,10 +40,8 @@ class Fault(NamedTuple):
     """``on_fault`` of the runner: "hold" or "reset"."""
 
     def __str__(self) -> str:
-        cause = {
-            "state": "its state is no longer finite",
-            "speed": "it is faster than speed_limit",
-        }.get(self.cause, f"the {self.cause} given for it is not finite")
+        known = {"state": "its state is no longer finite", "speed": "it is faster than speed_limit"}
+        cause = known.get(self.cause, f"the {self.cause} given for it is not finite")
         action = "held until it is reset" if self.action == "hold" else "reset"
         return f"env {self.env}, joint {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
 
