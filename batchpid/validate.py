@@ -152,8 +152,8 @@ def array(
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
     result = broadcast(argument, result, shape, remedy)
-    if finite:
-        entries(argument, result, np.isfinite(result), "is not finite", joint_names, remedy="pass finite numbers")
+    if finite and not (good := np.isfinite(result)).all():
+        entries(argument, result, good, "is not finite", joint_names, remedy="pass finite numbers")
     return result
 
 

@@ -193,10 +193,14 @@ class Runner:
         """
         pool = self._open_pool()
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
-        command = self._command(
-            self._shape, setpoint=setpoint, setpoint_rate=setpoint_rate, feedforward=feedforward
-        ).map(lambda rows: rows[None])
-        self._run(pool, command, count)
+        command = Command(
+            self._rows("setpoint", setpoint),
+            None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate),
+            None if feedforward is None else self._rows("feedforward", feedforward),
+        )
+        if self.control != "effort":
+            self._limits.check("setpoint", command.setpoint)
+        self._run(pool, command.map(lambda rows: rows[None]), count)
         return _copy(pool.present)
 
     def rollout(
@@ -228,9 +232,18 @@ class Runner:
                 remedy="repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, dof))",
             )
         ticks = shape[0]
-        command = self._command(
-            (ticks, *self._shape), setpoints=setpoints, setpoint_rates=setpoint_rates, feedforwards=feedforwards
+
+        def read(name: str, value: ArrayLike) -> NDArray[np.float64]:
+            rows = read_array(name, value)
+            return self._rows(name, rows[:, None] if rows.ndim == 2 else rows, (ticks, *self._shape))
+
+        command = Command(
+            read("setpoints", setpoints),
+            None if setpoint_rates is None else read("setpoint_rates", setpoint_rates),
+            None if feedforwards is None else read("feedforwards", feedforwards),
         )
+        if self.control != "effort":
+            self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
@@ -414,25 +427,13 @@ class Runner:
         self._pool.settle()
         return self._pool
 
-    def _command(self, shape: tuple[int, ...], **given: ArrayLike | None) -> Command:
-        """Return the command of ``shape`` (..., envs, dof), checked; the first argument, a setpoint, is required."""
-        rows: list[NDArray[np.float64] | None] = []
-        for name, value in given.items():
-            if value is None and rows:
-                rows.append(None)
-                continue
-            table: Any = value
-            if len(shape) == 3 and np.ndim(read_array(name, table)) == 2:
-                table = np.asarray(table)[:, None]  # (ticks, dof): for all envs alike
-            rows.append(array(name, table, shape, self._joint_names, finite=self._finite))
-        command = Command(*rows)
-        if self.control != "effort":
-            self._limits.check("setpoint", command.setpoint, stacklevel=4)
-        return command
+    def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+        """Return an argument as an array of ``shape``, or else (envs, dof), checked."""
+        return array(name, value, shape or self._shape, self._joint_names, finite=self._finite)
 
     def _state(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         """Return positions or velocities (envs, dof) to reset to, checked."""
-        rows = array(name, value, self._shape, self._joint_names, finite=self._finite)
+        rows = self._rows(name, value)
         if self._finite:
             return within(name, rows, _FARTHEST, self._joint_names)
         return np.where(np.abs(rows) > _FARTHEST, np.nan, rows)

@@ -27,7 +27,7 @@ class Command(NamedTuple):
 
     def map(self, function: Any) -> Command:
         """Return a command with ``function`` applied to each array that is given."""
-        return Command._make(None if rows is None else function(rows) for rows in self)
+        return Command(*[None if rows is None else function(rows) for rows in self])
 
 
 class FaultArrays(NamedTuple):

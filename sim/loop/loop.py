@@ -62,6 +62,7 @@ class Loop:
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
+        self._first_rows = [self.ticks[0].at(group) for group in slices]  # made once: every single tick uses them
 
     def _build(self, envs: slice) -> Pack:
         variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start
@@ -73,9 +74,9 @@ class Loop:
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
-        for group in self.groups:
+        for group, rows in zip(self.groups, self._first_rows, strict=True):
             group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
-            group.observe(self.ticks[0].at(group.envs))
+            group.observe(rows)
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
@@ -85,9 +86,9 @@ class Loop:
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
         began = time.perf_counter()
-        for group in self.groups:
+        for group, first_rows in zip(self.groups, self._first_rows, strict=True):
             for done, tick in enumerate(self.ticks[:ticks]):
-                rows = tick.at(group.envs)
+                rows = tick.at(group.envs) if done else first_rows
                 setpoint, rate, feedforward = rows.command
                 command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
                 group.run(self._steps + done * substeps, substeps, command)
@@ -106,8 +107,8 @@ class Loop:
         self._steps = snapshot.steps
         self.set_params(snapshot.params)
         self._place(snapshot.states)
-        for group in self.groups:
-            group.observe(self.ticks[0].at(group.envs))
+        for group, rows in zip(self.groups, self._first_rows, strict=True):
+            group.observe(rows)
 
     def _place(self, states: EnvStates) -> None:
         # The engine's contact caches, and the order in which it solves contacts, depend on its past; only those of a

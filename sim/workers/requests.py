@@ -7,6 +7,7 @@ import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass
+from operator import itemgetter, methodcaller
 from typing import Any, Self
 
 import numpy as np
@@ -130,10 +131,10 @@ class Run(Request):
         return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
     def for_envs(self, envs: slice) -> Self:
-        return self._with(self.command.map(lambda rows: rows[:, envs]))
+        return self._with(self.command.map(itemgetter((slice(None), envs))))
 
     def copy(self) -> Self:
-        return self._with(self.command.map(np.copy))
+        return self._with(self.command.map(methodcaller("copy")))
 
     def write(self, arrays: Arrays) -> None:
         for table, rows in zip(arrays.command, self.command, strict=True):
