@@ -94,7 +94,7 @@ class WorkerPool:
 
     @property
     def closed(self) -> bool:
-        """Whether :meth:`close` was called, or a worker was lost for good."""
+        """True after :meth:`close`, or after a worker was lost for good."""
         return self._closing or not self._slots
 
     @property
@@ -294,5 +294,5 @@ class WorkerPool:
 
 
 def _left_unchanged(error: Exception) -> bool:
-    """Whether a loop raised this before it changed anything."""
+    """Return True if a loop raised this before it changed anything."""
     return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)

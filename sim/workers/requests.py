@@ -28,7 +28,7 @@ class Request(ABC):
     idle_limit = 10.0
     """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
     is_replayed = True
-    """Whether it changes the loop, so that a replacement of a lost worker has to repeat it."""
+    """True if it changes the loop, so that a replacement of a lost worker repeats it."""
 
     @property
     def observed_tick(self) -> int | None:
