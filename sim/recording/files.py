@@ -3,8 +3,7 @@
 A file is .npz (NumPy) or .h5 (HDF5). Both hold the arrays of a :class:`sim.Rollout` under their names, ticks first, and
 what is known of its :class:`sim.RunInfo`: as further arrays in an .npz file, as attributes of an .h5 file. ``params``,
 ``versions`` and ``faults`` are JSON text. An .h5 file has checksums too: the attribute ``checksum`` of all others, and
-the dataset ``checksum`` of each tick's rows. (HDF5's own Fletcher-32 is of whole chunks. A kill while a chunk is
-written once more, with further rows, would make its older rows unreadable.)
+the dataset ``checksum`` of each tick's rows (Fletcher-32 covers whole chunks, whose older rows a kill would lose).
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ if TYPE_CHECKING:
 
 FORMAT = "batchpid-recording-1"
 HDF5 = (".h5", ".hdf5")
-CHUNK_BYTES = 1 << 18
-"""Approximate size of a chunk of an .h5 file."""
+CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
 DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
 """Dtype of each array of a recording."""
 
