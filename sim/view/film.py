@@ -58,7 +58,7 @@ def render_problem(program: str = TEST_PROGRAM) -> str | None:
     The test runs once, in a child process, because a failed attempt can kill its process.
     """
     try:
-        result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+        result = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, timeout=120)
     except subprocess.TimeoutExpired:
         return "a first picture took more than 120 s"
     if "rendered" in result.stdout:

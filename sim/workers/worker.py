@@ -223,7 +223,8 @@ def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
     program = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.serve import main; main()"
     with _interrupts_blocked():
         return subprocess.Popen(
-            [sys.executable, "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
+            # -P: without it the working folder comes first, and a json.py in it would run in every worker.
+            [sys.executable, "-P", "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
             env=os.environ | ONE_THREAD,
