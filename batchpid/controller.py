@@ -12,7 +12,7 @@ from batchpid.backends import JAXBackend, NumPyBackend
 from batchpid.errors import InvalidArgumentError
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
-from batchpid.validate import choice, env_mask, instance, integer, names, positive
+from batchpid.validate import choice, env_mask, instance, integer, names, positive, read_array
 
 BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31
@@ -180,6 +180,8 @@ class BatchPID:
 
     def _array(self, name: str, value: Any, exact: bool = False) -> Any:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is ``exact``-ly that."""
+        if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
+            value = read_array(name, value)
         try:
             array = self._engine.array(value)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:

@@ -114,6 +114,8 @@ def read_array(argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: b
     With ``traced`` an array that JAX traces is returned as it came.
     """
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            raise TypeError("it is masked")
         result: Any = value if traced and is_traced(value) else np.asarray(value)
         if result.dtype.kind not in kinds:
             raise TypeError(f"its dtype is {result.dtype}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from batchpid.validate import number
 
 
 @dataclass(frozen=True)
@@ -21,3 +23,7 @@ class Weights:
     """Weight of the effort's variation beyond that of the smooth move."""
     saturation: float = 3.0
     """Weight of the share of time in saturation."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            number(each.name, getattr(self, each.name), 0.0, 1e6, "weight")

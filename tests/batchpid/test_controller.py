@@ -9,6 +9,7 @@ import pytest
 from law_cases import DT, ENVS, JOINTS, LIMITED
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
 
 PARAMS = bp.make_params(JOINTS, **LIMITED, derivative_filter_time=0.02, anti_windup="back_calculation")
 
@@ -157,3 +158,20 @@ def test_a_missing_jax_is_named(monkeypatch):
 def test_import_loads_no_optional_package():
     code = "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    "measurement",
+    [
+        np.array([[1 + 2j, 0.0]]),
+        np.array([["1", "2"]]),
+        [["1", "2"]],
+        np.array([["2020-01-01", "2020-01-02"]], "datetime64"),
+        np.ma.masked_array([[1.0, 2.0]], mask=[[True, False]]),
+    ],
+    ids=["complex", "strings", "list of strings", "dates", "masked"],
+)
+def test_arrays_that_are_not_of_real_numbers_are_refused(measurement):
+    pid = bp.BatchPID(bp.make_params(2, kp=1.0), num_envs=1, dt=0.01)
+    with pytest.raises(InvalidArgumentError, match="measurement: cannot be read as an array of numbers"):
+        pid(np.zeros((1, 2)), measurement)

@@ -10,6 +10,7 @@ import pytest
 from batchpid.errors import InvalidArgumentError
 from sim.tuning.moves import random_moves
 from sim.tuning.search import tune
+from sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
@@ -71,3 +72,9 @@ def test_variation_makes_another_search(panda):
 def test_time_limit_ends_the_search_after_a_generation(panda):
     found = tune(panda, moves=random_moves(panda, 1, 0), workers=0, time_limit=0.0, **SMALL)
     assert len(found.history) == found.settings["generations"] == 1
+
+
+@pytest.mark.parametrize("weight", [float("nan"), float("inf"), -1.0])
+def test_weights_are_finite_and_not_negative(weight):
+    with pytest.raises(InvalidArgumentError, match="overshoot"):
+        Weights(overshoot=weight)
