@@ -27,6 +27,7 @@ Float64 = NDArray[np.float64]
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
+_ROUNDING = 1e-12  # share of a duration: a tick that ends this much before the end is the last one
 _NO_WAY = 1e-100  # [rad or m]: below this a quotient by the distance would overflow
 
 
@@ -124,7 +125,7 @@ def minimum_jerk(
     s = tau**3 * (10 + tau * (6 * tau - 15))
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
-    return _trajectory(time, x0, way, s, rate, acceleration, done=tau >= 1.0)
+    return _trajectory(time, x0, way, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
 
 
 def trapezoidal(
@@ -167,7 +168,7 @@ def trapezoidal(
     s = np.where(t < ramp, as_ * t**2 / 2, np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2)))
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
-    return _trajectory(time, x0, way, s, rate, acceleration, done=left <= 0)
+    return _trajectory(time, x0, way, s, rate, acceleration, done=left <= _ROUNDING * total)
 
 
 def jerk_limited(
@@ -223,7 +224,7 @@ def jerk_limited(
     durations = np.array([plan.duration for plan in plans])
     time = _ticks(dt, durations)
     table = np.array([[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()])
-    arrived = time[:, None, None] >= durations[:, None]
+    arrived = time[:, None, None] >= (1 - _ROUNDING) * durations[:, None]
     position, velocity, acceleration = (
         np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
         for k, rest in enumerate((rows["target_position"], np.zeros(()), np.zeros(())))
@@ -266,4 +267,4 @@ def _ticks(dt: float, total: Float64) -> Float64:
 
 def _count(duration: float, dt: float) -> int:
     """Return how many ticks cover a duration; a last one by rounding alone is none."""
-    return max(1, math.ceil(duration / dt * (1 - 1e-12)))
+    return max(1, math.ceil(duration / dt * (1 - _ROUNDING)))

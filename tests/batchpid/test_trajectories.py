@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
@@ -29,6 +29,7 @@ def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
 @each_move
 @settings(deadline=None)
 @given(start=poses, target=st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
+@example(start=np.array([[0.0, 0.7, 0.0]]), target=np.array([0.0, -3.0, 0.0]))  # ends by rounding
 def test_a_move_ends_at_its_target_at_rest_and_stays_between(move, start, target):
     t = move(start, target)
     assert t.position.shape == (t.ticks, *start.shape)
