@@ -21,8 +21,8 @@ from sim.options import RunnerOptions
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, RobotDescription, register_dynamics
+from sim.robot.findings import Finding
 from sim.robot.limits import SetpointWarning
-from sim.robot.preflight import Finding
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:

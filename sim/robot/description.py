@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim.observation import OBSERVED, RunInfo
+from sim.robot.findings import Finding
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -154,7 +155,8 @@ class Urdf:
 
     ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
     fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
-    that were not found or cannot be read, the latter with the reason.
+    that were not found or cannot be read, the latter with the reason. ``repairs`` are the findings of what was changed
+    so that the simulator can run it.
     """
 
     name: str
@@ -162,6 +164,7 @@ class Urdf:
     all_joints: tuple[Joint, ...]
     links: tuple[Link, ...]
     missing_meshes: tuple[str, ...]
+    repairs: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,14 +1,13 @@
 """Preflight: oddities of a robot, and of the way it is to be run, reported before the first step.
 
 SAPIEN silently accepts most of what is listed here. ``Robot.load`` raises an error for what SAPIEN cannot run at all; a
-:class:`Finding` is something that runs otherwise than the URDF, or the user, means.
+:class:`sim.Finding` is something that runs otherwise than the URDF, or the user, means.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,36 +16,11 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import array, choice, instance, number, within
 from sim.robot.description import DISSIPATION, Joint, RobotDescription
+from sim.robot.findings import SEVERITIES, Finding
 from sim.robot.stability import stability_report
 from sim.robot.urdf import mimic_works
 
-SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
 NEAR_BOUND = 0.5  # share of the stability range above which gains are reported: other poses may have less inertia
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Oddity of a joint, a link or the robot, and the remedy.
-
-    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs.
-    """
-
-    severity: str
-    code: str
-    text: str
-    remedy: str
-    joint: str | None = None
-    link: str | None = None
-
-    @property
-    def where(self) -> str:
-        """``"joint 'x'"``, ``"link 'x'"`` or ``"robot"``."""
-        if self.joint is not None:
-            return f"joint {self.joint!r}"
-        return "robot" if self.link is None else f"link {self.link!r}"
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.where}: {self.text}; {self.remedy}"
 
 
 def check(
@@ -62,7 +36,7 @@ def check(
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names
     start = robot.start if qpos is None else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
-    findings = [*_links(robot), *_robot(robot, start), *_poses(robot, "start pose", start)]
+    findings = [*robot.repairs, *_links(robot), *_robot(robot, start), *_poses(robot, "start pose", start)]
     for joint in robot.joints:
         findings += _joint(joint, robot)
     if setpoint is not None:
@@ -96,10 +70,6 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
 
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
-    if robot.missing_meshes:
-        text = f"collision meshes not found or not readable, simulated without: {', '.join(robot.missing_meshes)}"
-        remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
-        yield Finding("warning", "missing-mesh", text, remedy)
     if not robot.fixed_base:
         text = "SAPIEN's passive force does not compensate gravity on a floating base"
         yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")

@@ -18,7 +18,8 @@ from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
 from sim.robot.description import DISSIPATION, Joint, RobotDescription, Settings
-from sim.robot.preflight import Finding, check
+from sim.robot.findings import Finding
+from sim.robot.preflight import check
 from sim.robot.urdf import read_srdf, read_urdf
 
 _ASSETS = Path(assets.__file__).parent
@@ -39,6 +40,7 @@ class Robot(RobotDescription):
         missing_meshes: str = "error",
         dissipation: str = "urdf",
         fixed_base: bool = True,
+        strict: bool = False,
     ) -> Robot:
         """Load a bundled robot by name (``Robot.bundled()``), or any URDF by path.
 
@@ -53,24 +55,28 @@ class Robot(RobotDescription):
             joint friction 0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
             True to fix the root link to the world.
+        strict
+            True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
 
         Raises
         ------
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is not a usable URDF; the message names the element and the remedy.
+            The file is not a usable URDF; the message names the element and the remedy. With ``strict``, it needs
+            repairs, which the message lists.
         InvalidArgumentError
             An option is not one of those above.
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, DISSIPATION)
-        fixed_base = flag("fixed_base", fixed_base)
+        fixed_base, strict = flag("fixed_base", fixed_base), flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
         path = _find(name_or_path)
-        urdf = read_urdf(path, tuple(file_path("package_dirs", each) for each in package_dirs), missing_meshes)
+        folders = tuple(file_path("package_dirs", each) for each in package_dirs)
+        urdf = read_urdf(path, folders, missing_meshes, strict)
         joints = tuple(joint for joint in urdf.all_joints if joint.moves)
         if not joints:
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")

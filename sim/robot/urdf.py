@@ -19,6 +19,7 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic, Urdf
+from sim.robot.findings import Finding, refuse
 from sim.robot.meshes import find_mesh, mesh_problem
 from sim.robot.xml import number, numbers, parse_xml
 
@@ -40,12 +41,12 @@ _READ = {  # elements that are kept, by parent: what SAPIEN does not use it may 
 }
 
 
-def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -> Urdf:
+def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, strict: bool) -> Urdf:
     """Read and sanitise the URDF file at ``path``.
 
     Parameters
     ----------
-    package_dirs, missing_meshes
+    package_dirs, missing_meshes, strict
         See :meth:`sim.Robot.load`.
 
     Raises
@@ -68,6 +69,11 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -
             f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the file, pass "
             "package_dirs=[...] with the folder that holds the package, or missing_meshes='skip' to simulate without"
         )
+    repairs = []
+    if missing:
+        text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
+        remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
+        repairs.append(Finding("warning", "missing-mesh", text, remedy))
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
     ordered = _breadth_first(links, joints, path)
@@ -77,8 +83,10 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str) -
             raise RobotError(f"{path}: {problem}; correct the name")
         if joint.mimic is not None and not mimic_works(joint, joints):
             element.remove(element.find("mimic"))  # SAPIEN would mis-simulate it; the preflight reports it
+    if strict:
+        refuse(path, repairs)
     text = etree.tostring(root, encoding="unicode")
-    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing))
+    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:

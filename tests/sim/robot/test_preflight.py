@@ -11,7 +11,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim import Finding, Robot, Runner
-from sim.robot.preflight import SEVERITIES
+from sim.robot.findings import SEVERITIES
 from sim.robot.stability import stability_report
 
 COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'

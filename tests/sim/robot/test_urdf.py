@@ -320,6 +320,8 @@ def test_missing_meshes_can_be_skipped(tmp_path):
     loaded = Robot.load(path, missing_meshes="skip")
     assert loaded.missing_meshes == ("no.stl",)
     assert "missing-mesh" in {finding.code for finding in loaded.check()}
+    with pytest.raises(RobotError, match=r"needs 1 repair, which strict=True refuses:\n  robot: .*no\.stl"):
+        Robot.load(path, missing_meshes="skip", strict=True)
 
 
 @pytest.mark.parametrize(
@@ -336,6 +338,7 @@ def test_missing_meshes_can_be_skipped(tmp_path):
         {"name_or_path": "panda", "package_dirs": 3},
         {"name_or_path": "panda", "package_dirs": [None]},
         {"name_or_path": "panda", "fixed_base": "yes"},
+        {"name_or_path": "panda", "strict": "yes"},
     ],
 )
 def test_invalid_options_of_load_raise(options):
