@@ -24,6 +24,7 @@ from sim.cli.inspect import InspectCommand
 from sim.cli.plot import PlotCommand
 from sim.cli.render import RenderCommand
 from sim.cli.rollout import RolloutCommand
+from sim.cli.survey import SurveyCommand
 from sim.cli.tune import TuneCommand
 from sim.cli.view import ViewCommand
 
@@ -34,6 +35,7 @@ COMMANDS: dict[str, type[Any]] = {
     "tune": TuneCommand,
     "compare": CompareCommand,
     "inspect": InspectCommand,
+    "survey": SurveyCommand,
     "plot": PlotCommand,
     "view": ViewCommand,
     "render": RenderCommand,

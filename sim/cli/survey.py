@@ -1,0 +1,109 @@
+"""``batchpid survey``: many URDFs, each loaded, built and moved, in a table."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from batchpid.files import write_atomically
+from sim.cli import flags
+
+if TYPE_CHECKING:
+    from sim.tuning.survey import RobotReport
+
+
+@dataclass(frozen=True)
+class SurveyCommand:
+    """Load, build and move many robots, each in a process to itself, and list how far each gets.
+
+    Gains are designed per mass matrix. A move has settled if every joint stays within 2 % of it and ends within 1e-3
+    rad (or m) of the setpoint.
+    """
+
+    paths: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="FILE|FOLDER [FILE|FOLDER ...]", help_behavior_hint="(required)"),
+    ]
+    """URDF files, and folders that are searched for files *.urdf."""
+    moves: int = 8
+    """Number of moves of each robot."""
+    seed: int = 0
+    """Seed of the moves."""
+    seconds: flags.Seconds = 2.0
+    bandwidth: float = 2.0
+    """Bandwidth of the designed gains [Hz]."""
+    physics: flags.Physics = "accurate"
+    time_limit: float = 300.0
+    """Wall-clock time for each robot [s]."""
+    workers: flags.Workers = None
+    json: flags.OptionalPath = None
+    """Reports to write: a list of objects, .json."""
+    out: flags.OptionalPath = None
+    """Table to write in Markdown, .md."""
+
+    def run(self) -> int:
+        """Run the command; the exit status is 1 if a robot crashed its process."""
+        from sim.cli.run import bar
+        from sim.tuning.survey import find_urdfs, survey
+
+        json_path = flags.output_path("json", self.json, (".json",))
+        out = flags.output_path("out", self.out, (".md",))
+        urdfs = find_urdfs(self.paths)
+        cores = len(os.sched_getaffinity(0))
+        reports = survey(
+            urdfs,
+            moves=self.moves,
+            seed=self.seed,
+            seconds=self.seconds,
+            bandwidth_hz=self.bandwidth,
+            physics=self.physics,
+            time_limit=self.time_limit,
+            processes=max(1, cores if self.workers is None else self.workers),
+        )
+        done = list(bar("surveying", unit="robot", total=len(urdfs))(reports))
+        if json_path is not None:
+            write_atomically(json_path, json.dumps([report.asdict() for report in done], indent=1) + "\n")
+        if out is not None:
+            write_atomically(out, survey_table(done, "github") + "\n")
+        print(survey_table(done, "simple"))
+        print(f"\n{survey_summary(done)}")
+        return int(any(report.error and "the process ended" in report.error for report in done))
+
+
+def survey_table(reports: Sequence[RobotReport], style: str) -> str:
+    """Return the reports as a table in one of tabulate's styles; paths are relative to the folder that holds all."""
+    from tabulate import tabulate
+
+    shared = os.path.commonpath([os.path.dirname(os.path.abspath(report.urdf)) for report in reports])
+    rows = [
+        [
+            os.path.relpath(os.path.abspath(report.urdf), shared),
+            "-" if report.dof is None else str(report.dof),
+            f"{report.settled} of {report.moves}" if report.moves else "-",
+            "-" if report.worst_error is None else f"{report.worst_error:.0e}",
+            "-" if report.worst_overshoot is None else f"{report.worst_overshoot:.0%}",
+            report.error or ", ".join(report.findings),
+        ]
+        for report in reports
+    ]
+    headers = ["URDF", "joints", "settled", "worst error", "overshoot", "findings, or what went wrong"]
+    sides = ("left", "right", "right", "right", "right", "left")
+    return tabulate(rows, headers, tablefmt=style, disable_numparse=True, colalign=sides)
+
+
+def survey_summary(reports: Sequence[RobotReport]) -> str:
+    """Return one sentence with the number of robots that got through each stage."""
+    robots = [report for report in reports if report.dof != 0]
+    drawn = [report for report in robots if report.moves]
+    settled = [report for report in drawn if report.settled == report.moves]
+    return (
+        f"{sum(report.loads for report in robots)} of {len(robots)} files with a moving joint load, {len(drawn)} get "
+        f"moves, {len(settled)} settle on all of them ({len(reports) - len(robots)} files without a moving joint)."
+    )

@@ -1,0 +1,51 @@
+"""The survey: one report for each file, whatever becomes of the robot."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from tiny_urdf import one_joint
+
+from batchpid.errors import InvalidArgumentError
+from sim.tuning.survey import find_urdfs, survey
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robots")
+    (folder / "deep").mkdir()
+    (folder / "deep" / "arm.urdf").write_text(one_joint())
+    (folder / "scenery.urdf").write_text("<robot name='table'><link name='top'/></robot>")
+    (folder / "truncated.urdf").write_text(one_joint()[:200])
+    (folder / "notes.txt").write_text("no robot")
+    return folder
+
+
+def test_reports_come_in_order_with_all_that_is_known(folder):
+    good, scenery, truncated = survey(find_urdfs([folder]), moves=2, seconds=2.5, processes=2)
+    assert good.urdf.endswith("arm.urdf")
+    assert good.error is None
+    assert good.loads
+    assert (good.moves, good.settled) == (2, 2)
+    assert 0 <= good.worst_error < 1e-3
+    assert json.loads(json.dumps(good.asdict()))["findings"] == list(good.findings)
+    assert (scenery.dof, scenery.loads, scenery.moves) == (0, False, 0)
+    assert "without moving joints" in scenery.error
+    assert not truncated.loads
+    assert truncated.error.startswith("reading the URDF: ")
+
+
+def test_a_robot_that_takes_too_long_is_ended(folder):
+    (report,) = survey([folder / "deep" / "arm.urdf"], moves=1000, seconds=600.0, time_limit=2.0)
+    assert report.error.endswith("more than 2 s")
+
+
+def test_files_and_folders_are_found_once(folder):
+    arm = folder / "deep" / "arm.urdf"
+    assert find_urdfs([arm, folder]) == [arm, folder / "scenery.urdf", folder / "truncated.urdf"]
+    with pytest.raises(InvalidArgumentError, match="must be files or folders"):
+        find_urdfs([folder / "nothing"])
+    (folder / "empty").mkdir()
+    with pytest.raises(InvalidArgumentError, match=r"hold no file \*.urdf"):
+        find_urdfs([folder / "empty"])
