@@ -29,7 +29,7 @@ class SurveyCommand:
     paths: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="FILE|FOLDER [FILE|FOLDER ...]", help_behavior_hint="(required)"),
+        tyro.conf.arg(metavar="PATHS [PATHS ...]", help_behavior_hint="(required)"),
     ]
     """URDF files, and folders that are searched for files *.urdf."""
     moves: int = 8
