@@ -13,6 +13,7 @@ from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRi
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
+from sim.engine.mirrored_meshes import MirroringBuilder
 from sim.engine.root_state import ROOT_SIZE, read_root, write_root
 
 Build = Callable[[Any, int], Any]
@@ -32,6 +33,10 @@ class HeadlessScene(sapien.Scene):
     def __init__(self, system: PhysxCpuSystem | None = None) -> None:
         # Without a list of systems SAPIEN builds a render system, which fails without a device, or ends the process.
         super().__init__([PhysxCpuSystem() if system is None else system])
+
+    def create_articulation_builder(self) -> Any:
+        """Return a builder of articulations for this scene."""
+        return MirroringBuilder().set_scene(self)
 
     def create_actor_builder(self) -> Any:
         """Return a builder of actors for this scene."""
