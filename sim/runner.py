@@ -21,6 +21,7 @@ import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
+from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
 from sim.loop.faults import Fault, FaultLog
 from sim.loop.snapshot import EnvStates, Snapshot
@@ -352,6 +353,11 @@ class Runner:
     def faults(self) -> deque[Fault]:
         """Envs that failed, latest last: the last ten thousand."""
         return self._faults.faults
+
+    @property
+    def backend(self) -> str:
+        """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
+        return f"law in NumPy, {native_status()}"
 
     @property
     def time(self) -> float:

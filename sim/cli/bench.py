@@ -50,6 +50,7 @@ class BenchCommand:
         from sim.benchmark.workload import Workload
         from sim.cli.report import table
         from sim.cli.run import bar
+        from sim.engine.native import status as native_status
 
         out = flags.output_path("out", self.out, (".json",))
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
@@ -71,7 +72,7 @@ class BenchCommand:
 
         print(
             f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, "
-            f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds\n"
+            f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds, {native_status()}\n"
         )
         ours = results["closed loop"].rates
         ratios = {case: float(np.median(np.divide(ours, result.rates))) for case, result in results.items()}

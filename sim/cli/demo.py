@@ -56,7 +56,7 @@ class DemoCommand:
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
         options: dict[str, Any] = {"params": gains.params, "control": gains.control, "workers": self.workers}
         with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
-            print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes", flush=True)
+            print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
             rollout, report = hold_setpoint(runner, start, settings.target, seconds)
         print(report)
         for note in settings.notes:

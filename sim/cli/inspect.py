@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from batchpid.versions import package_versions
 from sim import Robot
 from sim.cli import flags
 from sim.tuning.gain_sets import gain_set
@@ -23,6 +24,8 @@ class InspectCommand:
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
     missing_meshes: flags.MissingMeshes = "error"
+    engine: flags.Switch = False
+    """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
     def run(self) -> int:
         """Run the command and return its exit status."""
@@ -39,6 +42,10 @@ class InspectCommand:
             print(f"\nUnder gains {gains.name}:")
             print("\n".join(map(str, of_gains)) or "Nothing odd.")
             findings += of_gains
+        if self.engine:
+            from sim.engine.native import status
+
+            print(f"\nEngine: SAPIEN {package_versions(['sapien'])['sapien']}, {status()}.")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 

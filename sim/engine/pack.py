@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sim.engine.building import SceneSpec, build_scene, engine_settings, link_extents, new_system, set_collision_group
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.dynamics import scene_dynamics
+from sim.engine.native import engine_calls
 from sim.engine.root_state import read_root, write_root
 from sim.engine.user_content import SceneContent
 
@@ -73,24 +74,19 @@ class Pack:
         return build_scene(self.spec, system)
 
     def _bind(self) -> None:
-        """Store the bound methods that every sim step calls, which is cheaper than looking them up."""
+        """Prepare the calls of every sim step, for the present robots and systems."""
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
-        self._get_qpos = [robot.get_qpos for robot in robots]
-        self._get_qvel = [robot.get_qvel for robot in robots]
-        self._passive_force = [robot.compute_passive_force for robot in robots]
-        # set_qf from a kept row view costs half of what a fresh one does.
-        rows = zip(robots, self.qf, self._suspended, strict=False)
-        self._set_qf = [(robot.set_qf, row) for robot, row, suspended in rows if not suspended]
-        self._steps = [system.step for system in dict.fromkeys(self.systems)]
+        self._calls = engine_calls(
+            robots, list(dict.fromkeys(self.systems)), self.qf[: len(robots)], self._suspended[: len(robots)]
+        )
         shared = [row for row in range(len(robots)) if self._isolates and not self.isolated[row]]
         self._get_contacts = [s.get_contacts for s in dict.fromkeys(self.systems[row] for row in shared)]
         self._links = {link: (row, i) for row in shared for i, link in enumerate(robots[row].links)}
 
     def step(self) -> None:
         """Do one sim step of every scene."""
-        for step in self._steps:
-            step()
+        self._calls.step()
         for get_contacts in self._get_contacts:
             contacts = get_contacts()
             if contacts:
@@ -105,7 +101,9 @@ class Pack:
             if row is not None and not self._suspended[row]:
                 distance = min(point.separation for point in contact.points)
                 near.setdefault(row, []).append(NearPair(first, second, distance))
-        return [row for row, pairs in near.items() if self._predictor.predicts_contact(pairs, self._get_qvel[row]())]
+        return [
+            row for row, pairs in near.items() if self._predictor.predicts_contact(pairs, self.robots[row].get_qvel())
+        ]
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
@@ -149,22 +147,20 @@ class Pack:
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the joint positions [rad or m], a new array."""
-        return np.concatenate([get() for get in self._get_qpos], dtype=dtype).reshape(self.size, self.dof)
+        return self._calls.qpos(dtype)
 
     def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the joint velocities [rad/s or m/s], a new array."""
-        return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self.size, self.dof)
+        return self._calls.qvel(dtype)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], a new array."""
-        forces = [compute(gravity, coriolis) for compute in self._passive_force]
-        return np.concatenate(forces, dtype=dtype).reshape(self.size, self.dof)
+        return self._calls.passive_force(gravity, coriolis, dtype)
 
     def write_qf(self, effort: NDArray[Any]) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
-        for set_qf, row in self._set_qf:
-            set_qf(row)
+        self._calls.write_qf()
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], root: NDArray[Any] | None = None

@@ -25,6 +25,7 @@ from typing import Any
 import cloudpickle
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
+from sim.engine import native
 from sim.loop.arrays import Arrays
 from sim.workers.channel import Channel
 from sim.workers.liveness import Liveness
@@ -227,7 +228,7 @@ def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
             [sys.executable, "-P", "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
-            env=os.environ | ONE_THREAD,
+            env=os.environ | ONE_THREAD | native.environment(),
         )
 
 

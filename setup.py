@@ -1,0 +1,18 @@
+"""Build of the optional extension; everything else about the package stands in pyproject.toml."""
+
+from setuptools import Extension, setup
+
+setup(
+    ext_modules=[
+        Extension(
+            "sim.engine.native._gateway",
+            ["sim/engine/native/gateway.cpp"],
+            extra_compile_args=["-std=c++17", "-O2"],
+            language="c++",
+            define_macros=[("Py_LIMITED_API", "0x030B0000")],
+            py_limited_api=True,
+            optional=True,  # without a compiler batchpid works as well, only slower
+        )
+    ],
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},
+)

@@ -1,0 +1,204 @@
+"""Native calls into the engine: an optional extension that reads and writes all robots of a pack in one call.
+
+The extension calls functions that SAPIEN's shared library exports, so that it needs nothing of SAPIEN to be compiled.
+It depends on the layout of two of SAPIEN's types, which no header promises. So it is used only if a self-test in a
+child process, where a crash does no harm, gives bit-identical results to Python's calls; the verdict is kept for this
+pair of libraries in the user's cache. Otherwise, and with the environment variable ``BATCHPID_NATIVE=0``, Python's
+calls do the same work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import importlib
+import json
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine.calls import EngineCalls, PythonCalls
+
+_gateway: Any
+try:
+    _gateway = importlib.import_module("sim.engine.native._gateway")
+except ImportError:
+    _gateway = None
+
+SWITCH = "BATCHPID_NATIVE"
+"""Environment variable: "0" switches the native calls off."""
+_VERIFIED = "BATCHPID_NATIVE_VERIFIED"
+_SYMBOLS = (  # in the order of the gateway's Functions
+    "_ZN6sapien5physx17PhysxArticulation7getQposEv",
+    "_ZN6sapien5physx17PhysxArticulation7getQvelEv",
+    "_ZN6sapien5physx17PhysxArticulation19computePassiveForceEbb",
+    "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
+    "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
+)
+_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
+SELF_TEST = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.engine.native import self_test; self_test.main()"
+)
+_SECONDS = 60.0
+
+
+class NativeStatus(NamedTuple):
+    """Whether the native calls are used, and the reason if they are not."""
+
+    active: bool
+    reason: str
+
+    def __str__(self) -> str:
+        return "native calls into SAPIEN" if self.active else f"Python calls into SAPIEN ({self.reason})"
+
+
+def status() -> NativeStatus:
+    """Return whether native calls are used; the first call of a new installation runs the self-test (a second)."""
+    if os.environ.get(SWITCH) == "0":
+        return NativeStatus(False, f"native calls are switched off by {SWITCH}=0")
+    return _verified()
+
+
+def environment() -> dict[str, str]:
+    """Return the environment that saves a child process of this one the self-test."""
+    return {_VERIFIED: _fingerprint()} if status().active else {}
+
+
+def engine_calls(
+    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+) -> EngineCalls:
+    """Return native calls where they are available, else Python's; the arguments are those of both."""
+    make = NativeCalls if robots and status().active else PythonCalls
+    return make(robots, systems, qf, skip)
+
+
+class NativeCalls:
+    """The calls of :class:`sim.engine.calls.PythonCalls`, one for all robots. Raises RuntimeError if SAPIEN does."""
+
+    def __init__(
+        self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+    ) -> None:
+        self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
+        pointers = [
+            [_pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))
+        ]
+        self._gateway = _gateway.gateway(_functions(), *pointers, qf.shape[1])
+        self._qf, self._skip = qf, skip
+
+    def qpos(self, dtype: Any) -> NDArray[Any]:
+        """Return the joint positions, a new array."""
+        rows = np.empty(self._qf.shape, dtype)
+        _gateway.read_qpos(self._gateway, rows)
+        return rows
+
+    def qvel(self, dtype: Any) -> NDArray[Any]:
+        """Return the joint velocities, a new array."""
+        rows = np.empty(self._qf.shape, dtype)
+        _gateway.read_qvel(self._gateway, rows)
+        return rows
+
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
+        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
+        rows = np.empty(self._qf.shape, dtype)
+        _gateway.passive_force(self._gateway, rows, gravity, coriolis)
+        return rows
+
+    def write_qf(self) -> None:
+        """Apply the efforts in ``qf``."""
+        _gateway.write_qf(self._gateway, self._qf, self._skip)
+
+    def step(self) -> None:
+        """Do one sim step of every system."""
+        _gateway.step(self._gateway)
+
+
+def _pointer(wrapper: Any, kind: str) -> int:
+    """Return the address of the C++ object in ``wrapper``, by pybind11's conduit, which checks its type and ABI."""
+    capsule = wrapper._pybind11_conduit_v1_(_ABI, _gateway.type_info(kind), b"raw_pointer_ephemeral")
+    if capsule is None:
+        raise RuntimeError(f"SAPIEN's {kind} is not of the type that the extension was made for")
+    api = ctypes.pythonapi
+    name, pointer = api.PyCapsule_GetName, api.PyCapsule_GetPointer
+    name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    return pointer(capsule, name(capsule))
+
+
+@cache
+def _functions() -> tuple[int, ...]:
+    """Return the addresses of the exported functions; AttributeError names one that is missing."""
+    library = ctypes.CDLL(str(_sapien_library()))
+    return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in _SYMBOLS)
+
+
+@cache
+def _sapien_library() -> Path:
+    """Return the path of SAPIEN's shared library, which is loaded with its Python package."""
+    import sapien  # noqa: F401
+
+    with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
+        paths = {line.split(maxsplit=5)[-1].strip() for line in maps if "libsapien" in line}
+    if len(paths) != 1:
+        raise OSError("SAPIEN's shared library is not loaded, or more than once")
+    return Path(paths.pop())
+
+
+@cache
+def _fingerprint() -> str:
+    """Return a hash of the two libraries."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in (_sapien_library(), Path(_gateway.__file__)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+@cache
+def _verified() -> NativeStatus:
+    return verify(Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "batchpid"))
+
+
+def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
+    """Return whether the native calls work with this SAPIEN: a verdict kept in ``folder``, or that of the self-test.
+
+    ``program`` runs in a child process, with sys.path as JSON in its first argument; it passes by exit status 0. If it
+    does not, a RuntimeWarning says so.
+    """
+    if _gateway is None:
+        return NativeStatus(False, "the extension was not built: it needs a C++ compiler when batchpid is installed")
+    try:
+        fingerprint = _fingerprint()
+        _functions()
+        kept = folder / f"native-{fingerprint}"
+        known = os.environ.get(_VERIFIED) == fingerprint or kept.is_file()
+        problem = None if known else _run(program)
+    except (OSError, AttributeError) as error:  # the latter for a function that is not exported
+        known, problem = False, str(error)
+    if problem is not None:
+        warnings.warn(f"native calls do not work with this SAPIEN: {problem}", RuntimeWarning, stacklevel=4)
+        return NativeStatus(False, f"the self-test failed: {problem}")
+    if not known:
+        with contextlib.suppress(OSError):  # the next process tests again
+            folder.mkdir(parents=True, exist_ok=True)
+            kept.touch()
+    return NativeStatus(True, "")
+
+
+def _run(program: str) -> str | None:
+    """Run a Python program in a child process; return what went wrong, None if nothing did."""
+    command = [sys.executable, "-P", "-c", program, json.dumps(sys.path)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_SECONDS)
+    except subprocess.TimeoutExpired:
+        return f"more than {_SECONDS:g} s"
+    if done.returncode:
+        return (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+    return None

@@ -1,0 +1,59 @@
+"""Self-test of the native calls, in a process to itself: bit-identical results to Python's, or an exit status."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine.building import SceneSpec, build_scene, new_system
+from sim.engine.calls import PythonCalls
+from sim.engine.native import NativeCalls
+from sim.engine.physics import PHYSICS
+from sim.robot.description import Joint
+
+STEPS = 50
+_BODY = """<inertial><mass value="1.5"/>
+<inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="0" izz="0.01"/></inertial>
+<collision><geometry><box size="0.1 0.1 0.4"/></geometry></collision>"""
+_URDF = f"""<robot name="test"><link name="base"/><link name="arm">{_BODY}</link><link name="hand">{_BODY}</link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><origin xyz="0 0 0.25"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="100" velocity="9"/></joint>
+<joint name="slide" type="prismatic"><parent link="arm"/><child link="hand"/><origin xyz="0 0 0.5"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="100" velocity="9"/></joint></robot>"""
+
+
+def main() -> None:
+    """Compare native and Python calls on four robots in two systems; raise what is found."""
+    reads = [_run(make) for make in (PythonCalls, NativeCalls)]
+    for ours, theirs in zip(*reads, strict=True):
+        if ours.tobytes() != theirs.tobytes():
+            raise AssertionError("native and Python calls give different results")
+    if not np.ptp(reads[0][-3], axis=0).any():
+        raise AssertionError("no robot moved")
+
+
+def _run(make: Callable[..., Any]) -> list[NDArray[Any]]:
+    """Return everything that is read in a run under varied efforts, which ends on the ground."""
+    joints = (Joint("turn", "revolute", "base", "arm"), Joint("slide", "prismatic", "arm", "hand"))
+    spec = SceneSpec(_URDF, None, joints, 1e-2, PHYSICS["accurate"])
+    systems = [new_system(spec), new_system(spec)]
+    scenes, robots = zip(*(build_scene(spec, systems[row // 2]) for row in range(4)), strict=True)
+    qf, skip = np.zeros((4, 2), np.float32), np.array([False, False, False, True])
+    for row, robot in enumerate(robots):
+        robot.set_qpos(np.array([0.2 * row, 0.1 * row], np.float32))
+    calls, found = make(robots, systems, qf, skip), []
+    for step in range(STEPS):
+        qf[...] = calls.passive_force(True, True, np.float64) + np.array([[20.0 * np.sin(step), 5.0]])
+        calls.write_qf()
+        calls.step()
+        found += [calls.qpos(np.float64), calls.qvel(np.float32), calls.passive_force(False, True, np.float32)]
+    for scene in scenes:
+        scene.clear()
+    try:
+        calls.qpos(np.float64)
+    except RuntimeError:
+        return found
+    raise AssertionError("a robot whose scene is gone can still be read")
