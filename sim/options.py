@@ -141,6 +141,11 @@ class RunnerOptions:
         """
         return min(self.pack_size, max(1, self.num_envs // 8))
 
+    @property
+    def has_stiction(self) -> bool:
+        """True if joints have Coulomb friction that the loop models."""
+        return bool(self.robot.friction.any()) or self.variation is not None
+
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params`` if they fit the robot, the number of envs and the control.
 

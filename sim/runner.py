@@ -320,7 +320,7 @@ class Runner:
         snapshot.check(self.options.about())
         self.options.check_params(snapshot.params)
         sizes = [size for part in pool.run(ReadContentSizes()) for size in part]
-        snapshot.states.check(self.num_envs, self.robot.dof, snapshot.params, sizes)
+        snapshot.states.check(self.num_envs, self.robot.dof, snapshot.params, self.options.has_stiction, sizes)
         pool.run(Restore(snapshot))
         self._steps, self._params = snapshot.steps, snapshot.params
         self._faults.restore(snapshot.states.containment["step"])

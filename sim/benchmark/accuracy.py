@@ -26,6 +26,7 @@ from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS, Physics
 from sim.loop.arrays import Command
 from sim.loop.control import PIDControl
+from sim.loop.friction import JointFriction
 from sim.robot.description import Dynamics
 from sim.robot.robot import Robot
 from sim.tuning.moves import Moves, draw_moves, random_moves
@@ -144,10 +145,13 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     control = PIDControl(spec, robot.tuned(), plant)
     control.begin(Command(moves.target), steps)
     table = np.empty((steps, *moves.start.shape))
+    friction = JointFriction(plant) if isinstance(plant, Pack) else None
     for step in range(steps):
         passive = plant.passive_force(True, True)
-        plant.write_qf(control.effort(plant.read_qpos(), passive, step))
-        for _ in range(refinement):
+        effort = control.effort(plant.read_qpos(), passive, step)
+        for fine_step in range(step * refinement, (step + 1) * refinement):
+            total = effort if friction is None else friction.effort(effort, plant.read_qvel(), fine_step)
+            plant.write_qf(total)
             plant.step()
         table[step] = plant.read_qpos()
     return table

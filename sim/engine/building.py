@@ -161,8 +161,12 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
         link.set_linear_damping(dissipation.link_damping)
         link.set_angular_damping(dissipation.link_damping)
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
-        # SAPIEN parses <dynamics friction> and never applies it.
-        built.set_friction(joint.friction if dissipation.joint_friction is None else dissipation.joint_friction)
+        built.set_friction(dissipation.joint_friction)
+        if dissipation.modelled:
+            # SAPIEN implements the URDF's damping as a drive, with an error that depends on the solver; this is exact,
+            # with the effort of batchpid.friction.
+            built.set_drive_properties(0.0, 0.0)
+            built.set_armature(np.array([spec.timestep * joint.damping], np.float32))
     return scene, robot
 
 

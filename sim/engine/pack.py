@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.friction import Friction
 from sim.engine.building import SceneSpec, build_scene, engine_settings, link_extents, new_system, set_collision_group
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.native import engine_calls
 from sim.engine.root_state import read_root, write_root
 from sim.engine.user_content import SceneContent
+from sim.robot.description import DISSIPATION
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
@@ -39,6 +41,8 @@ class Pack:
         Robots that have a system to themselves because contact was predicted (M,); none with ``isolates`` False.
     qf
         Efforts last written, in the engine's precision.
+    friction
+        Friction and damping that the loop has to apply to the joints.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class Pack:
         self.size, self.dof = size, self.robots[0].dof
         self.isolated = np.zeros(size, bool)
         self._predictor = ContactPredictor(link_extents(self.robots[0]), self.dof, spec.timestep)
+        self.friction = self._friction()
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
@@ -72,6 +77,13 @@ class Pack:
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``."""
         return build_scene(self.spec, system)
+
+    def _friction(self) -> Friction:
+        """Return the friction and damping of the joints that the engine does not simulate."""
+        if not DISSIPATION[self.spec.dissipation].modelled:
+            return Friction()
+        rows = (np.array([[getattr(joint, name) for joint in self.spec.joints]]) for name in ("friction", "damping"))
+        return Friction(*(row if row.any() else None for row in rows))
 
     def _bind(self) -> None:
         """Prepare the calls of every sim step, for the present robots and systems."""
@@ -157,6 +169,10 @@ class Pack:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], a new array."""
         return self._calls.passive_force(gravity, coriolis, dtype)
 
+    def delivered(self, effort: NDArray[Any]) -> NDArray[Any]:
+        """Return the efforts that the motors deliver when these are asked for (M, dof) [N m or N]."""
+        return effort
+
     def write_qf(self, effort: NDArray[Any]) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
@@ -220,7 +236,7 @@ class Pack:
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).
 
-        The URDF's joint damping, which SAPIEN also implements as drive damping, is added to ``damping``.
+        Where the engine simulates the URDF's joint damping, which is drive damping too, it is added to ``damping``.
         """
         limit = np.minimum(force_limit, np.finfo(np.float32).max)
         tables = (np.broadcast_to(table, self.qf.shape).flat for table in (stiffness, damping + self._damping, limit))

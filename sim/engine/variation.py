@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.friction import Friction
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
@@ -26,7 +27,7 @@ class Variation:
     payload: Float64
     """Mass added to ``link`` (envs,) [kg]."""
     friction: Float64
-    """Joint friction added (envs,), PhysX's dimensionless coefficient."""
+    """Coulomb friction added to every joint (envs,) [N m or N]."""
     link: str
     """Name of the link that carries the payload."""
     resolution: float = 0.0
@@ -48,15 +49,18 @@ class VariedPack(Pack):
         self._pending = np.zeros((size, self.dof)) if variation.late else None
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
-        """Return a new scene and the robot in it, with payload and friction."""
+        """Return a new scene and the robot in it, with its payload."""
         scene, robot = super()._build(row, system)
         variation = self._variation
         for link in robot.links:
             if link.name == variation.link:
                 link.set_mass(link.mass + float(variation.payload[row]))
-        for joint in robot.active_joints:
-            joint.set_friction(joint.friction + float(variation.friction[row]))
         return scene, robot
+
+    def _friction(self) -> Friction:
+        """Return the friction of the joints, with what is added."""
+        model, added = super()._friction(), self._variation.friction[:, None] + np.zeros((self.size, self.dof))
+        return model._replace(coulomb=added if model.coulomb is None else added + model.coulomb)
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the joint positions as the sensors measure them."""
@@ -72,11 +76,11 @@ class VariedPack(Pack):
             force = force - self._model.inverse_dynamics(qpos, still, still)
         return force.astype(dtype)
 
-    def write_qf(self, effort: NDArray[Any]) -> None:
-        """Apply efforts, or those of the step before where they are late."""
+    def delivered(self, effort: NDArray[Any]) -> NDArray[Any]:
+        """Return these efforts, or those of the step before where they are late."""
         if self._pending is not None:
             effort, self._pending = self._pending, np.array(effort, np.float64)
-        super().write_qf(effort)
+        return effort
 
     def write_state(self, rows: Sequence[int], *state: Any) -> None:
         """Place robots; their pending efforts are dropped."""

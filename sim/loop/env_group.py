@@ -10,6 +10,7 @@ from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.control import CONTROLS
 from sim.loop.faults import FaultContainment, finite
+from sim.loop.friction import JointFriction
 from sim.loop.snapshot import EnvStates
 from sim.options import RunnerOptions
 
@@ -28,6 +29,8 @@ class EnvGroup:
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         self._control = CONTROLS[options.control](pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
+        self._friction = JointFriction(pack)
+        self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._qpos = pack.read_qpos()
         self._steps = 0
 
@@ -66,7 +69,7 @@ class EnvGroup:
         containment, observation = self._containment, rows.observation
         observation.qpos[...] = self._qpos
         observation.qvel[...] = self.pack.read_qvel(np.float32)
-        observation.effort[...] = self.pack.qf
+        observation.effort[...] = self._motor
         observation.saturated[...] = self._control.saturated
         observation.ok[...] = ~containment.failed
         for table, last in zip(rows.fault, (containment.step, containment.joint, containment.cause), strict=True):
@@ -82,12 +85,13 @@ class EnvGroup:
         return EnvStates(
             qpos=pack.read_qpos(np.float32),
             qvel=pack.read_qvel(np.float32),
-            effort=pack.qf.copy(),
+            effort=self._motor.copy(),
             root=pack.read_root(),
             content=pack.read_content(),
             isolated=pack.isolated.copy(),
             saturated=self._control.saturated,
             controller=self._control.read(),
+            friction=self._friction.read(),
             containment=self._containment.read(),
         )
 
@@ -102,13 +106,16 @@ class EnvGroup:
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
         self._control.write(states.controller, states.saturated)
+        self._friction = JointFriction(pack)
+        self._friction.write(states.friction)
+        self._motor[...] = states.effort
         self._qpos = pack.read_qpos()
 
     # -- the closed loop ---------------------------------------------------------------------------------------
 
     def _run_substeps(self, substeps: int, command: Command) -> None:
         """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
-        pack, control = self.pack, self._control
+        pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
         for step in range(substeps):
             forward = self._feedforward(command)
@@ -117,6 +124,11 @@ class EnvGroup:
                 self._contain(pack.read_qpos(), step)
                 forward = self._feedforward(command)
             effort = control.effort(self._qpos, forward, step)
+            if effort is not None:
+                self._motor[...] = effort = pack.delivered(effort)
+            if friction.acts:
+                motor = np.zeros_like(self._qpos) if effort is None else effort
+                effort = friction.effort(motor, pack.read_qvel(), self._steps + step)
             if effort is not None:
                 pack.write_qf(effort)
             pack.step()
@@ -185,5 +197,7 @@ class EnvGroup:
         rows = np.flatnonzero(mask)
         self.pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
         self.pack.suspend(self._containment.suspended)
+        self._motor[mask] = 0.0
         self._qpos = self.pack.read_qpos()
         self._control.reset(self._qpos, mask)
+        self._friction.reset(mask)

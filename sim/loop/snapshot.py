@@ -22,10 +22,11 @@ import batchpid as bp
 from batchpid.choices import CHOICE_TYPES
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
+from batchpid.friction import FrictionState
 from batchpid.validate import file_path
 from sim.loop.faults import CAUSES, FaultContainment
 
-_FORMAT = 3
+_FORMAT = 4
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, EOFError)
 """Errors that np.load and the steps after it raise for files that are no snapshot."""
 
@@ -46,6 +47,8 @@ class EnvStates:
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
+    friction: dict[str, NDArray[Any]]
+    """Leaves of :class:`batchpid.friction.FrictionState`."""
     containment: dict[str, NDArray[Any]]
     """See :class:`sim.loop.faults.FaultContainment`."""
 
@@ -60,8 +63,12 @@ class EnvStates:
         tables = [_flatten(vars(replace(part, content=_widen(part.content, width)))) for part in parts]
         return EnvStates(**_nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
 
-    def check(self, num_envs: int, dof: int, params: bp.PIDParams, content_sizes: Sequence[int]) -> None:
+    def check(
+        self, num_envs: int, dof: int, params: bp.PIDParams, friction: bool, content_sizes: Sequence[int]
+    ) -> None:
         """Check that these are states of so many envs and joints, under ``params``, with content of such sizes (envs,).
+
+        ``friction`` tells whether joints have Coulomb friction.
 
         Raises
         ------
@@ -78,6 +85,7 @@ class EnvStates:
             isolated=row,
             saturated=table > 0,
             controller={name: leaf for name, leaf in bp.init(params, table)._asdict().items() if leaf is not None},
+            friction=dict.fromkeys(FrictionState._fields, table) if friction else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = _flatten(vars(expected)), _flatten(vars(self))
@@ -200,7 +208,7 @@ def _flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 
 def _nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the groups of :func:`_flatten`."""
-    groups: dict[str, Any] = {"controller": {}, "containment": {}}
+    groups: dict[str, Any] = {"controller": {}, "friction": {}, "containment": {}}
     for name, rows in tables.items():
         group, dot, leaf = name.partition(".")
         if dot:

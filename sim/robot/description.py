@@ -116,15 +116,21 @@ def register_dynamics(make: Callable[[RobotDescription, bool], Dynamics]) -> Non
 
 
 class Dissipation(NamedTuple):
-    """PhysX's dimensionless friction coefficient of every joint, None for the URDF's; damping of every link [1/s]."""
+    """Friction and damping in the engine.
 
-    joint_friction: float | None
+    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
+    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.friction`, in the URDF's units,
+    and not the engine's.
+    """
+
+    joint_friction: float
     link_damping: float
+    modelled: bool
 
 
 DISSIPATION = {
-    "urdf": Dissipation(joint_friction=None, link_damping=0.0),
-    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05),  # SAPIEN 3's defaults
+    "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
 }
 """Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""
 
@@ -232,6 +238,11 @@ class RobotDescription(Urdf):
     def damping(self) -> Float64:
         """Viscous damping of the joints (dof,) [N m s/rad or N s/m]."""
         return np.array([joint.damping for joint in self.joints])
+
+    @property
+    def friction(self) -> Float64:
+        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien", which has PhysX's own."""
+        return np.array([joint.friction for joint in self.joints]) * DISSIPATION[self.dissipation].modelled
 
     @property
     def start(self) -> Float64:

@@ -93,14 +93,13 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
     def found(severity: str, code: str, text: str, remedy: str) -> Finding:
         return Finding(severity, code, text, remedy, joint.name)
 
-    imposed = DISSIPATION[robot.dissipation].joint_friction
+    dissipation = DISSIPATION[robot.dissipation]
     friction = f"friction {joint.friction:g}"
-    if joint.friction and imposed is None:
-        text = f"{friction}: the URDF means {joint.effort_unit}, PhysX a coefficient that multiplies the joint's load"
-        remedy = "expect another steady-state error than from Coulomb friction, or set it to 0"
-        yield found("warning", "friction", text, remedy)
-    if imposed is not None and joint.friction != imposed:
-        text = f"{friction} of the URDF is replaced by SAPIEN's default {imposed:g}"
+    if dissipation.modelled and joint.friction >= joint.effort_limit > 0:
+        text = f"{friction} {joint.effort_unit} is not below its effort limit of {joint.effort_limit:g}: it cannot move"
+        yield found("warning", "friction", text, "correct <dynamics friction=> or <limit effort=>")
+    if not dissipation.modelled and joint.friction != dissipation.joint_friction:
+        text = f"{friction} of the URDF is replaced by SAPIEN's default {dissipation.joint_friction:g}"
         yield found("note", "friction", text, "load with dissipation='urdf' to keep it")
     if joint.mimic is not None:
         law = f"mimics {joint.mimic.joint!r} (multiplier {joint.mimic.multiplier:g}, offset {joint.mimic.offset:g})"

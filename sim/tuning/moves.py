@@ -161,6 +161,7 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
 def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200) -> Float64:
     """Return the efforts (samples, dof) of the minimum-jerk motion from ``start`` to ``target`` in ``duration`` [s].
 
+    They overcome the joints' friction and damping.
     T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
     """
     t = np.linspace(0, 1, samples)[:, None]
@@ -168,7 +169,8 @@ def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float
     qpos = start + step * (10 * t**3 - 15 * t**4 + 6 * t**5)
     qvel = step * (30 * t**2 - 60 * t**3 + 30 * t**4) / duration
     qacc = step * (60 * t - 180 * t**2 + 120 * t**3) / duration**2
-    return robot.dynamics().inverse_dynamics(qpos, qvel, qacc)
+    dissipation = robot.damping * qvel + robot.friction * np.sign(qvel)
+    return robot.dynamics().inverse_dynamics(qpos, qvel, qacc) + dissipation
 
 
 def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> Float64:

@@ -40,10 +40,10 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
             "link 'tip'.*costs time",
         ),
         (
-            one_joint(LIMIT + '<dynamics friction="0.2"/>'),
+            one_joint(LIMIT + '<dynamics friction="12"/>'),
             "friction",
             "warning",
-            "'hinge': friction 0.2.*N m",
+            "'hinge': friction 12 N m.*effort limit of 10.*cannot move",
         ),
         (one_joint("", "continuous"), "continuous", "note", "'hinge': its position wraps"),
         (
