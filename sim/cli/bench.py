@@ -39,7 +39,7 @@ class BenchCommand:
     peers: flags.Switch = False
     """Measure MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop, too, where installed."""
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """Figures to write, with the machine and the versions: .json."""
 

@@ -26,7 +26,7 @@ class CompareCommand:
     friction: flags.Friction = 0.1
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
     """First two sets on the first move, to draw: .png or .svg."""
 

@@ -28,7 +28,7 @@ class DemoCommand:
     seed: int = 0
     """Seed of the start poses."""
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     picture: Path = Path("out/demo.png")
     """Step responses to draw: .png or .svg."""
     viewer: flags.Switch = False

@@ -34,7 +34,7 @@ RecordedRobot = Annotated[
     tyro.conf.Positional,
     _flag("Bundled robot, or path of a URDF. Default: that of the recording, or panda."),
 ]
-MissingMeshes = Annotated[Literal["error", "skip"], _flag("Raise an error for missing meshes, or skip their shapes.")]
+MissingMeshes = Annotated[Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
 Workers = Annotated[int | None, _flag("Processes that step the scenes; 0: this one. Default: one per available core.")]
 Gains = Annotated[

@@ -23,7 +23,7 @@ class InspectCommand:
     """List the fixed joints too."""
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 

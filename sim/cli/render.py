@@ -28,7 +28,7 @@ class RenderCommand:
     """Width of the film [pixels]."""
     height: int = 540
     """Height of the film [pixels]."""
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     out: Path = Path("out/film.mp4")
     """Film to write: .mp4 or .gif."""
 

@@ -41,7 +41,7 @@ class RolloutCommand:
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None

@@ -42,7 +42,7 @@ class TuneCommand:
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     time_limit: flags.TimeLimit = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False
     """Continue a search with the same options that was stopped."""
     out: flags.OptionalPath = None

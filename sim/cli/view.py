@@ -37,7 +37,7 @@ class ViewCommand:
     compensate: flags.Compensate = "gravity+coriolis"
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "error"
+    missing_meshes: flags.MissingMeshes = "skip"
     play: flags.OptionalPath = None
     """Recorded run to show: .npz or .h5."""
     fps: flags.Fps = 30.0

@@ -82,13 +82,15 @@ class Joint:
 class Link:
     """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
 
-    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF: both are given, and not zero.
+    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
+    that inertia tensor: see :func:`sim.robot.inertia.triangle_excess`.
     """
 
     name: str
     mass: float | None
     collisions: int
     inertial: bool
+    triangle_excess: float = 0.0
 
 
 class Dynamics(Protocol):

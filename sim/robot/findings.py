@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lxml import etree
+
 from batchpid.errors import RobotError
 
+MOST_LISTED = 50  # repairs in an error
 SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
 
 
@@ -36,9 +39,19 @@ class Finding:
         return f"{self.severity}: {self.where}: {self.text}; {self.remedy}"
 
 
+def finding_of(element: etree._Element, severity: str, code: str, text: str, remedy: str) -> Finding:
+    """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the robot."""
+    owner: etree._Element | None = element
+    while owner is not None and owner.tag not in ("joint", "link"):
+        owner = owner.getparent()
+    joint, link = (None if owner is None or owner.tag != tag else owner.get("name") for tag in ("joint", "link"))
+    return Finding(severity, code, text, remedy, joint, link)
+
+
 def refuse(path: Path, repairs: Sequence[Finding]) -> None:
     """Raise a RobotError that lists the ``repairs`` of the URDF at ``path``, if there are any."""
     if repairs:
-        listed = "".join(f"\n  {each.where}: {each.text}; {each.remedy}" for each in repairs)
+        listed = "".join(f"\n  {each.where}: {each.text}; {each.remedy}" for each in repairs[:MOST_LISTED])
+        listed += "\n  ..." if len(repairs) > MOST_LISTED else ""
         count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
         raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")

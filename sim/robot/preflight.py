@@ -20,6 +20,7 @@ from sim.robot.findings import SEVERITIES, Finding
 from sim.robot.stability import stability_report
 from sim.robot.urdf import mimic_works
 
+EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
 NEAR_BOUND = 0.5  # share of the stability range above which gains are reported: other poses may have less inertia
 
 
@@ -55,6 +56,13 @@ def check(
 def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
     for link in robot.links:
+        if link.triangle_excess > EXCESS:
+            percent = f"{100 * link.triangle_excess:.0f} %"
+            text = (
+                f"no body has its inertia tensor: the largest principal moment is {percent} of itself above the sum of "
+            )
+            text += "the others; it is simulated as given"
+            yield Finding("note", "inertia", text, "correct <inertia>", link=link.name)
         if link.inertial or (robot.fixed_base and link.name not in carriers):
             continue
         fixed = link.name in carriers and not carriers[link.name].moves
@@ -120,9 +128,7 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
         remedy = "give <limit lower= upper=>, so that setpoints can be checked"
         yield found("note", "no-limits", "it has no position limits", remedy)
     remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
-    if joint.effort_limit == 0:
-        yield found("warning", "zero-effort", "its effort limit is 0: within it no controller can move it", remedy)
-    elif math.isinf(joint.effort_limit):
+    if math.isinf(joint.effort_limit):
         yield found("note", "no-effort-limit", "it has no effort limit, so efforts are not saturated", remedy)
 
 

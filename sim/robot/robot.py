@@ -37,7 +37,7 @@ class Robot(RobotDescription):
         name_or_path: str | Path,
         *,
         package_dirs: Sequence[str | Path] = (),
-        missing_meshes: str = "error",
+        missing_meshes: str = "skip",
         dissipation: str = "urdf",
         fixed_base: bool = True,
         strict: bool = False,
@@ -49,7 +49,7 @@ class Robot(RobotDescription):
         package_dirs
             Folders in which ``package://`` mesh paths are looked up first.
         missing_meshes
-            ``"error"``, or ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read.
+            ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or ``"error"``.
         dissipation
             ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: SAPIEN's defaults,
             joint friction 0.05 and link damping 0.05, for comparison with its tutorial.

@@ -7,38 +7,27 @@ mimic joint that SAPIEN would silently mis-simulate.
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lxml import etree
 
 from batchpid.errors import RobotError
-from sim.robot.description import MOVING_TYPES, Joint, Link, Mimic, Urdf
+from sim.robot.description import Joint, Link, Mimic, Urdf
 from sim.robot.findings import Finding, refuse
+from sim.robot.inertia import from_entries, triangle_excess
+from sim.robot.joint_repair import ends_of
+from sim.robot.link_repair import MOMENTS
 from sim.robot.meshes import find_mesh, mesh_problem
+from sim.robot.repair import repair
 from sim.robot.xml import number, numbers, parse_xml
 
+MOST_READ = 4096  # links and joints of a file
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 MAX_PAIRS = 31  # SAPIEN has a bit for each pair of links that may not collide
-SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
-SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6  # of shapes [m] and scales of meshes, by PhysX's limits of the latter
-_SHAPES = {  # that SAPIEN knows: their attributes, each with as many numbers as it has
-    "box": {"size": "0 0 0"},
-    "sphere": {"radius": "0"},
-    "cylinder": {"radius": "0", "length": "0"},
-    "capsule": {"radius": "0", "length": "0"},
-    "mesh": {"scale": "1 1 1"},
-}
-_READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
-    "robot": {"link", "joint"},
-    "link": {"inertial", "collision"},
-    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
-}
 
 
 def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, strict: bool) -> Urdf:
@@ -54,22 +43,19 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     RobotError
         Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a bad mesh.
     """
-    root = parse_xml(path)
+    repairs: list[Finding] = []
+    root = parse_xml(path, repairs)
     if root.tag != "robot":
         raise RobotError(f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?")
-    if (count := len(root.findall("link"))) > MAX_LINKS:
-        remedy = "merge links that are joined by fixed joints, or split the robot"
-        raise RobotError(f"{path}: has {count} links; PhysX holds at most {MAX_LINKS} in one robot; {remedy}")
-    for parent in [*root.findall("link"), *root.findall("joint"), root]:
-        for child in [child for child in parent if child.tag not in _READ[parent.tag]]:
-            parent.remove(child)
+    if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
+        raise RobotError(f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not need")
+    repairs += repair(root, path)
     missing = _resolve_meshes(root, path, package_dirs)
     if missing and missing_meshes == "error":
         raise RobotError(
             f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the file, pass "
             "package_dirs=[...] with the folder that holds the package, or missing_meshes='skip' to simulate without"
         )
-    repairs = []
     if missing:
         text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
@@ -78,13 +64,13 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     links = [_read_link(element, path) for element in root.findall("link")]
     ordered = _breadth_first(links, joints, path)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
-        if joint.mimic is not None and joint.mimic.joint not in (other.name for other in joints):
-            problem = f"joint {joint.name!r} mimics the unknown joint {joint.mimic.joint!r}"
-            raise RobotError(f"{path}: {problem}; correct the name")
         if joint.mimic is not None and not mimic_works(joint, joints):
             element.remove(element.find("mimic"))  # SAPIEN would mis-simulate it; the preflight reports it
     if strict:
         refuse(path, repairs)
+    if (count := len(root.findall("link"))) > MAX_LINKS:
+        remedy = "merge links that are joined by fixed joints, or split the robot"
+        raise RobotError(f"{path}: has {count} links; PhysX holds at most {MAX_LINKS} in one robot; {remedy}")
     text = etree.tostring(root, encoding="unicode")
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
 
@@ -108,47 +94,24 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
 
 
 def _read_joint(element: etree._Element, path: Path) -> Joint:
-    """Return a joint, and write out or remove what SAPIEN fails on.
-
-    SAPIEN reads a missing limit as NaN, fails on ``<dynamics>`` without damping, and parses what it does not use.
-    """
+    """Return a repaired joint, and write out or remove what SAPIEN fails on."""
     name, kind = element.get("name", ""), element.get("type", "")
-    where, ranged = f"{path}: joint {name!r}", kind in ("revolute", "prismatic")
-    if not name:
-        raise RobotError(f"{where}: has no name; add name=")
-    if kind not in (*MOVING_TYPES, "fixed"):
-        remedy = "use revolute, continuous, prismatic or fixed"
-        raise RobotError(f"{where}: type {kind!r} cannot be simulated by SAPIEN's loader; {remedy}")
-    parent, child = (None if end is None else end.get("link") for end in map(element.find, ("parent", "child")))
+    where = f"{path}: joint {name!r}"
+    parent, child = ends_of(element)
     if not parent or not child:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
     axis, limit, dynamics, mimic = map(element.find, ("axis", "limit", "dynamics", "mimic"))
     fields: dict[str, Any] = _origin(element, where)
-    if axis is not None and kind == "fixed":
-        element.remove(axis)
-    elif axis is not None:
+    if axis is not None:
         fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
-        if math.hypot(*fields["axis"]) < 1e-3:
-            raise RobotError(f"{where}: <axis xyz={axis.get('xyz')!r}> has no direction; correct the URDF")
-    if limit is None and ranged:
-        raise RobotError(f"{where}: a {kind} joint needs <limit lower= upper= effort= velocity=>; add it")
     if limit is not None:
-        limits = {f"{key}_limit": number(limit, key, "inf", where, limit=True) for key in ("effort", "velocity")}
-        if min(limits.values()) < 0:
-            raise RobotError(f"{where}: effort and velocity limits must be >= 0 ({limits}); correct the URDF")
-        for key in ("lower", "upper") if ranged else ():
-            limits[key] = number(limit, key, "0", where, limit=True)
-            limit.set(key, repr(limits[key]))
-        if ranged and limits["lower"] > limits["upper"]:
-            text = f"lower limit {limits['lower']:g} is above upper limit {limits['upper']:g}"
-            raise RobotError(f"{where}: {text}; swap them")
-        if not ranged:
+        fields |= {f"{key}_limit": number(limit, key, "inf", where, limit=True) for key in ("effort", "velocity")}
+        if kind == "continuous":
             element.remove(limit)
-        fields |= limits
+        else:
+            fields |= {key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")}
     for key in ("damping", "friction") if dynamics is not None else ():
         fields[key] = number(dynamics, key, "0", where)
-        if fields[key] < 0:
-            raise RobotError(f"{where}: damping and friction must be >= 0 ({key} is {fields[key]}); correct the URDF")
         dynamics.set(key, repr(fields[key]))
     if mimic is not None:
         multiplier, offset = number(mimic, "multiplier", "1", where), number(mimic, "offset", "0", where)
@@ -172,43 +135,16 @@ def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
 
 
 def _read_link(element: etree._Element, path: Path) -> Link:
-    """Return a link, and write out or remove those parts of its ``<inertial>`` that SAPIEN fails on."""
-    name = element.get("name", "")
-    where = f"{path}: link {name!r}"
-    if not name:
-        raise RobotError(f"{where}: has no name; add name=")
-    mass, inertia = element.find("inertial/mass"), element.find("inertial/inertia")
-    value = None if mass is None else number(mass, "value", "0", where)
-    if value and value < SMALLEST:
-        raise RobotError(f"{where}: mass {value} must be 0 or at least {SMALLEST:g} kg; correct the URDF")
-    tensor = np.zeros((3, 3))
-    if inertia is not None:
-        for row, column, key in zip(*np.triu_indices(3), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), strict=True):
-            tensor[row, column] = tensor[column, row] = number(inertia, key, "0", where)
-            inertia.set(key, inertia.get(key, "0"))
-        if tensor.any() and np.linalg.eigvalsh(tensor)[0] < SMALLEST:
-            problem = f"whose principal moments are not all at least {SMALLEST:g} kg m^2"
-            raise RobotError(f"{where}: no body has the inertia {dict(inertia.attrib)}, {problem}; correct the URDF")
-    for part in [*element]:
+    """Return a repaired link."""
+    name, inertial = element.get("name", ""), element.find("inertial")
+    where, collisions = f"{path}: link {name!r}", element.findall("collision")
+    for part in [each for each in (inertial, *collisions) if each is not None]:
         _origin(part, where)
-        if part.tag == "inertial" and not (value and tensor.any()):
-            element.remove(part)  # SAPIEN does not use it
-        elif part.tag == "collision":
-            _check_shapes(part, where)
-    return Link(name, value, len(element.findall("collision")), bool(value) and bool(tensor.any()))
-
-
-def _check_shapes(collision: etree._Element, where: str) -> None:
-    shapes = [shape for shape in collision.iterfind("geometry/*") if shape.tag in _SHAPES]
-    if not shapes:
-        raise RobotError(f"{where}: a <collision> has none of {', '.join(_SHAPES)}; add <geometry> with a shape")
-    for shape in shapes:
-        for key, default in _SHAPES[shape.tag].items():
-            sizes = numbers(shape, key, default, where)
-            sizes = tuple(map(abs, sizes)) if key == "scale" else sizes  # a negative scale mirrors the mesh
-            if min(sizes) < SMALLEST_SIZE or max(sizes) > LARGEST_SIZE:
-                need = f"must be > 0, from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
-                raise RobotError(f"{where}: <{shape.tag} {key}={shape.get(key)!r}> {need}; correct the URDF")
+    if inertial is None:
+        return Link(name, None, len(collisions), False)
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    excess = triangle_excess(from_entries([number(inertia, key, "0", where) for key in MOMENTS]))
+    return Link(name, number(mass, "value", "0", where), len(collisions), True, excess)
 
 
 def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
@@ -220,18 +156,11 @@ def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]
 def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
     """Return the joints level by level from the root, siblings in file order, if they form one tree."""
     known, children = [link.name for link in links], [joint.child_link for joint in joints]
-    linked, moved, below = set(known), set(children), defaultdict(list)
+    moved, below = set(children), defaultdict(list)
     for joint in joints:
         below[joint.parent_link].append(joint)
-        for link in {joint.parent_link, joint.child_link} - linked:
-            raise RobotError(f"{path}: joint {joint.name!r} names the unknown link {link!r}; add the link")
-    for problem, names, remedy in (
-        ("link name used twice", known, "names must be unique"),
-        ("joint name used twice", [joint.name for joint in joints], "names must be unique"),
-        ("link with two parents", children, "a robot must be a tree"),
-    ):
-        if twice := sorted(name for name, count in Counter(names).items() if count > 1):
-            raise RobotError(f"{path}: {problem}: {', '.join(twice)}; {remedy}")
+    if twice := sorted(name for name, count in Counter(children).items() if count > 1):
+        raise RobotError(f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree")
     roots = [name for name in known if name not in moved]
     if len(roots) != 1:
         raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")

@@ -7,38 +7,80 @@ nesting and the size of text, which the standard library's parser does not.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 from lxml import etree
 
 from batchpid.errors import RobotError
+from sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
+MOST_PREFIXES = 100  # of namespaces that nobody declared
 LARGEST = 1e18  # magnitude of a number, whose square single precision, that of PhysX, can hold
 LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
 
 
-def parse_xml(path: Path) -> etree._Element:
+def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
     """Return the root element of the file at ``path``, without comments and processing instructions.
+
+    A file that is not quite XML is read as :func:`_lenient` says, and a finding appended to ``repairs``.
 
     Raises
     ------
     RobotError
         The file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or has a DTD.
     """
-    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
         if len(data) > SIZE_LIMIT:
             raise RobotError(f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need")
-        root = etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
+        root = _parse(data)
     except etree.XMLSyntaxError as error:
-        raise RobotError(f"{path}: not well-formed XML: {error.msg}; correct the file at that line") from error
+        try:
+            root = _lenient(data)
+        except etree.XMLSyntaxError:
+            raise RobotError(f"{path}: not well-formed XML: {error.msg}; correct the file at that line") from error
+        if repairs is not None:
+            text = f"not well-formed XML: {error.msg}; read as if that were correct"
+            repairs.append(Finding("warning", "xml", text, "correct the file at that line"))
     except OSError as error:
         raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise RobotError(f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines")
+    return root
+
+
+def _parse(data: bytes) -> etree._Element:
+    options = {"resolve_entities": False, "no_network": True, "load_dtd": False}
+    return etree.fromstring(data, etree.XMLParser(**options, remove_comments=True, remove_pis=True))
+
+
+def _lenient(data: bytes) -> etree._Element:
+    """Return the first ``<robot>``, or other element, of a file that is XML but for what other readers of URDFs accept.
+
+    These are: text or comments before the declaration or after the root, a wrong encoding, ``--`` in comments, ``&``
+    alone, and prefixes of namespaces that nobody declared.
+    """
+    utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = data.decode("utf-16" if utf16 else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    for start, end in (("<!--", "-->"), ("<?", "?>")):  # comments and processing instructions, in linear time
+        first, *rest = text.split(start)
+        text = first + "".join(part.partition(end)[2] for part in rest)
+    text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
+    prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[:MOST_PREFIXES]
+    declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
+    wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
+    root = wrapper.find("robot")
+    root = wrapper[0] if root is None and len(wrapper) else root
+    if root is None:
+        raise etree.XMLSyntaxError("no element", 0, 0, 0)
+    wrapper.remove(root)
+    root.tail = None
     return root
 
 
@@ -67,3 +109,11 @@ def numbers(
 def number(element: etree._Element | None, key: str, default: str, where: str, limit: bool = False) -> float:
     """Return the number in an attribute; see :func:`numbers`."""
     return numbers(element, key, default, where, limit)[0]
+
+
+def readable(element: etree._Element | None, key: str, default: str, limit: bool = False) -> tuple[float, ...] | None:
+    """Return the numbers in an attribute, or None where :func:`numbers` raises."""
+    try:
+        return numbers(element, key, default, "", limit)
+    except RobotError:
+        return None

@@ -69,7 +69,7 @@ def try_loading(path: Path, build: bool) -> None:
     """Load a robot and ``build`` a scene of it: an error is one of ours, and neither takes long nor much memory."""
     before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     try:
-        loaded = Robot.load(path, missing_meshes="skip")
+        loaded = Robot.load(path)
         if build:
             with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0), substeps=1) as runner:
                 runner.step(loaded.start)

@@ -124,8 +124,8 @@ def test_an_unreadable_mesh_is_an_error_or_skipped_and_reported(case, tmp_path):
     (tmp_path / name).write_bytes(data)
     path = write(tmp_path, arm(name))
     with pytest.raises(RobotError, match=rf"not readable: {name} \(.*missing_meshes='skip'"):
-        Robot.load(path)
-    loaded = Robot.load(path, missing_meshes="skip")
+        Robot.load(path, missing_meshes="error")
+    loaded = Robot.load(path)
     assert loaded.missing_meshes[0].startswith(f"{name} (")
     assert "missing-mesh" in {finding.code for finding in loaded.check()}
     with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:

@@ -47,12 +47,11 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
         ),
         (one_joint("", "continuous"), "continuous", "note", "'hinge': its position wraps"),
         (
-            one_joint('<limit effort="1" velocity="1"/>'),
+            one_joint('<limit lower="0.5" upper="0.5" effort="1" velocity="1"/>'),
             "no-range",
             "warning",
-            r"'hinge'.*\[0, 0\] rad.*cannot move",
+            r"'hinge'.*\[0.5, 0.5\] rad.*cannot move",
         ),
-        (one_joint(LIMIT.replace('"10"', '"0"')), "zero-effort", "warning", "'hinge': its effort limit is 0"),
         (
             one_joint('<limit lower="-1" upper="1"/>'),
             "no-effort-limit",
@@ -60,7 +59,12 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
             "'hinge': it has no effort limit",
         ),
         (one_joint(LIMIT.replace('"1"', '"inf"')), "no-limits", "note", "'hinge': it has no position limits"),
-        (one_joint(LIMIT + '<mimic joint="hinge"/>'), "mimic", "warning", "'hinge'.*mis-simulate.*independently"),
+        (
+            one_joint(arm=INERTIAL.replace('izz="0.1"', 'izz="0.3"')),
+            "inertia",
+            "note",
+            "'arm': no body has.* 33 % .*as given",
+        ),
     ],
 )
 def test_each_oddity_of_a_urdf_has_its_finding(text, code, severity, message, tmp_path):

@@ -1,0 +1,158 @@
+"""Repair of a URDF's joints: types, axes, limits, friction and damping, mimics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from lxml import etree
+
+from sim.robot.description import MOVING_TYPES
+from sim.robot.findings import Finding, finding_of
+from sim.robot.xml import readable
+
+
+def repair(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
+    """Repair a joint of the robot ``root``, but for its mimic."""
+    yield from _type(joint, root)
+    if joint.get("type") == "fixed":
+        for tag in ("axis", "limit", "dynamics"):
+            if (element := joint.find(tag)) is not None:
+                joint.remove(element)
+        return
+    yield from _axis(joint)
+    yield from _limits(joint)
+    yield from _dynamics(joint)
+
+
+def ends_of(joint: etree._Element) -> tuple[str | None, str | None]:
+    """Return the names of the parent and the child link of a joint, None where they are not given."""
+    parent, child = (None if end is None else end.get("link") for end in map(joint.find, ("parent", "child")))
+    return parent, child
+
+
+def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
+    """Fix joints of types that SAPIEN lacks."""
+    kind = joint.get("type", "")
+    if kind.lower() in (*MOVING_TYPES, "fixed"):
+        joint.set("type", kind.lower())
+        return
+    joint.set("type", "fixed")
+    parent = ends_of(joint)[0]
+    at_root = kind == "floating" and all(ends_of(other)[1] != parent for other in root.findall("joint"))
+    severity, remedy = "warning", "use revolute, continuous or prismatic joints"
+    if at_root:
+        severity, remedy = "note", "load with fixed_base=False for a robot that is free to move"
+    text = f"joints of type {kind!r} cannot be simulated by SAPIEN: it is fixed"
+    yield finding_of(joint, severity, "joint-type", text, remedy)
+
+
+def _axis(joint: etree._Element) -> Iterator[Finding]:
+    """Replace an axis without direction by the URDF's default, x."""
+    axis = joint.find("axis")
+    if axis is None or joint.get("type") == "fixed":
+        return
+    direction = readable(axis, "xyz", "1 0 0")
+    length = 0.0 if direction is None else math.hypot(*direction)
+    if direction is None or length < 1e-12:
+        text = f"<axis xyz={axis.get('xyz')!r}> has no direction: it is the x axis, which is the URDF's default"
+        yield finding_of(joint, "warning", "axis", text, "correct the axis")
+        joint.remove(axis)
+    elif length < 1e-3:  # SAPIEN's bound, below which it takes another axis
+        axis.set("xyz", " ".join(repr(part / length) for part in direction))
+
+
+def _limits(joint: etree._Element) -> Iterator[Finding]:
+    """Repair the limits: what is no limit, or a placeholder, is infinite."""
+    limit, kind = joint.find("limit"), joint.get("type")
+    if kind == "fixed":
+        return
+    if limit is None:
+        limit = etree.SubElement(joint, "limit")
+    for key in ("effort", "velocity"):
+        values = readable(limit, key, "inf", limit=True)
+        if values is not None and values[0] > 0:
+            continue
+        text = limit.attrib.pop(key)
+        if values is not None and values[0] < 0:
+            limit.set(key, repr(-values[0]))
+            yield finding_of(
+                joint, "warning", "limits", f"{key} limit {text}: its magnitude is used", "make it positive"
+            )
+        else:
+            meaning = "a placeholder" if values else "no number"
+            problem = f"<limit {key}={text!r}> is {meaning}: it counts as not given, so there is no limit"
+            yield finding_of(joint, "warning", f"no-{key}-limit", problem, f"give <limit {key}=> of the motor")
+    if kind in ("revolute", "prismatic"):
+        yield from _range(joint, limit)
+
+
+def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
+    """Repair the position limits of a revolute or prismatic joint, and write them out."""
+    remedy = "give <limit lower= upper=>"
+    given = {key: limit.get(key) for key in ("lower", "upper")}
+    low, high = (readable(limit, key, "0", limit=True) for key in given)
+    for key, values in zip(given, (low, high), strict=True):
+        if values is None:
+            text = f"<limit {key}={given[key]!r}> is no number: the joint has no {key} limit"
+            yield finding_of(joint, "warning", "limits", text, remedy)
+    lower, upper = (-math.inf if low is None else low[0]), (math.inf if high is None else high[0])
+    efforts = [limit.get(key) for key in ("effort", "velocity")]
+    if lower == upper == 0 and (None in given.values() or efforts == [None, None]):
+        text = "it has no position limits" if None in given.values() else "its limits are all 0, placeholders"
+        yield finding_of(joint, "warning", "limits", f"{text}: it can move without end", remedy)
+        lower, upper = -math.inf, math.inf
+    elif lower > upper and None in given.values():
+        missing = "lower" if given["lower"] is None else "upper"
+        yield finding_of(joint, "warning", "limits", f"it has no {missing} limit: it has no end there", remedy)
+        lower, upper = (-math.inf, upper) if missing == "lower" else (lower, math.inf)
+    elif lower > upper:
+        yield finding_of(joint, "warning", "limits", f"its limits [{lower:g}, {upper:g}] are swapped", "swap them")
+        lower, upper = upper, lower
+    limit.set("lower", repr(lower))
+    limit.set("upper", repr(upper))
+
+
+def _dynamics(joint: etree._Element) -> Iterator[Finding]:
+    """Make friction and damping that cannot be zero."""
+    dynamics = joint.find("dynamics")
+    for key in ("damping", "friction") if dynamics is not None else ():
+        values = readable(dynamics, key, "0")
+        if values is None or values[0] < 0:
+            text = f"<dynamics {key}={dynamics.get(key)!r}> must be a number >= 0: it is 0"
+            yield finding_of(joint, "warning", "dynamics", text, "correct the URDF")
+            dynamics.set(key, "0")
+
+
+def mimics(root: etree._Element) -> Iterator[Finding]:
+    """Remove mimics of joints that cannot lead."""
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    sound: set[str | None] = set()  # joints whose chain of leaders ends
+    for name, joint in joints.items():
+        if (mimic := joint.find("mimic")) is None:
+            continue
+        leader = joints.get(mimic.get("joint"))
+        values = [readable(mimic, key, default) for key, default in (("multiplier", "1"), ("offset", "0"))]
+        problem = None
+        if joint.get("type") == "fixed":
+            problem = "is fixed itself"
+        elif leader is None:
+            problem = "is not in the file"
+        elif leader.get("type") == "fixed":
+            problem = "does not move"
+        elif None in values or values[0] == (0.0,):
+            problem = f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot lead it"
+        else:
+            chain, each = {name}, mimic.get("joint")
+            while each in joints and each not in sound and each not in chain:
+                chain.add(each)
+                follows = joints[each].find("mimic")
+                each = None if follows is None else follows.get("joint")
+            if each == name:
+                problem = "mimics it in turn" if len(chain) > 1 else "is this joint itself"
+            elif each not in chain:
+                sound |= chain
+        if problem is not None:
+            text = f"it mimics {mimic.get('joint')!r}, which {problem}: it moves independently"
+            yield finding_of(joint, "warning", "mimic", text, "correct <mimic joint=>, or remove it")
+            joint.remove(mimic)

@@ -1,0 +1,96 @@
+"""Repair of a URDF's links: mass, inertia and collision shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from lxml import etree
+
+from sim.robot.findings import Finding, finding_of
+from sim.robot.inertia import DENSITY, ball, from_entries, nearest_physical
+from sim.robot.xml import readable
+
+SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
+SMALLEST_RATIO = 1e-9  # of principal moments that SAPIEN's eigenvalues and single precision resolve
+SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6  # of shapes [m] and scales of meshes, by PhysX's limits of the latter
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+SHAPES = {  # that SAPIEN knows: their attributes, each with as many numbers as it has
+    "box": {"size": "0 0 0"},
+    "sphere": {"radius": "0"},
+    "cylinder": {"radius": "0", "length": "0"},
+    "capsule": {"radius": "0", "length": "0"},
+    "mesh": {"scale": "1 1 1"},
+}
+
+
+def repair(link: etree._Element) -> Iterator[Finding]:
+    """Repair a link."""
+    yield from _inertial(link)
+    yield from _collisions(link)
+
+
+def _inertial(link: etree._Element) -> Iterator[Finding]:
+    """Replace inertia tensors that no body has; remove masses that none has."""
+    if (inertial := link.find("inertial")) is None:
+        return
+    origin, mass, inertia = map(inertial.find, ("origin", "mass", "inertia"))
+    if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
+        text = f"the centre of mass {dict(origin.attrib)} is no position: it is that of the link's frame"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>")
+        inertial.remove(origin)
+    value = readable(mass, "value", "0")
+    if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
+        text = f"<mass value={mass.get('value')!r}> is no mass that PhysX can hold: it counts as not given"
+        yield finding_of(link, "warning", "inertia", text, "give a mass > 0 [kg]")
+        value = None
+    if not value or not value[0]:
+        link.remove(inertial)  # SAPIEN does not use it
+        return
+    parts = [readable(inertia, key, "0") for key in MOMENTS]
+    tensor = np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
+    moments = np.linalg.eigvalsh(tensor)
+    if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
+        changed = tensor
+    else:
+        changed = nearest_physical(tensor) if moments[2] >= SMALLEST else np.zeros((3, 3))
+        done = "replaced by the nearest that a body has"
+        if changed.max() < SMALLEST:
+            changed = ball(value[0])
+            done = f"replaced by that of a ball of its {value[0]:g} kg at {DENSITY:g} kg/m^3"
+        before, after = (
+            " ".join(f"{moment:.3g}" for moment in each) for each in (moments, np.linalg.eigvalsh(changed))
+        )
+        text = f"no body has an inertia tensor of the principal moments {before} kg m^2: {done}, {after}"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
+    if inertia is None:
+        inertia = etree.SubElement(inertial, "inertia")
+    for key, moment in zip(MOMENTS, changed[np.triu_indices(3)].tolist(), strict=True):
+        if changed is not tensor or key not in inertia.attrib:
+            inertia.set(key, repr(moment))
+
+
+def _collisions(link: etree._Element) -> Iterator[Finding]:
+    """Leave out collision shapes that PhysX cannot hold."""
+    for collision in link.findall("collision"):
+        shapes = collision.findall("geometry/*")
+        problem = f"it has none of {', '.join(SHAPES)}" if not shapes else None
+        origin = collision.find("origin")
+        if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
+            problem = f"<origin> {dict(origin.attrib)} is no position"
+        for shape in shapes:
+            for key, default in SHAPES[shape.tag].items():
+                text = shape.get(key, default)
+                if key == "scale" and len(text.split()) == 1:
+                    shape.set(key, " ".join([text] * 3))  # one factor for all axes
+                sizes = readable(shape, key, default)
+                if sizes is None or min(map(abs, sizes)) < SMALLEST_SIZE or max(map(abs, sizes)) > LARGEST_SIZE:
+                    problem = f"<{shape.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
+                elif min(sizes) < 0 and key != "scale":  # a negative scale mirrors the mesh
+                    shape.set(key, " ".join(repr(abs(size)) for size in sizes))
+                    problem_text = f"<{shape.tag} {key}={text!r}> is negative: its magnitude is used"
+                    yield finding_of(link, "warning", "collision", problem_text, "make it positive")
+        if problem is not None:
+            text = f"a collision shape is left out: {problem}"
+            yield finding_of(link, "warning", "collision", text, "correct <collision>")
+            link.remove(collision)

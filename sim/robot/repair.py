@@ -1,0 +1,163 @@
+"""Repair of URDFs as published: what can be put right without a guess of the robot's geometry.
+
+Every function changes the XML tree in place and yields a finding of each repair. What is left is valid for the reader
+(:mod:`sim.robot.urdf`), or has no repair and is an error there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from lxml import etree
+
+from batchpid.errors import RobotError
+from sim.robot import joint_repair, link_repair
+from sim.robot.findings import Finding, finding_of
+from sim.robot.joint_repair import ends_of
+from sim.robot.link_repair import SHAPES
+
+_READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
+    "robot": {"link", "joint"},
+    "link": {"inertial", "collision"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
+    "inertial": {"origin", "mass", "inertia"},
+    "collision": {"origin", "geometry"},
+    "geometry": {*SHAPES},
+}
+_MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
+_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration", "safety_controller"}
+_VECTORS = ("xyz", "rpy", "size", "scale")
+
+
+def repair(root: etree._Element, path: Path) -> list[Finding]:
+    """Repair the ``<robot>`` read from ``path`` in place and return the findings.
+
+    Raises
+    ------
+    RobotError
+        The file is a xacro that was not expanded.
+    """
+    found = [*_elements(root), *_attributes(root)]
+    _refuse_xacro(root, path)
+    found += [*_links(root), *_joints(root), *_tree(root)]
+    for joint in root.findall("joint"):
+        found += joint_repair.repair(joint, root)
+    found += joint_repair.mimics(root)
+    for link in root.findall("link"):
+        found += link_repair.repair(link)
+    return found
+
+
+def _elements(root: etree._Element) -> Iterator[Finding]:
+    """Remove elements that SAPIEN does not use, and all but the first of those that may stand once."""
+    unknown: Counter[str] = Counter()
+    xacro: Counter[str] = Counter()
+    stack = [root]
+    while stack:
+        parent, seen = stack.pop(), set()
+        for child in list(parent):
+            tag = etree.QName(child).localname
+            if child.tag in _READ[parent.tag] and (child.tag in _MANY or child.tag not in seen):
+                seen.add(child.tag)
+                stack += [child] if child.tag in _READ else []
+                continue
+            if child.tag in _READ[parent.tag]:
+                text = f"<{parent.tag}> has several <{tag}>: the first is used"
+                yield finding_of(parent, "warning", "repeated-element", text, "remove the others")
+            elif "xacro" in (etree.QName(child).namespace or ""):
+                xacro[tag] += 1
+            elif tag not in _UNUSED:
+                unknown[tag] += 1
+            parent.remove(child)
+    if xacro:
+        text = f"elements of xacro, not expanded, are left out: {_list(xacro)}"
+        yield Finding("warning", "xacro", text, "expand the file first: xacro FILE.xacro > FILE.urdf")
+    if unknown:
+        text = f"elements that the simulation does not use are left out: {_list(unknown)}"
+        yield Finding("note", "unknown-element", text, "remove them, or expect no effect")
+
+
+def _list(tags: Counter[str]) -> str:
+    shown = [f"<{tag}>" if count == 1 else f"{count} <{tag}>" for tag, count in tags.most_common(8)]
+    return ", ".join(shown) + (" and others" if len(tags) > 8 else "")
+
+
+def _attributes(root: etree._Element) -> Iterator[Finding]:
+    """Strip the attributes, remove empty ones, and separate numbers by blanks."""
+    for element in root.iter():
+        for key, value in element.items():
+            if not (text := value.strip()):
+                del element.attrib[key]
+                if key != "name":
+                    problem = f"<{element.tag} {key}=''> is empty and counts as not given"
+                    yield finding_of(element, "note", "empty-attribute", problem, "give a value, or remove it")
+            elif key in _VECTORS and "," in text:
+                element.set(key, text.replace(",", " "))
+                problem = f"<{element.tag} {key}={text!r}> is read with blanks in place of the commas"
+                yield finding_of(element, "warning", "number", problem, "separate the numbers by blanks")
+            elif text != value:
+                element.set(key, text)
+
+
+def _refuse_xacro(root: etree._Element, path: Path) -> None:
+    for element in root.iter():
+        for key, value in element.items():
+            if "${" in value:
+                problem = f"<{element.tag} {key}={value!r}> is an expression of xacro, so this is no URDF yet"
+                raise RobotError(f"{path}: {problem}; expand it first: xacro FILE.xacro > FILE.urdf")
+
+
+def _links(root: etree._Element) -> Iterator[Finding]:
+    """Remove links without a name and with a name that is taken."""
+    seen: set[str | None] = {None}
+    for link in root.findall("link"):
+        if (name := link.get("name")) in seen:
+            text = "no joint can refer to a link without name" if name is None else "this name is used twice"
+            kept = "it is left out" if name is None else "the first link is kept, the other left out"
+            yield finding_of(link, "warning", "repeated-name", f"{text}: {kept}", "give every link a name to itself")
+            root.remove(link)
+        seen.add(name)
+
+
+def _joints(root: etree._Element) -> Iterator[Finding]:
+    """Give joints without a name, or with one that is taken, a name; remove copies."""
+    seen: dict[str, tuple[str | None, str | None]] = {}
+    for joint in root.findall("joint"):
+        name, ends = joint.get("name"), ends_of(joint)
+        if name is not None and seen.get(name) == ends:
+            yield finding_of(
+                joint, "warning", "repeated-name", "it is given twice: the first is kept", "remove the copy"
+            )
+            root.remove(joint)
+            continue
+        base = new = name or "{}_to_{}".format(*ends)
+        number = 2
+        while new in seen:
+            new, number = f"{base}_{number}", number + 1
+        if new != name:
+            joint.set("name", new)
+            problem = "it had no name" if name is None else f"the name {name!r} is used twice"
+            yield finding_of(
+                joint, "warning", "repeated-name", f"{problem}: it is called {new!r}", "name it in the URDF"
+            )
+        seen[new] = ends
+
+
+def _tree(root: etree._Element) -> Iterator[Finding]:
+    """Add links that only joints name; remove links that no joint names, if others make the robot."""
+    links = {link.get("name"): link for link in root.findall("link")}
+    ends = [ends_of(joint) for joint in root.findall("joint")]
+    for name in dict.fromkeys(end for pair in ends for end in pair if end is not None):
+        if name not in links:
+            links[name] = etree.SubElement(root, "link", name=name)
+            text = "joints name this link, but it is not in the file: it is added, without mass and shape"
+            yield Finding("warning", "missing-link", text, "correct the name, or add the link", link=name)
+    joined = {end for pair in ends for end in pair}
+    for name, link in links.items():
+        if joined and name not in joined:
+            yield finding_of(
+                link, "warning", "loose-link", "no joint holds it: it is left out", "join it, or remove it"
+            )
+            root.remove(link)

@@ -1,0 +1,227 @@
+"""Faults of published URDFs that are repaired: each is told, refused by strict=True, and the robot runs."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
+
+from batchpid.errors import RobotError
+from sim import Robot, Runner
+from sim.robot.inertia import ball, nearest_physical, triangle_excess
+
+BASE, ARM, TIP = link("base"), link("arm"), link("tip")
+HINGE = joint("hinge", "base", "arm")
+SHAPE = "<collision><geometry>{}</geometry></collision>"
+TENSOR = '<inertial><mass value="2"/><inertia ixx="{}" ixy="{}" ixz="{}" iyy="{}" iyz="{}" izz="{}"/></inertial>'
+
+
+def moved(mimic: str, kind: str = "revolute") -> str:
+    """Two joints in a row, the second with a ``<mimic>``."""
+    return robot(BASE, ARM, TIP, HINGE, joint("tip_joint", "arm", "tip", kind, LIMIT + mimic))
+
+
+def limited(**attributes: str) -> str:
+    return one_joint("<limit {}/>".format(" ".join(f'{key}="{value}"' for key, value in attributes.items())))
+
+
+def mass(value: str) -> str:
+    return one_joint(arm=INERTIAL.replace('mass value="1"', f'mass value="{value}"'))
+
+
+def shaped(shape: str) -> str:
+    return one_joint(arm=INERTIAL + SHAPE.format(shape))
+
+
+REPAIRED = {  # the URDF, the code of its finding, and what that says
+    "blank before the declaration": ("\n" + one_joint(), "xml", "robot: not well-formed XML.*line 2"),
+    "comment before the declaration": ("<!-- made by hand -->" + one_joint(), "xml", "XML declaration"),
+    "byte order mark and a blank": ("\ufeff\n" + one_joint(), "xml", "XML declaration"),
+    "wrong encoding": (one_joint().replace("?>", " encoding='utf-16'?>"), "xml", "not well-formed"),
+    "hyphens in a comment": (robot(BASE, ARM, HINGE, "<!-- a -- b -->"), "xml", "hyphen"),
+    "several roots": (one_joint() + "<gazebo/>", "xml", "Extra content"),
+    "ampersand": (one_joint().replace('"test"', '"rock & roll"'), "xml", "EntityRef"),
+    "undeclared prefix": (robot(BASE, ARM, HINGE, "<xacro:macro/>"), "xacro", "left out: <macro>; expand"),
+    "unknown elements": (robot(BASE, ARM, HINGE, "<plugin/><plugin/>"), "unknown-element", "left out: 2 <plugin>"),
+    "two limits": (one_joint(LIMIT + LIMIT), "repeated-element", "'hinge': <joint> has several <limit>: the first"),
+    "empty attribute": (
+        one_joint(LIMIT.replace('"10"', '""')),
+        "empty-attribute",
+        "'hinge': <limit effort=''> is empty",
+    ),
+    "commas": (one_joint().replace("0 1 0", "0, 1, 0"), "number", "'hinge': <axis xyz='0, 1, 0'>.*blanks"),
+    "link twice": (robot(BASE, ARM, ARM, HINGE), "repeated-name", "link 'arm': .*used twice: the first link is kept"),
+    "link without name": (robot(BASE, ARM, "<link/>", HINGE), "repeated-name", "link without name: it is left out"),
+    "joint twice": (robot(BASE, ARM, HINGE, HINGE), "repeated-name", "'hinge': it is given twice"),
+    "joint name twice": (
+        robot(BASE, ARM, TIP, HINGE, joint("hinge", "arm", "tip")),
+        "repeated-name",
+        "the name 'hinge' is used twice: it is called 'hinge_2'",
+    ),
+    "joint without name": (one_joint().replace('name="hinge"', ""), "repeated-name", "called 'base_to_arm'"),
+    "unknown link": (robot(BASE, HINGE), "missing-link", "link 'arm': .*is added"),
+    "loose link": (robot(BASE, ARM, TIP, HINGE), "loose-link", "link 'tip': no joint holds it"),
+    "unknown type": (
+        robot(BASE, ARM, TIP, HINGE, joint("k", "arm", "tip", "ball")),
+        "joint-type",
+        "joint 'k': joints of type 'ball'.*is fixed",
+    ),
+    "planar": (robot(BASE, ARM, TIP, HINGE, joint("k", "arm", "tip", "planar")), "joint-type", "'planar'.*is fixed"),
+    "floating base": (
+        robot(link("world", ""), BASE, ARM, HINGE, joint("k", "world", "base", "floating")),
+        "joint-type",
+        "'k': .*'floating'.*is fixed; load with fixed_base=False",
+    ),
+    "zero axis": (one_joint().replace("0 1 0", "0 0 0"), "axis", "'hinge': .*no direction: it is the x axis"),
+    "axis of two numbers": (one_joint().replace("0 1 0", "0 1"), "axis", "'hinge': .*x axis"),
+    "no limit": (one_joint(""), "limits", "'hinge': it has no position limits"),
+    "prismatic without limit": (one_joint("", "prismatic"), "limits", "'hinge': it has no position limits"),
+    "limits of 0": (limited(lower="0", upper="0", effort="0", velocity="0"), "limits", "all 0, placeholders"),
+    "no range": (limited(effort="1", velocity="1"), "limits", "'hinge': it has no position limits"),
+    "one limit": (limited(upper="-1", effort="1", velocity="1"), "limits", "'hinge': it has no lower limit"),
+    "NaN limit": (limited(lower="nan", upper="1"), "limits", "'hinge': <limit lower='nan'> is no number"),
+    "limit of 1e300": (limited(lower="0", upper="1e300"), "limits", "'hinge': <limit upper='1e300'> is no number"),
+    "swapped limits": (limited(lower="2", upper="1"), "limits", r"'hinge': its limits \[2, 1\] are swapped"),
+    "effort of 0": (one_joint(LIMIT.replace('"10"', '"0"')), "no-effort-limit", "'hinge': .*effort='0'.*placeholder"),
+    "velocity of 0": (one_joint(LIMIT.replace('"2"', '"0"')), "no-velocity-limit", "'hinge': .*placeholder"),
+    "NaN effort": (one_joint(LIMIT.replace('"10"', '"nan"')), "no-effort-limit", "'hinge': .*'nan'> is no number"),
+    "digits of another script": (one_joint(LIMIT.replace('"10"', '"1_0"')), "no-effort-limit", "'1_0'> is no number"),
+    "negative effort": (one_joint(LIMIT.replace('"10"', '"-9"')), "limits", "'hinge': effort limit -9: its magnitude"),
+    "negative damping": (one_joint(LIMIT + '<dynamics damping="-1"/>'), "dynamics", "'hinge': .*damping='-1'.*it is 0"),
+    "infinite friction": (one_joint(LIMIT + '<dynamics friction="inf"/>'), "dynamics", "'hinge': .*friction='inf'"),
+    "mimic of nothing": (moved('<mimic joint="ghost"/>'), "mimic", "'tip_joint': .*'ghost'.*not in the file.*independ"),
+    "mimic without joint": (moved('<mimic multiplier="2"/>'), "mimic", "'tip_joint': it mimics None"),
+    "mimic of itself": (moved('<mimic joint="tip_joint"/>'), "mimic", "'tip_joint': .*this joint itself"),
+    "mimic by 0": (moved('<mimic joint="hinge" multiplier="0"/>'), "mimic", "'tip_joint': .*multiplier '0'"),
+    "mimic by nothing": (moved('<mimic joint="hinge" offset="x"/>'), "mimic", "'tip_joint': .*offset 'x'"),
+    "mimic of a fixed joint": (
+        robot(
+            BASE,
+            ARM,
+            TIP,
+            joint("f", "base", "arm", "fixed", ""),
+            joint("k", "arm", "tip", inner=LIMIT + '<mimic joint="f"/>'),
+        ),
+        "mimic",
+        "'k': it mimics 'f', which does not move",
+    ),
+    "fixed joint that mimics": (moved('<mimic joint="hinge"/>', "fixed"), "mimic", "'tip_joint': .*is fixed itself"),
+    "mimics in a circle": (
+        moved('<mimic joint="hinge"/>').replace("</joint>", '<mimic joint="tip_joint"/></joint>', 1),
+        "mimic",
+        "'hinge': it mimics 'tip_joint', which mimics it in turn",
+    ),
+    "negative mass": (mass("-1"), "inertia", "link 'arm': <mass value='-1'> is no mass"),
+    "NaN mass": (mass("nan"), "inertia", "link 'arm': <mass value='nan'>"),
+    "mass of 1e300": (mass("1e300"), "inertia", "link 'arm': <mass value='1e300'>"),
+    "mass of 1e-300": (mass("1e-300"), "inertia", "link 'arm': <mass value='1e-300'>"),
+    "centre of mass": (
+        one_joint(arm=INERTIAL.replace("<mass", '<origin xyz="1e300 0 0"/><mass')),
+        "inertia",
+        "link 'arm': the centre of mass",
+    ),
+    "no inertia": (one_joint(arm='<inertial><mass value="2"/></inertial>'), "inertia", "'arm': .*ball of its 2 kg"),
+    "zero inertia": (one_joint(arm=TENSOR.format(*"000000")), "inertia", "'arm': .*0 0 0 .*ball of its 2 kg"),
+    "inertia of 1e300": (one_joint(arm=TENSOR.format("1e300", *"00101")), "inertia", "'arm': .*ball"),
+    "one entry everywhere": (one_joint(arm=TENSOR.format(*["1e-6"] * 6)), "inertia", "nearest.* 1e-06 1e-06 2e-06"),
+    "rounded zero": (one_joint(arm=TENSOR.format("0.2", "0", "0", "0.2", "0", "0.0")), "inertia", "0.0002 0.2 0.2"),
+    "large off-diagonal": (one_joint(arm=TENSOR.format("0.1", "1", "0", "0.1", "0", "0.1")), "inertia", "'arm'.*near"),
+    "negative moment": (one_joint(arm=TENSOR.format("-1", "0", "0", "1", "0", "1")), "inertia", "'arm'.*nearest"),
+    "shape without geometry": (one_joint(arm=INERTIAL + "<collision/>"), "collision", "'arm': .*none of box"),
+    "unknown shape": (shaped("<plane/>"), "collision", "'arm': .*none of box"),
+    "negative box": (shaped('<box size="-1 1 1"/>'), "collision", "'arm': .*size='-1 1 1'> is negative: its magn"),
+    "flat box": (shaped('<box size="1 1 0"/>'), "collision", "'arm': a collision shape is left out: <box size"),
+    "large box": (shaped('<box size="1e300 1 1"/>'), "collision", "'arm': a collision shape is left out"),
+    "NaN sphere": (shaped('<sphere radius="nan"/>'), "collision", "'arm': .*<sphere radius='nan'>"),
+    "scale of 0": (shaped('<mesh filename="x.stl" scale="0 1 1"/>'), "collision", "'arm': .*<mesh scale='0 1 1'>"),
+    "shape nowhere": (
+        one_joint(arm=INERTIAL + SHAPE.format('<box size="1 1 1"/>').replace("<geo", '<origin xyz="x"/><geo')),
+        "collision",
+        "'arm': a collision shape is left out: <origin>.* is no position",
+    ),
+    "missing mesh": (shaped('<mesh filename="package://ghost/no.stl"/>'), "missing-mesh", "package://ghost/no.stl"),
+}
+
+
+@pytest.mark.parametrize("case", REPAIRED)
+def test_a_repair_is_told_and_the_robot_runs_or_strict_refuses(case, tmp_path):
+    text, code, message = REPAIRED[case]
+    path = write(tmp_path, text)
+    repaired = Robot.load(path)
+    told = [str(finding) for finding in repaired.repairs if finding.code == code]
+    assert any(re.search(message, each) for each in told), repaired.repairs
+    assert set(repaired.repairs) <= set(repaired.check())
+    with Runner(repaired, 1, workers=0, control="effort", substeps=1, ground=False) as runner:
+        assert runner.step(np.zeros(repaired.dof)).ok.all()
+    with pytest.raises(RobotError, match="which strict=True refuses") as info:
+        Robot.load(path, strict=True)
+    assert re.search(message.split(";")[0], str(info.value))
+
+
+def test_repairs_have_the_effect_that_they_tell(tmp_path):
+    def load(case: str) -> Robot:
+        return Robot.load(write(tmp_path, REPAIRED[case][0]))
+
+    assert (load("swapped limits").lower, load("swapped limits").upper) == (1, 2)
+    assert (load("one limit").lower, load("one limit").upper) == (-np.inf, -1)
+    assert load("effort of 0").effort_limit == load("velocity of 0").velocity_limit == np.inf
+    assert load("negative effort").effort_limit == 9
+    assert load("joint name twice").joint_names == ("hinge", "hinge_2")
+    assert [joint.mimic for joint in load("mimics in a circle").joints].count(None) == 1
+    assert load("floating base").joint_names == ("hinge",)
+    assert load("commas").joints[0].axis == (0, 1, 0)
+    heavy = load("no inertia").mass_matrix([0.0])[0]
+    np.testing.assert_allclose(heavy, ball(2.0)[:1, :1], rtol=1e-4)
+
+
+def test_latin_1_that_claims_to_be_utf_8_is_read(tmp_path):
+    path = tmp_path / "test.urdf"
+    path.write_bytes(one_joint().replace("hinge", "Drehgelenk für Rück").encode("latin-1"))
+    assert Robot.load(path).joint_names == ("Drehgelenk für Rück",)
+
+
+def test_what_urdfs_hold_for_others_is_no_repair(tmp_path):
+    unused = "<visual/>", "<material/>", "<transmission/>", "<gazebo/>", "<sensor/>"
+    text = robot(link("base", "<visual/>" + INERTIAL), ARM, HINGE, *unused[1:])
+    assert Robot.load(write(tmp_path, text), strict=True).repairs == ()
+
+
+# -- Inertia -------------------------------------------------------------------------------------------------------
+
+ENTRIES = st.lists(st.floats(-1, 1), min_size=9, max_size=9)
+
+
+def symmetric(entries: list[float]) -> np.ndarray:
+    half = np.reshape(entries, (3, 3))
+    return half + half.T
+
+
+@given(ENTRIES)
+def test_the_nearest_tensor_is_physical(entries):
+    moments = np.linalg.eigvalsh(nearest_physical(symmetric(entries)))
+    assert moments[0] >= -1e-12
+    assert moments[2] <= moments[0] + moments[1] + 1e-12
+
+
+@given(ENTRIES, st.lists(st.floats(0.1, 1), min_size=3, max_size=3))
+def test_no_physical_tensor_is_nearer_than_the_nearest(entries, covariance):
+    """A body's tensor is tr(C) - C for a covariance C: any other is at least as far, but for the least slenderness."""
+    tensor, axes = symmetric(entries), np.linalg.eigh(symmetric(entries[::-1]))[1]
+    spread = (axes * covariance) @ axes.T
+    other = np.trace(spread) * np.eye(3) - spread
+    nearest = nearest_physical(tensor)
+    slack = 1e-3 * np.linalg.eigvalsh(nearest)[2] + 1e-12
+    assert np.linalg.norm(nearest - tensor) <= np.linalg.norm(other - tensor) + slack
+
+
+@given(ENTRIES)
+def test_a_physical_tensor_is_its_own_nearest(entries):
+    vectors = np.reshape(entries, (3, 3))
+    covariance = vectors @ vectors.T + 0.01 * np.eye(3)
+    tensor = np.trace(covariance) * np.eye(3) - covariance
+    assert triangle_excess(tensor) < 0
+    np.testing.assert_allclose(nearest_physical(tensor), tensor, atol=1e-12)
