@@ -4,6 +4,7 @@
 # make check    linter, formatter, types, floors and docs: what CI runs before the tests
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines
+# make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
 # make figures  measure and redraw docs/performance.md (5 minutes, on an idle machine)
 # make soak     the minutes-long tests
 #
@@ -17,7 +18,7 @@ RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
 
-.PHONY: demo test test-isa check docs format bench figures accuracy soak clean
+.PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
@@ -54,6 +55,9 @@ format: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	@$(RUN) -m pytest bench --timeout 1200 $(ARGS)
+
+bench-check: $(VENV)/.dev
+	@$(RUN) -m pytest bench -m check -s --timeout 1200 $(ARGS)
 
 MEASURED := out/bench
 bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json $(3)

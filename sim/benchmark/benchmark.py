@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from sim.benchmark.baselines import make_baselines
 from sim.benchmark.peers import make_peers
 from sim.benchmark.workload import Case, Workload, run_round
+from sim.engine.native import python_calls
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays
 from sim.loop.loop import Loop
 from sim.options import RunnerOptions
 from sim.robot.robot import Robot
+from sim.runner import Runner
 from sim.workers.shared_memory import SharedArrays
 
 Float64 = NDArray[np.float64]
@@ -35,6 +37,7 @@ CASES = {
     "bare engine, packs of 8": "internal drive, no control, no gravity, 8 robots to a system, all stepped in turn",
     "bare engine": "the same, 4 robots to a system, as the Runner packs them",
     "bare engine, pack by pack": "the same, each pack stepped for a tick while it is in the cache",
+    "closed loop, Python calls": "the closed loop without the native extension: the same as below, if there is none",
     "closed loop, tick by tick": "PID, gravity and Coriolis compensation at every sim step: Runner.step, tick by tick",
     "closed loop": "the same by Runner.rollout: as all of the above, the workers never wait for each other",
 }
@@ -61,21 +64,27 @@ class Result:
 
 
 def make_closed_loops(workload: Workload) -> dict[str, Case]:
-    """Return the cases of the Runner, by name; they share one runner."""
+    """Return the cases of the Runner, by name; all but that of Python's calls share one runner."""
     runner, target, ticks = workload.runner(), workload.target, workload.ticks
+    with python_calls():
+        python = workload.runner()
 
     def tick_by_tick() -> NDArray[np.float32]:
         for _ in range(ticks):
             final = runner.step(target).qpos[0]
         return final
 
-    def rollout() -> NDArray[np.float32]:
+    def rollout(runner: Runner) -> NDArray[np.float32]:
         return runner.rollout(np.broadcast_to(target, (ticks, *target.shape))).qpos[-1, 0]
 
-    def case(run: Callable[[], NDArray[Any]]) -> Case:
+    def case(runner: Runner, run: Callable[[], NDArray[Any]]) -> Case:
         return Case(workload.num_envs * workload.steps, lambda: runner.reset(workload.start), run, runner.close)
 
-    return {"closed loop, tick by tick": case(tick_by_tick), "closed loop": case(rollout)}
+    return {
+        "closed loop, Python calls": case(python, lambda: rollout(python)),
+        "closed loop, tick by tick": case(runner, tick_by_tick),
+        "closed loop": case(runner, lambda: rollout(runner)),
+    }
 
 
 def measure_rates(

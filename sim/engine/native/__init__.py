@@ -18,7 +18,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,6 +66,17 @@ def status() -> NativeStatus:
     if os.environ.get(SWITCH) == "0":
         return NativeStatus(False, f"native calls are switched off by {SWITCH}=0")
     return _verified()
+
+
+@contextlib.contextmanager
+def python_calls() -> Iterator[None]:
+    """Switch the native calls off for packs and processes that are made within."""
+    before = os.environ.get(SWITCH)
+    os.environ[SWITCH] = "0"
+    try:
+        yield
+    finally:
+        os.environ.pop(SWITCH) if before is None else os.environ.update({SWITCH: before})
 
 
 def environment() -> dict[str, str]:
