@@ -135,8 +135,11 @@ def mimics(root: etree._Element) -> Iterator[Finding]:
         values = [readable(mimic, key, default) for key, default in (("multiplier", "1"), ("offset", "0"))]
         problem = None
         if joint.get("type") == "fixed":
-            problem = "is fixed itself"
-        elif leader is None:
+            joint.remove(mimic)
+            text = f"it is fixed, so it does not mimic {mimic.get('joint')!r}"
+            yield finding_of(joint, "note", "mimic", text, "remove <mimic>")
+            continue
+        if leader is None:
             problem = "is not in the file"
         elif leader.get("type") == "fixed":
             problem = "does not move"

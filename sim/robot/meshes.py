@@ -22,15 +22,22 @@ _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attrib
 
 
 def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist."""
-    relative = name.removeprefix("package://").removeprefix("file://")
-    own = path.absolute().parents
-    folders = [*package_dirs, *own] if name.startswith("package://") else [own[0], *package_dirs]
-    for folder in folders:
-        candidate = (folder / relative).absolute()
-        if relative and os.path.isfile(candidate):
-            return candidate
-    return None
+    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist.
+
+    ``package://`` and ``model://`` paths are looked up in ``package_dirs`` and in the folders above the URDF, with the
+    name of the package and, in a folder that is the package under another name, without it. Other paths are relative to
+    the URDF's folder, or to one of these.
+    """
+    name = re.sub(r"^\$\(find ([^)]+)\)", r"package://\1", name.replace("\\", "/"))  # xacro, and Windows
+    scheme, _, relative = name.rpartition("://")
+    above = path.absolute().parents
+    if scheme in ("package", "model"):
+        relative = relative.lstrip("/")
+        within = relative.partition("/")[2]
+        candidates = [folder / each for each in (relative, within) if each for folder in (*package_dirs, *above)]
+    else:
+        candidates = [folder / relative for folder in (above[0], *package_dirs, *above[1:]) if relative]
+    return next((each.absolute() for each in candidates if os.path.isfile(each)), None)
 
 
 def mesh_problem(path: Path) -> str | None:

@@ -12,7 +12,8 @@ ODD = """<robot name="odd">
     <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
   </link>
   <joint name="hinge" type="continuous">
-    <parent link="base"/><child link="arm"/><axis xyz="0 0 1"/><dynamics friction="0.5" damping="0.25"/>
+    <parent link="base"/><child link="arm"/><axis xyz="0 0 1"/><limit effort="0"/>
+    <dynamics friction="0.5" damping="0.25"/>
   </joint>
 </robot>
 """

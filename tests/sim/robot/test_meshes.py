@@ -118,6 +118,30 @@ def test_a_sound_mesh_is_simulated(name, tmp_path):
     assert touching.tolist() == [False, True]
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "package://arm_description/meshes/arm.stl",
+        "package:///arm_description/meshes/arm.stl",
+        "package://arm_of_the_maker/meshes/arm.stl",
+        "model://arm_description/meshes/arm.stl",
+        "$(find arm_description)/meshes/arm.stl",
+        "../meshes/arm.stl",
+        "..\\meshes\\arm.stl",
+        "meshes/arm.stl",
+        "file://{folder}/meshes/arm.stl",
+        "{folder}/meshes/arm.stl",
+    ],
+)
+def test_a_mesh_is_found_by_the_ways_that_urdfs_name_it(name, tmp_path):
+    folder = tmp_path / "arm_description"
+    for each in ("urdf", "meshes"):
+        (folder / each).mkdir(parents=True)
+    (folder / "meshes" / "arm.stl").write_bytes(stl())
+    loaded = Robot.load(write(folder / "urdf", arm(name.format(folder=folder))), strict=True)
+    assert str(folder / "meshes" / "arm.stl") in loaded.urdf.replace("urdf/../", "")
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_an_unreadable_mesh_is_an_error_or_skipped_and_reported(case, tmp_path):
     name, data = BAD[case]

@@ -109,7 +109,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "mimic",
         "'k': it mimics 'f', which does not move",
     ),
-    "fixed joint that mimics": (moved('<mimic joint="hinge"/>', "fixed"), "mimic", "'tip_joint': .*is fixed itself"),
+    "fixed joint that mimics": (moved('<mimic joint="hinge"/>', "fixed"), "mimic", "'tip_joint': it is fixed, so"),
     "mimics in a circle": (
         moved('<mimic joint="hinge"/>').replace("</joint>", '<mimic joint="tip_joint"/></joint>', 1),
         "mimic",
