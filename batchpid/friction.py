@@ -32,10 +32,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.display import array_summary
-from batchpid.elementwise import namespace
+from batchpid.elementwise import clip, namespace
 
 SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
+LOOKAHEAD = 0.1
+"""Time by which the setpoint is looked ahead to tell the direction of the wanted motion [s]."""
 
 
 class Friction(NamedTuple):
@@ -121,6 +123,27 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
     if friction.viscous is not None:
         total = total - friction.viscous * velocity
     return state, total
+
+
+def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
+    """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') / band in [-1, 1].
+
+    Its sign is that of the wanted motion and not of the velocity, so it cannot chatter: friction, which is at least as
+    large and opposes the velocity, leaves no more than 0 in the direction of motion. A joint that is at rest within
+    ``band`` of its setpoint stays there.
+
+    Parameters
+    ----------
+    coulomb
+        F, known (joints,) or (envs, joints) [N m or N].
+    error, rate
+        e = r - q and r' (envs, joints) [rad or m, and per s]; a rate of None is 0.
+    band
+        Half width in which the sign is blurred (joints,) [rad or m].
+    """
+    xp = namespace(coulomb, error, rate, band)
+    ahead = error if rate is None else error + LOOKAHEAD * rate
+    return clip(ahead * (coulomb / band), -coulomb, coulomb, xp)
 
 
 def reset(state: FrictionState, fresh: FrictionState, mask: Any) -> FrictionState:

@@ -96,7 +96,7 @@ class RunInfo:
     control: str | None = None
     """One of "pid", "drive", "effort"."""
     compensate: str | None = None
-    """Passive force, one of "gravity+coriolis", "gravity", "none"."""
+    """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or "none"."""
     physics: str | None = None
     """Solver settings: "accurate", "fast", or the text of a :class:`sim.Physics`."""
     params: PIDParams | None = None

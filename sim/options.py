@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sim.engine.variation import Variation
 
 ControlMode = Literal["pid", "drive", "effort"]
-Compensation = Literal["gravity+coriolis", "gravity", "none"]
+Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
 PhysicsPreset = Literal["accurate", "fast"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
@@ -51,8 +51,9 @@ class RunnerOptions:
     control: ControlMode = "pid"
     """``"pid"``; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and damping;
     ``"effort"``: the setpoint is the joint effort."""
-    compensate: Compensation = "gravity+coriolis"
-    """Passive force added at every sim step."""
+    compensate: Compensation = "gravity+coriolis+friction"
+    """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
+    "effort" friction is not compensated."""
     physics: PhysicsPreset | Physics = "accurate"
     """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, or a :class:`sim.Physics`."""
     ground: bool = True

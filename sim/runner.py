@@ -86,7 +86,7 @@ class Runner:
         timestep: float = 1 / 2000,
         substeps: int = 20,
         control: ControlMode = "pid",
-        compensate: Compensation = "gravity+coriolis",
+        compensate: Compensation = "gravity+coriolis+friction",
         physics: PhysicsPreset | Physics = "accurate",
         ground: bool = True,
         build: Callable[[Any, int], Any] | None = None,

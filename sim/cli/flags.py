@@ -54,7 +54,10 @@ GainSets = Annotated[
     ),
 ]
 Physics = Annotated[Literal["accurate", "fast"], _flag("Solver settings: SAPIEN's, or fewer iterations.")]
-Compensate = Annotated[Literal["gravity+coriolis", "gravity", "none"], _flag("Passive force added at every sim step.")]
+Compensate = Annotated[
+    Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
+    _flag("Passive force and known friction, added at every sim step."),
+]
 Seconds = Annotated[float, _flag("Simulated time [s].")]
 Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]

@@ -36,7 +36,7 @@ class RolloutCommand:
     """Seed of the start poses."""
     spread: float = 0.3
     """Largest distance of a start pose from the robot's own [rad or m]; env 0 starts at that itself."""
-    compensate: flags.Compensate = "gravity+coriolis"
+    compensate: flags.Compensate = "gravity+coriolis+friction"
     physics: flags.Physics = "accurate"
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""

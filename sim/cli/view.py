@@ -34,7 +34,7 @@ class ViewCommand:
     control: tuple[Literal["pid", "drive"], ...] = ("pid",)
     """Batch PID, PhysX's internal drive, or both side by side."""
     gains: flags.Gains = None
-    compensate: flags.Compensate = "gravity+coriolis"
+    compensate: flags.Compensate = "gravity+coriolis+friction"
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"

@@ -42,9 +42,12 @@ class Control:
         Joints whose effort was limited in the last sim step of the last tick (M, dof).
     reads_qpos_each_step
         Whether :meth:`effort` needs qpos at every sim step; otherwise it is ignored.
+    drive
+        Damping and stiffness of the engine's drives [N m s/rad, N m/rad].
     """
 
     reads_qpos_each_step = True
+    drive: tuple[Any, Any] = 0.0, 0.0
 
     def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
         self._scene, self._plant, self.params = scene, plant, params
@@ -68,8 +71,13 @@ class Control:
         """Begin a tick of ``substeps`` sim steps under ``command``."""
         self._command, self._substeps = command, substeps
 
-    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
-        """Return the joint efforts of sim step ``step`` of the tick, ``feedforward`` included; None for zero."""
+    def effort(
+        self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None
+    ) -> Float64 | None:
+        """Return the joint efforts of sim step ``step`` of the tick, ``feedforward`` included; None for zero.
+
+        A ``qvel`` that is known need not be read.
+        """
         raise NotImplementedError
 
     def read(self) -> dict[str, NDArray[Any]]:
@@ -103,11 +111,12 @@ class PIDControl(Control):
         self._measures_rate = params.measurement_rate is not None
         self._coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
 
-    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64:
+    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Advance the law by one sim step."""
         if self.params.gain_units is not None and step % MASS_MATRIX_STEPS == 0:
             self._update_mass_matrix(qpos, min(MASS_MATRIX_STEPS, self._substeps - step))
-        qvel = self._plant.read_qvel() if self._measures_rate or self._damping is not None else None
+        if qvel is None and (self._measures_rate or self._damping is not None):
+            qvel = self._plant.read_qvel()
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel
             feedforward = viscous if feedforward is None else feedforward + viscous
@@ -157,6 +166,7 @@ class DriveControl(Control):
         damping = np.zeros_like(params.kp) if params.kd is None else params.kd
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
         self._plant.write_drive(params.kp, damping, limit)
+        self.drive = damping, params.kp
 
     def begin(self, command: Command, substeps: int) -> None:
         """Begin a tick: set the drives' targets."""
@@ -164,7 +174,9 @@ class DriveControl(Control):
         setpoint, rate, _ = command
         self._plant.write_drive_target(setpoint, np.zeros_like(setpoint) if rate is None else rate)
 
-    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
+    def effort(
+        self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None
+    ) -> Float64 | None:
         """Return ``feedforward``; move the drives' targets where there is an integral."""
         if self.reads_qpos_each_step:
             setpoint, rate, _ = self._command
@@ -181,7 +193,9 @@ class EffortControl(Control):
 
     reads_qpos_each_step = False
 
-    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int) -> Float64 | None:
+    def effort(
+        self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None
+    ) -> Float64 | None:
         """Add and saturate."""
         setpoint = self._command.setpoint
         total = setpoint if feedforward is None else setpoint + feedforward

@@ -25,18 +25,21 @@ class EnvGroup:
 
     def __init__(self, pack: Pack, envs: slice, params: bp.PIDParams, options: RunnerOptions) -> None:
         self.pack, self.envs, self._options = pack, envs, options
-        self._gravity, self._coriolis = options.compensate != "none", options.compensate == "gravity+coriolis"
+        compensated = options.compensate.split("+")
+        self._gravity, self._coriolis = "gravity" in compensated, "coriolis" in compensated
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         self._control = CONTROLS[options.control](pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
-        self._friction = JointFriction(pack)
+        self._friction = JointFriction(pack, self._control.drive)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._qpos = pack.read_qpos()
+        self._compensates = self._friction.compensates and "friction" in compensated and options.control != "effort"
         self._steps = 0
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
         self._control.set_params(params)
+        self._friction.drive = self._control.drive
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
@@ -106,7 +109,7 @@ class EnvGroup:
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
         self._control.write(states.controller, states.saturated)
-        self._friction = JointFriction(pack)
+        self._friction = JointFriction(pack, self._control.drive)
         self._friction.write(states.friction)
         self._motor[...] = states.effort
         self._qpos = pack.read_qpos()
@@ -117,37 +120,42 @@ class EnvGroup:
         """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
         pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
+        reads_qpos = control.reads_qpos_each_step or self._compensates
         for step in range(substeps):
             forward = self._feedforward(command)
-            if not control.reads_qpos_each_step and not self._sound(forward):
+            if not reads_qpos and not self._sound(forward):
                 # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
                 self._contain(pack.read_qpos(), step)
                 forward = self._feedforward(command)
-            effort = control.effort(self._qpos, forward, step)
+            qvel = pack.read_qvel() if friction.acts else None
+            effort = control.effort(self._qpos, forward, step, qvel)
             if effort is not None:
                 self._motor[...] = effort = pack.delivered(effort)
-            if friction.acts:
+            if qvel is not None:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
-                effort = friction.effort(motor, pack.read_qvel(), self._steps + step)
+                effort = friction.effort(motor, qvel, self._steps + step)
             if effort is not None:
                 pack.write_qf(effort)
             pack.step()
-            if control.reads_qpos_each_step:
+            if reads_qpos:
                 qpos = pack.read_qpos()
                 if self._sound(qpos):
                     self._qpos = qpos
                 else:
                     self._contain(qpos, step + 1)
-        if not control.reads_qpos_each_step:
+        if not reads_qpos:
             self._qpos = pack.read_qpos()
 
     def _feedforward(self, command: Command) -> Float64 | None:
         """Return the compensation plus the caller's feedforward; None for zero."""
-        extra = command.feedforward
-        if not self._gravity:
-            return extra
-        passive = self.pack.passive_force(self._gravity, self._coriolis)
-        return passive if extra is None else passive + extra
+        forward = command.feedforward
+        if self._gravity:
+            passive = self.pack.passive_force(self._gravity, self._coriolis)
+            forward = passive if forward is None else passive + forward
+        if self._compensates:
+            friction = self._friction.feedforward(command, self._qpos)
+            forward = friction if forward is None else friction + forward
+        return forward
 
     # -- envs that fail ----------------------------------------------------------------------------------------
 

@@ -8,34 +8,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid import friction
+from batchpid.elementwise import TURN, wrap
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
+from sim.loop.arrays import Command
+from sim.robot.description import DISSIPATION
 
 Float64 = NDArray[np.float64]
 
 REFRESH_STEPS = 64
-"""Sim steps for which the joints' inertia is kept: its half would do, so 32 ms are short for the motion of an arm."""
+"""Sim steps for which the inertia that the joints show is kept."""
+BAND = {"rad": 1e-4, "m": 2e-5}
+"""Half width, by the joint's unit, in which the compensation is less than the friction."""
 
 
 class JointFriction:
-    """Friction model of the M joints of ``pack``; it owns the model's state.
+    """Friction model of the M robots of ``pack``; it owns the model's state.
+
 
     Attributes
     ----------
     acts
         Whether there is any friction or damping to apply.
+    compensates
+        Whether :meth:`feedforward` has friction to cancel.
+    drive
+        Damping and stiffness of the engine's drives, (1, dof) or (M, dof) [N m s/rad, N m/rad].
     """
 
-    def __init__(self, pack: Pack) -> None:
-        self._pack, self._model = pack, pack.friction
+    def __init__(self, pack: Pack, drive: tuple[Any, Any] = (0.0, 0.0)) -> None:
+        self._pack, self._model, self.drive = pack, pack.friction, drive
         self.acts = any(leaf is not None for leaf in self._model)
+        joints = pack.spec.joints
+        modelled = DISSIPATION[pack.spec.dissipation].modelled
+        self._known = np.array([joint.friction * modelled for joint in joints])  # the controller knows the URDF's
+        self._band = np.array([BAND[joint.unit] for joint in joints])
+        self._turns = np.array([joint.continuous / TURN for joint in joints])
+        self.compensates = bool(self._known.any())
         self._state = friction.FrictionState()
-        self._drive: tuple[Any, Any] = (0.0, 0.0)
         self.reset(np.ones(pack.size, bool))
-
-    def set_drive(self, damping: Any, stiffness: Any) -> None:
-        """Set damping and stiffness of the engine's drives, (1, dof) or (M, dof), from the next refresh on."""
-        self._drive = damping, stiffness
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Reset the envs of ``mask`` (M,), which were placed."""
@@ -43,14 +54,19 @@ class JointFriction:
             return
         pack = self._pack
         velocity, load = pack.read_qvel(), pack.passive_force(True, True)
-        fresh = friction.init(self._model, velocity, load, self._mass_matrix(), pack.spec.timestep, *self._drive)
+        fresh = friction.init(self._model, velocity, load, self._mass_matrix(), pack.spec.timestep, *self.drive)
         self._state = fresh if self._state.effort is None else friction.reset(self._state, fresh, mask)
+
+    def feedforward(self, command: Command, qpos: Float64) -> Float64:
+        """Return the efforts that cancel the known friction on the way to the setpoint of ``command`` (M, dof)."""
+        error = wrap(command.setpoint - qpos, self._turns, np)
+        return friction.compensation(self._known, error, command.setpoint_rate, self._band)
 
     def effort(self, motor: Float64, qvel: Float64, step: int) -> Float64:
         """Return the efforts to apply in sim step ``step``, counted from the start of the runner (M, dof)."""
         if step % REFRESH_STEPS == 0 and self._model.coulomb is not None:
             timestep = self._pack.spec.timestep
-            self._state = friction.refresh(self._model, self._state, self._mass_matrix(), timestep, *self._drive)
+            self._state = friction.refresh(self._model, self._state, self._mass_matrix(), timestep, *self.drive)
         self._state, total = friction.advance(self._model, self._state, motor, qvel)
         return total
 

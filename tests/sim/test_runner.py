@@ -99,7 +99,7 @@ def test_its_repr_fits_two_lines(panda):
     with Runner(panda, 2, params=panda.params(), workers=0) as runner:
         runner.step(panda.start)
         assert repr(runner) == (
-            "Runner(panda, 2 envs, in this process, control 'pid', compensate 'gravity+coriolis',\n"
+            "Runner(panda, 2 envs, in this process, control 'pid', compensate 'gravity+coriolis+friction',\n"
             "       physics 'accurate', timestep 0.0005 s, 20 substeps, at 0.01 s)"
         )
     assert "closed" in repr(runner)

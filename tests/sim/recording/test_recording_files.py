@@ -63,7 +63,7 @@ def test_rollouts_are_read_as_they_were_written(suffix, tmp_path, rollout):
     assert_same_info(read.info, replace(rollout.info, seed=7))
     (fault,) = read.info.faults
     assert (fault.env, fault.joint, fault.cause) == (1, "panda_joint4", "setpoint")
-    assert (read.info.physics, read.info.compensate, read.info.complete) == ("fast", "gravity+coriolis", True)
+    assert (read.info.physics, read.info.compensate, read.info.complete) == ("fast", "gravity+coriolis+friction", True)
     assert os.listdir(path.parent) == [path.name]
     every = read_recording(path, every=4)
     assert_identical(every, rollout.for_ticks(slice(None, None, 4)))
