@@ -19,7 +19,7 @@ from sim.tuning.weights import Weights
 class TuneCommand:
     """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated moves.
 
-    Ends with a table of the gains before and after, on moves that the search did not see, and writes the params.
+    Ends with a table of the gains before and after, on moves that the search did not see, and writes the better params.
     """
 
     robot: flags.RobotName = "panda"
@@ -88,22 +88,27 @@ class TuneCommand:
             robot, sets, moves=20, seed=self.seed, variation=variation, workers=self.workers, physics=self.physics
         )
         print(evaluation_table(robot, evaluations))
-        tuned, arm = evaluations[1], arm_joints(robot)
-        worst = tuned.metrics.worst()
+        arm = arm_joints(robot)
+        chosen = 0 if evaluations[1].worse_than(evaluations[0], arm) else 1
+        judged = evaluations[chosen]
+        worst = judged.metrics.worst()
+        if not chosen:
+            print("\nThe designed gains are written: on these moves the tuned ones fall short more often, or by more.")
         about = found.settings | {
             "cost": found.cost,
             "start_cost": found.start_cost,
+            "gains": sets[chosen].name,
             "judged": {
-                "moves": len(tuned.moves.start),
+                "moves": len(judged.moves.start),
                 "seed": self.seed + 1,
                 "settling_time": float(worst.settling_time[arm].max()),
                 "overshoot": float(worst.overshoot[arm].max()),
                 "steady_state_error": float(worst.steady_state_error[arm].max()),
-                "chatter": float(tuned.chatter[:, arm].max()),
+                "chatter": float(judged.chatter[:, arm].max()),
             },
         }
-        save_params(out, found.params, robot.joint_names, about)
+        save_params(out, sets[chosen].params, robot.joint_names, about)
         history.unlink(missing_ok=True)
         print(f"\nwritten: {out}\npicture: {draw_first_move(robot, evaluations, picture)}")
-        for text in tuned.shortfalls(arm)[:5]:
+        for text in judged.shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {text}")

@@ -41,24 +41,39 @@ class Evaluation(NamedTuple):
     settling_limit: Float64
     """Settling time asked for (moves,) [s]."""
 
-    def shortfalls(self, joints: NDArray[np.bool_]) -> list[str]:
-        """Return the demands that ``joints`` (dof,) miss, worst first.
+    def demands(self, joints: NDArray[np.bool_]) -> dict[str, Float64]:
+        """Return the figure of each demand on ``joints`` (dof,), in units of its limit (moves, dof); 0 elsewhere.
 
         Settling within ``settling_limit``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <= 2.
         """
-        demands = (
-            ("settling time", self.metrics.settling_time / self.settling_limit[:, None], 1.0),
-            ("overshoot", self.metrics.overshoot, MAX_OVERSHOOT),
-            ("steady-state error", self.metrics.steady_state_error, MAX_ERROR),
-            ("chatter", self.chatter, MAX_CHATTER),
-        )
+        figures = {
+            "settling time": self.metrics.settling_time / self.settling_limit[:, None],
+            "overshoot": self.metrics.overshoot / MAX_OVERSHOOT,
+            "steady-state error": self.metrics.steady_state_error / MAX_ERROR,
+            "chatter": self.chatter / MAX_CHATTER,
+        }
+        return {
+            demand: np.where(joints, np.nan_to_num(figure, nan=0.0, posinf=np.inf), 0.0)
+            for demand, figure in figures.items()
+        }
+
+    def shortfalls(self, joints: NDArray[np.bool_]) -> list[str]:
+        """Return the :meth:`demands` that ``joints`` (dof,) miss, worst first."""
         found = []
-        for demand, figure, limit in demands:
-            excess = np.where(joints, np.nan_to_num(figure, nan=0.0, posinf=np.inf), 0.0) / limit
+        for demand, excess in self.demands(joints).items():
             for move, joint in np.argwhere(excess > 1):
                 text = f"{demand} of move {self.moves.names[move]!r}, joint {joint}: {excess[move, joint]:.2f} x limit"
                 found.append((float(excess[move, joint]), text))
         return [text for _, text in sorted(found, reverse=True)]
+
+    def worse_than(self, other: Evaluation, joints: NDArray[np.bool_]) -> bool:
+        """Return whether more moves miss a demand than in ``other``, or as many, the worst of them by more."""
+
+        def rank(evaluation: Evaluation) -> tuple[int, float]:
+            excess = np.max([*evaluation.demands(joints).values()], axis=(0, 2))
+            return int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
+
+        return rank(self) > rank(other)
 
 
 def absolute_band(robot: Robot) -> Float64:

@@ -1,16 +1,11 @@
 r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
 
 Each env runs one move of one candidate, so that a generation is one rollout. A share of the effort limits is reserved
-for moves that are harder than those searched. The cost of a candidate is the mean over joints, taken as the mean over
-moves plus the worst move, of::
+for moves that are harder than those searched; :mod:`sim.tuning.candidates` defines the cost. The search itself is the
+package ``cmaes`` (N. Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772).
 
-    w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
-        + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
-
-A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; E the error left
-at the end; TV the total variation of the effort and TV_smooth that of the smooth motion that takes a second; S the
-share of time in saturation. N. Hansen, "The CMA evolution strategy: a tutorial" (arXiv:1604.00772); the search itself
-is the package ``cmaes``.
+The best of the candidates and the designed gains then run a final on more moves, at the full effort limits, and the
+cheapest there is the result: what suits the few moves of the search need not suit others.
 
 A search is a function of its seed and does not depend on the number of workers. To resume, a fresh search of the same
 seed is given the costs in the history, and continues as if it had never stopped.
@@ -31,37 +26,23 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.files import write_atomically
-from batchpid.stability import stability_bound
 from batchpid.validate import integer, number
 from batchpid.versions import package_versions
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.evaluation import SUBSTEPS, absolute_band, run_moves
-from sim.tuning.moves import Moves, search_moves, smooth_variation
+from sim.tuning.candidates import HEADROOM, Candidates
+from sim.tuning.evaluation import SUBSTEPS
+from sim.tuning.moves import Moves, random_moves, search_moves
 from sim.tuning.randomization import draw_variation
 from sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
-FACTORS = {
-    # factor: its standard deviation at first, in units of INITIAL_SPREAD; the last two matter less
-    "bandwidth": 1.0,
-    "stiffness": 1.0,
-    "damping": 1.0,
-    "setpoint_weight": 2.0,
-    "derivative_filter_time": 2.0,
-}
-"""Factors that are searched for all joints together; with ``per_joint`` one for each joint's inertia as well.
-
-A bandwidth factor c moves all poles alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
-"""
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
-HEADROOM = 0.9
-"""Share of the effort limits that candidates may use."""
-PENALTY_RATIO = 0.8
-"""Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
-DIVERGED_COST = 1e3
-"""Cost of a candidate that diverges; up to twice that, the sooner it does."""
+FINALISTS, FINAL_MOVES = 3, 24
+"""Candidates of the final, besides the designed gains, and its moves."""
+_FINAL_SEED = 1_000_003
+"""Distance of the seed of these moves from that of the search."""
 
 
 class Tuning(NamedTuple):
@@ -69,6 +50,7 @@ class Tuning(NamedTuple):
 
     params: bp.PIDParams
     cost: float
+    """In the search."""
     start_params: bp.PIDParams
     """Designed gains that the search began with."""
     start_cost: float
@@ -113,7 +95,8 @@ def tune(
     weights
         Of the terms of the cost.
     moves
-        Default: those of :func:`sim.tuning.moves.search_moves`.
+        Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Moves that are
+        given are the final as well.
     variation
         Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: the robot of each move has its
         own payload and friction, the same for all candidates. None: no variation.
@@ -144,6 +127,7 @@ def tune(
     population = integer("population", population, 4, 1000)
     seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
+    final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     moves = search_moves(robot, seed) if moves is None else moves
     count = len(moves.start)
     settings: dict[str, Any] = {
@@ -164,7 +148,7 @@ def tune(
     if variation is not None:
         drawn = draw_variation(robot, count, seed, **variation)
         runner_options["variation"] = drawn.for_envs(np.tile(np.arange(count), population))
-    search = _Search(robot, gain_units, per_joint, moves, seconds, weights)
+    search = Candidates(robot, gain_units, per_joint, moves, seconds, weights)
     optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
     start = search.params(np.zeros((1, search.dimension)))
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
@@ -184,84 +168,26 @@ def tune(
                 bar.set_postfix(cost=f"{np.min(costs):.4f}", designed=f"{costs[0][0]:.4f}")
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
+    every = np.concatenate([np.ravel(row) for row in costs])
+    best = int(np.argmin(every))
+    if final is not None and best:
+        ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS] if index]
+        finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
+        if variation is not None:
+            drawn = draw_variation(robot, FINAL_MOVES, seed + _FINAL_SEED, **variation)
+            runner_options["variation"] = drawn.for_envs(np.tile(np.arange(FINAL_MOVES), len(finalists)))
+        judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0)
+        options |= runner_options
+        with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
+            best = finalists[int(np.argmin(judge.costs(runner, np.array(points)[finalists])))]
     return Tuning(
-        params=search.params(points[int(np.argmin(costs))][None]),
-        cost=float(np.min(costs)),
+        params=search.params(points[best][None]),
+        cost=float(every[best]),
         start_params=start,
         start_cost=costs[0][0],
         history=tuple(costs),
         settings={**settings, "generations": len(costs)},
     )
-
-
-class _Search:
-    """Search space and cost: from points to params, and to the costs of their rollouts."""
-
-    def __init__(
-        self, robot: Robot, gain_units: str, per_joint: bool, moves: Moves, seconds: float, weights: Weights
-    ) -> None:
-        self.robot, self.moves, self.seconds, self.weights = robot, moves, seconds, weights
-        self.designed = robot.designed(gain_units)
-        self.dimension = len(FACTORS) + (robot.dof if per_joint else 0)
-        self._band = absolute_band(robot)
-        self._smooth = smooth_variation(robot, moves, 1.0)
-        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
-        # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
-        if gain_units == "mass_matrix":
-            self._mass, self._damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
-        else:
-            self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
-        inertia = gain_units == "inertia"
-        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(robot.dof)
-
-    def params(self, points: Float64) -> bp.PIDParams:
-        """Return params with one row for each of ``points`` (n, dimension)."""
-        shared = np.exp(np.array(list(FACTORS.values())) * points[:, : len(FACTORS)])
-        bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
-        joints = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
-        d = self.designed
-        return d.replace(
-            kp=d.kp * bandwidth**2 * stiffness * joints,
-            ki=d.ki * bandwidth**3 * joints,
-            kd=d.kd * bandwidth * damping * joints,
-            setpoint_weight=np.minimum(d.setpoint_weight * weight, 1.0) + np.zeros_like(d.kp),
-            derivative_filter_time=d.derivative_filter_time * filter_time,
-        )
-
-    def costs(self, runner: Runner, points: Float64) -> tuple[float, ...]:
-        """Return the cost of each of ``points``, run on ``runner``, whose envs are candidates x moves."""
-        count, moves, params = len(points), self.moves, self.params(points)
-        limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
-        limited = params.replace(**{name: HEADROOM * limit for name, limit in limits.items() if limit is not None})
-        runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
-        rollout, m = run_moves(runner, moves.take(np.tile(np.arange(len(moves.start)), count)), self.seconds)
-        w = self.weights
-
-        def bounded(figure: Float64) -> Float64:
-            return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)
-
-        cost = (
-            w.itae * bounded(m.itae) / self._size
-            + w.settling * np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
-            + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
-            + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
-            + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
-            + w.saturation * bounded(m.saturation_share)
-        ).mean(2)
-        lasted = rollout.ok.mean(0).reshape(count, -1)
-        total = np.minimum(cost.mean(1) + cost.max(1), DIVERGED_COST)
-        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
-        return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
-
-    def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
-        """Return the penalty (count,) of candidates near the stability bound, which these moves may not show."""
-        ratios = [
-            stability_bound(
-                self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
-            ).ratio.max()
-            for kp, kd, tau in zip(params.kp, params.kd, params.derivative_filter_time, strict=True)
-        ]
-        return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)
 
 
 class _History:

@@ -53,6 +53,16 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
     assert f"{costs[0][0]:.4f} as designed" in said
 
 
+def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
+    out = tmp_path / "panda.yaml"
+    monkeypatch.setattr("sim.tuning.evaluation.Evaluation.worse_than", lambda *_: True)
+    status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
+    assert status == 0
+    assert "The designed gains are written" in said
+    assert bp.load_about(out)["gains"] == "designed"
+    assert (bp.load_params(out)[0].kp == load_bundled("panda").designed().kp).all()
+
+
 def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     robot = load_bundled("panda")
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)

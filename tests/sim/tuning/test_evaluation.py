@@ -53,6 +53,19 @@ def test_shortfalls_of_the_tutorials_gains_are_listed(panda):
     assert "settling time of move 'tutorial'" in "".join(shortfalls)
 
 
+def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
+    moves, arm = random_moves(panda, 2, seed=4), arm_joints(panda)
+    tuned, weak = (
+        evaluate_gains(panda, params, moves, workers=0, seconds=1.5)
+        for params in (panda.tuned(), panda.params(kp=1.0, ki=0.0, kd=0.1))
+    )
+    assert weak.worse_than(tuned, arm)
+    assert not tuned.worse_than(weak, arm)
+    assert not tuned.worse_than(tuned, arm)
+    assert max(np.max(figure) for figure in weak.demands(arm).values()) > 1
+    assert not weak.worse_than(tuned, np.zeros(panda.dof, bool))  # no joint, no demand
+
+
 def test_variation_changes_the_motion_alike_for_any_number_of_workers(panda):
     moves = random_moves(panda, 3, 2)
     drawn = draw_variation(panda, 3, 1)

@@ -46,6 +46,17 @@ def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
         tune(panda, generations=3, history=history, **options)
 
 
+def test_the_result_is_the_best_of_the_final_not_of_the_search(panda, monkeypatch):
+    drawn = iter([random_moves(panda, 1, 3)])
+    monkeypatch.setattr("sim.tuning.search.search_moves", lambda *_: random_moves(panda, 1, 0))
+    monkeypatch.setattr("sim.tuning.search.random_moves", lambda *_: next(drawn))
+    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 1)
+    found = tune(panda, workers=0, **SMALL)
+    costs = sorted(cost for row in found.history for cost in row)
+    assert found.cost in [*costs[:3], found.start_cost]
+    assert found.cost <= found.start_cost
+
+
 def test_search_starts_from_the_designed_gains(panda):
     found = tune(panda, moves=random_moves(panda, 1, 0), workers=0, **SMALL)
     for name in ("kp", "ki", "kd"):

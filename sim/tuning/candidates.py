@@ -1,0 +1,121 @@
+"""Candidates of a search for gains: from points in log space to params, and to costs by simulation.
+
+The cost of a candidate is the mean over joints, taken as the mean over moves plus the worst move, of::
+
+    w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
+        + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
+
+A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; E the error left
+at the end; TV the total variation of the effort and TV_smooth that of the smooth motion that takes a second; S the
+share of time in saturation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.stability import stability_bound
+from sim.robot.robot import Robot
+from sim.runner import Runner
+from sim.tuning.evaluation import absolute_band, run_moves
+from sim.tuning.moves import Moves, smooth_variation
+from sim.tuning.weights import Weights
+
+Float64 = NDArray[np.float64]
+FACTORS = {
+    # factor: its standard deviation at first, in units of INITIAL_SPREAD; the last two matter less
+    "bandwidth": 1.0,
+    "stiffness": 1.0,
+    "damping": 1.0,
+    "setpoint_weight": 2.0,
+    "derivative_filter_time": 2.0,
+}
+"""Factors that are searched for all joints together; with ``per_joint`` one for each joint's inertia as well.
+
+A bandwidth factor c moves all poles alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
+"""
+HEADROOM = 0.9
+"""Share of the effort limits that candidates may use."""
+PENALTY_RATIO = 0.8
+"""Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
+DIVERGED_COST = 1e3
+"""Cost of a candidate that diverges; up to twice that, the sooner it does."""
+
+
+class Candidates:
+    """Candidates of a search as points in log space: their params, and the costs of their rollouts on ``moves``."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        gain_units: str,
+        per_joint: bool,
+        moves: Moves,
+        seconds: float,
+        weights: Weights,
+        headroom: float = HEADROOM,
+    ) -> None:
+        self.robot, self.moves, self.seconds, self.weights, self.headroom = robot, moves, seconds, weights, headroom
+        self.designed = robot.designed(gain_units)
+        self.dimension = len(FACTORS) + (robot.dof if per_joint else 0)
+        self._band = absolute_band(robot)
+        self._smooth = smooth_variation(robot, moves, 1.0)
+        self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
+        # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
+        if gain_units == "mass_matrix":
+            self._mass, self._damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
+        else:
+            self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
+        inertia = gain_units == "inertia"
+        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(robot.dof)
+
+    def params(self, points: Float64) -> bp.PIDParams:
+        """Return params with one row for each of ``points`` (n, dimension)."""
+        shared = np.exp(np.array(list(FACTORS.values())) * points[:, : len(FACTORS)])
+        bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
+        joints = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
+        d = self.designed
+        return d.replace(
+            kp=d.kp * bandwidth**2 * stiffness * joints,
+            ki=d.ki * bandwidth**3 * joints,
+            kd=d.kd * bandwidth * damping * joints,
+            setpoint_weight=np.minimum(d.setpoint_weight * weight, 1.0) + np.zeros_like(d.kp),
+            derivative_filter_time=d.derivative_filter_time * filter_time,
+        )
+
+    def costs(self, runner: Runner, points: Float64) -> tuple[float, ...]:
+        """Return the cost of each of ``points``, run on ``runner``, whose envs are candidates x moves."""
+        count, moves, params = len(points), self.moves, self.params(points)
+        limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
+        limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
+        runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
+        rollout, m = run_moves(runner, moves.take(np.tile(np.arange(len(moves.start)), count)), self.seconds)
+        w = self.weights
+
+        def bounded(figure: Float64) -> Float64:
+            return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)
+
+        cost = (
+            w.itae * bounded(m.itae) / self._size
+            + w.settling * np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
+            + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
+            + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
+            + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
+            + w.saturation * bounded(m.saturation_share)
+        ).mean(2)
+        lasted = rollout.ok.mean(0).reshape(count, -1)
+        total = np.minimum(cost.mean(1) + cost.max(1), DIVERGED_COST)
+        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
+        return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
+
+    def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
+        """Return the penalty (count,) of candidates near the stability bound, which these moves may not show."""
+        ratios = [
+            stability_bound(
+                self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
+            ).ratio.max()
+            for kp, kd, tau in zip(params.kp, params.kd, params.derivative_filter_time, strict=True)
+        ]
+        return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)
