@@ -42,7 +42,10 @@ BACK_OFF = 0.8
 
 
 class Designable(Protocol):
-    """Robot that :func:`design_gains` can work on, such as :class:`sim.Robot`."""
+    """Robot that :func:`design_gains` can work on, such as :class:`sim.Robot`.
+
+    A ``design_effort_limit`` (dof,), if it has one, becomes the effort limit of the designed params.
+    """
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) at ``qpos`` (n, dof)."""
@@ -160,6 +163,9 @@ def design_gains(
         "weight_origin": "start",
         "gain_units": gain_units,
     }
+    limit = getattr(robot, "design_effort_limit", None)
+    if limit is not None and not {"effort_limit", "effort_min", "effort_max"} & set(options):
+        designed["effort_limit"] = limit
     return robot.params(**(designed | options))
 
 

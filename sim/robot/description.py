@@ -6,6 +6,7 @@ import math
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim.observation import OBSERVED, RunInfo
+from sim.robot.effort import POSES, suggested_effort_limit
 from sim.robot.findings import Finding
 
 Float64 = NDArray[np.float64]
@@ -225,6 +227,20 @@ class RobotDescription(Urdf):
     def effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N], infinite where the URDF gives none."""
         return np.array([joint.effort_limit for joint in self.joints])
+
+    @cached_property
+    def design_effort_limit(self) -> Float64:
+        """Effort limits (dof,) [N m or N] of designed and tuned gains.
+
+        They are the URDF's; where it gives none, :func:`sim.robot.effort.suggested_effort_limit`, which loads SAPIEN.
+        """
+        given = self.effort_limit
+        if np.isfinite(given).all():
+            return given
+        qpos, dynamics = self.sample(POSES), self.dynamics()
+        gravity = dynamics.inverse_dynamics(qpos, np.zeros_like(qpos), np.zeros_like(qpos))
+        suggested = suggested_effort_limit(gravity, dynamics.mass_matrix(qpos), self.friction, self.damping)
+        return np.where(np.isfinite(given), given, suggested)
 
     @property
     def velocity_limit(self) -> Float64:

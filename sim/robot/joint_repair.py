@@ -80,9 +80,9 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
                 joint, "warning", "limits", f"{key} limit {text}: its magnitude is used", "make it positive"
             )
         else:
-            meaning = "a placeholder" if values else "no number"
-            problem = f"<limit {key}={text!r}> is {meaning}: it counts as not given, so there is no limit"
-            yield finding_of(joint, "warning", f"no-{key}-limit", problem, f"give <limit {key}=> of the motor")
+            code, meaning = ("placeholder", "a placeholder") if values else ("limits", "no number")
+            problem = f"<limit {key}={text!r}> is {meaning}: it counts as not given, so there is no {key} limit"
+            yield finding_of(joint, "warning", code, problem, f"give <limit {key}=> of the motor")
     if kind in ("revolute", "prismatic"):
         yield from _range(joint, limit)
 

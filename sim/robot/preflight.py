@@ -127,9 +127,10 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
     elif not joint.continuous and math.isinf(joint.upper - joint.lower):
         remedy = "give <limit lower= upper=>, so that setpoints can be checked"
         yield found("note", "no-limits", "it has no position limits", remedy)
-    remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
     if math.isinf(joint.effort_limit):
-        yield found("note", "no-effort-limit", "it has no effort limit, so efforts are not saturated", remedy)
+        limit = f"{robot.design_effort_limit[robot.joints.index(joint)]:.3g} {joint.effort_unit}"
+        text = f"it has no effort limit: designed and tuned gains stay within {limit}, from gravity and inertia"
+        yield found("note", "no-effort-limit", text, "give <limit effort=>, or pass effort_limit= to robot.params()")
 
 
 def _stability(

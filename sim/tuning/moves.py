@@ -140,7 +140,7 @@ def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Fl
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:
     """Return the time of the shortest bang-bang motion along each move (moves,) [s]; inf if gravity forbids it."""
-    dynamics, limit = robot.dynamics(), robot.effort_limit
+    dynamics, limit = robot.dynamics(), robot.design_effort_limit
     t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
     early = t < 0.5
     z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
@@ -180,7 +180,7 @@ def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> 
     """
     rows = zip(moves.start, moves.target, np.broadcast_to(durations, len(moves.start)), strict=True)
     variation = [np.abs(np.diff(smooth_effort(robot, *row), axis=0)).sum(0) for row in rows]
-    return np.maximum(variation, 1e-3 * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 1.0))
+    return np.maximum(variation, 1e-3 * robot.design_effort_limit)
 
 
 def _with_mimics(robot: Robot, qpos: Float64) -> Float64:

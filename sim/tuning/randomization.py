@@ -49,5 +49,5 @@ def payload_capacity(robot: Robot) -> float:
     own = np.abs(robot.dynamics().inverse_dynamics(qpos, still, still))
     per_kg = np.abs(kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.effort_limit - own) / per_kg, np.inf)
+        carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.design_effort_limit - own) / per_kg, np.inf)
     return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))
