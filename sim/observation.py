@@ -89,6 +89,8 @@ class RunInfo:
     """Text of the robot description."""
     dissipation: str | None = None
     """Source of joint friction and damping: "urdf" or "sapien"."""
+    merge_fixed: bool | None = None
+    """True if links that fixed joints connect were simulated as one."""
     timestep: float | None = None
     """Time step of simulation and control [s]."""
     substeps: int | None = None

@@ -192,6 +192,7 @@ class RunnerOptions:
             "dissipation": robot.dissipation,
             "ground": self.ground,
             "fixed_base": robot.fixed_base,
+            "merge_fixed": robot.merge_fixed,
         }
 
 

@@ -6,18 +6,23 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache, reduce
+from operator import or_
 from typing import Any
 
 import numpy as np
-from sapien import physx
+from lxml import etree
+from numpy.typing import NDArray
+from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
 from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
-from sim.engine.user_content import Build, HeadlessScene
+from sim.engine.user_content import Build, Frames, HeadlessScene
 from sim.robot.description import DISSIPATION, Joint
+from sim.robot.merging import Merged, merge_fixed_links, place_links
+from sim.robot.spatial_inertia import SpatialInertia, total
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,7 @@ class SceneSpec:
     """Everything that a scene is built from, picklable.
 
     ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` are the degrees of freedom in SAPIEN's order.
+    With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
     Specs that differ in ``build`` alone are equal.
     """
 
@@ -36,6 +42,7 @@ class SceneSpec:
     dissipation: str = "urdf"
     ground: bool = True
     fixed_base: bool = True
+    merge_fixed: bool = True
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
@@ -49,16 +56,86 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     RobotError
         SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
+    if spec.merge_fixed:
+        builder = _load(merged(spec).urdf, None, spec.fixed_base)
+        used = reduce(or_, _srdf_bits(spec).values())
+    else:
+        builder, used = _load(spec.urdf, spec.srdf, spec.fixed_base), 0
+    _ignore_contacts_within_bodies(builder, used)
+    return builder
+
+
+@lru_cache(maxsize=8)
+def merged(spec: SceneSpec) -> Merged:
+    """Return the robot of ``spec`` with its fixed joints merged, the same object for equal specs."""
+
+    @cache
+    def unmerged() -> dict[str, Any]:
+        return {link.name: link for link in _load(spec.urdf, None, spec.fixed_base).link_builders}
+
+    def inertia_of_shapes(link: str) -> SpatialInertia:
+        return link_inertia(unmerged()[link].build_physx_component())
+
+    return merge_fixed_links(spec.urdf, inertia_of_shapes)
+
+
+def center_of_mass(spec: SceneSpec, link: str) -> tuple[str, NDArray[np.float64]]:
+    """Return the simulated link that a link of the URDF is part of, and the center of mass of the latter in its frame.
+
+    That of a link without mass is its origin.
+    """
+    at, inertia = place_links(spec.urdf, spec.merge_fixed)[link], merged(spec).inertias.get(link)
+    return at.link, at.position if inertia is None else inertia.moved(at.position, at.wxyz).center
+
+
+def add_point_mass(link: Any, mass: float, position: NDArray[np.float64]) -> None:
+    """Add ``mass`` [kg] at ``position`` (3,) [m] in the frame of one of SAPIEN's links."""
+    inertia = total([link_inertia(link), SpatialInertia(mass, position, np.zeros((3, 3)))])
+    principal, axes = np.linalg.eigh(inertia.tensor)
+    at = np.eye(4)
+    at[:3, :3], at[:3, 3] = axes * np.linalg.det(axes), inertia.center  # a rotation, not a reflection
+    link.set_mass(inertia.mass)
+    link.set_cmass_local_pose(Pose(at))
+    link.set_inertia(principal)
+
+
+@lru_cache(maxsize=8)
+def _srdf_bits(spec: SceneSpec) -> dict[str, int]:
+    """Return bits of the third collision group for each link of the URDF: pairs of the .srdf share one.
+
+    SAPIEN's loader does the same for links that are not merged. PhysX ignores contacts within a body, and with the
+    bodies that joints connect it to.
+    """
+    bodies = merged(spec).bodies
+    joined = {frozenset((bodies[joint.parent_link].link, bodies[joint.child_link].link)) for joint in spec.joints}
+    bits, number = dict.fromkeys(bodies, 0), 0
+    for element in etree.fromstring((spec.srdf or "<robot/>").encode()).findall("disable_collisions"):
+        links = element.get("link1"), element.get("link2")
+        if element.get("reason").lower() == "default" and len(pair := {bodies[link].link for link in links}) == 2:
+            if frozenset(pair) in joined:
+                continue
+            for link in links:
+                bits[link] |= 1 << number
+            number += 1
+    return bits
+
+
+def link_inertia(link: Any) -> SpatialInertia:
+    """Return the inertia of one of SAPIEN's links, in the link's frame."""
+    at, principal = link.cmass_local_pose, np.diag(np.asarray(link.inertia, float))
+    return SpatialInertia(link.mass, np.zeros(3), principal).moved(np.asarray(at.p, float), np.asarray(at.q, float))
+
+
+def _load(urdf: str, srdf: str | None, fixed_base: bool) -> ArticulationBuilder:
     loader = HeadlessScene().create_urdf_loader()
-    loader.fix_root_link = spec.fixed_base
-    with _in_memory(spec.urdf) as urdf, _in_memory(spec.srdf or "<robot/>") as srdf:
+    loader.fix_root_link = fixed_base
+    with _in_memory(urdf) as urdf_path, _in_memory(srdf or "<robot/>") as srdf_path:
         try:
-            builders, actors, _ = loader.parse(urdf, srdf)
+            builders, actors, _ = loader.parse(urdf_path, srdf_path)
         except Exception as error:
             raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
     if len(builders) != 1 or actors:
         raise RobotError("the URDF does not describe one articulated robot; it needs at least one moving joint")
-    _ignore_contacts_within_bodies(builders[0])
     return builders[0]
 
 
@@ -71,14 +148,14 @@ def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
     return bodies
 
 
-def _ignore_contacts_within_bodies(builder: ArticulationBuilder) -> None:
+def _ignore_contacts_within_bodies(builder: ArticulationBuilder, used: int) -> None:
     """Filter out contacts between links of one rigid body: they cannot move apart, and the solver would shake them.
 
     PhysX filters a parent and its child only, not a hand whose flange is a separate link. Shapes that share a bit of
-    the third collision group never touch; each body gets one that no pair of the .srdf uses, as long as there are any.
+    the third collision group never touch; each body gets one that no pair of the .srdf uses, as long as there are any:
+    neither one of ``used`` nor one of the builder's.
     """
     bodies = rigid_bodies(builder)
-    used = 0
     for link in builder.link_builders:
         used |= link.collision_groups[2]
     free = (1 << bit for bit in range(32) if not used >> bit & 1)
@@ -152,6 +229,13 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             files = ", ".join(record.filename for record in records if record.filename)
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
+    if spec.merge_fixed and spec.srdf is not None:
+        bits = _srdf_bits(spec)
+        for link in robot.links:
+            for shape, owner in zip(link.collision_shapes, merged(spec).owners[link.name], strict=True):
+                groups = list(shape.get_collision_groups())
+                groups[2] |= bits[owner]
+                shape.set_collision_groups(groups)
     names, ours = [joint.name for joint in robot.active_joints], [joint.name for joint in spec.joints]
     if names != ours:
         raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF")
@@ -187,6 +271,15 @@ def link_extents(robot: Any) -> list[LinkExtent]:
         parent = None if link.parent is None else numbers[link.parent]
         extents.append(LinkExtent(parent, dofs.get(joint.name), slides, float(offset), radius))
     return extents
+
+
+def link_frames(spec: SceneSpec, robot: Any) -> Frames:
+    """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
+    entities = {link.name: link.entity for link in robot.links}
+    return {
+        name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
+        for name, at in place_links(spec.urdf, spec.merge_fixed).items()
+    }
 
 
 def set_collision_group(scene: HeadlessScene, group: int) -> None:

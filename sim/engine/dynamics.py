@@ -81,4 +81,5 @@ def scene_dynamics(spec: SceneSpec) -> Dynamics:
 
 def robot_dynamics(robot: RobotDescription, ground: bool = True) -> Dynamics:
     """Return the dynamics of ``robot`` on a fixed base, with or without a ground at height 0."""
-    return scene_dynamics(SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["fast"], ground=ground))
+    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["fast"], merge_fixed=robot.merge_fixed)
+    return scene_dynamics(replace(spec, ground=ground))

@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.friction import Friction
-from sim.engine.building import SceneSpec, build_scene, engine_settings, link_extents, new_system, set_collision_group
+from sim.engine.building import (
+    SceneSpec,
+    build_scene,
+    engine_settings,
+    link_extents,
+    link_frames,
+    new_system,
+    set_collision_group,
+)
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.native import engine_calls
@@ -62,7 +70,8 @@ class Pack:
         if spec.build is not None:
             with engine_settings(spec):
                 envs = enumerate(self._scenes, start=first_env)
-                self._contents = [SceneContent(spec.build, scene, env) for env, scene in envs]
+                frames = [link_frames(spec, robot) for robot in self.robots]
+                self._contents = [SceneContent(spec.build, scene, env, frames[env - first_env]) for env, scene in envs]
         for row, scene in enumerate(self._scenes):
             set_collision_group(scene, row + 1)
         self.size, self.dof = size, self.robots[0].dof

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,12 @@ from sim.engine.mirrored_meshes import MirroringBuilder
 from sim.engine.root_state import ROOT_SIZE, read_root, write_root
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds to the scene of env ``env``; returns the entities whose poses are wanted, or None."""
+"""``build(scene, env)`` adds to the scene of env ``env``; returns what poses are wanted of, or None.
+
+That is entities, and names of the robot's links, also of those that are simulated as part of another.
+"""
+Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
+"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the same."""
 
 
 class _HeadlessBuilder(ActorBuilder):
@@ -54,12 +59,13 @@ for _name in dir(sapien.Scene):
 class SceneContent:
     """Content that ``build`` added to the scene of env ``env``.
 
-    ``watched`` are the entities that ``build`` returned, ``size`` is the number of values in the state.
+    ``watched`` are the entities that ``build`` returned, each with the pose of a frame in it or None; ``size`` is the
+    number of values in the state. ``links`` are those of the scene's robot.
     """
 
-    def __init__(self, build: Build, scene: Any, env: int) -> None:
+    def __init__(self, build: Build, scene: Any, env: int, links: Frames) -> None:
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
-        self.watched = _call(build, scene, env)
+        self.watched = _call(build, scene, env, links)
         self._bodies, self._articulations = [], []
         for entity in scene.entities:
             if entity.per_scene_id in before:
@@ -111,13 +117,15 @@ class SceneContent:
             robot.set_qf(take(robot.dof))
 
     def poses(self) -> NDArray[np.float32]:
-        """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
-        rows = [np.concatenate([pose.p, pose.q]) for pose in (entity.get_pose() for entity in self.watched)]
+        """Return the poses of what is watched (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
+        frames = [(entity.get_pose(), frame) for entity, frame in self.watched]
+        poses = [pose if frame is None else pose * frame for pose, frame in frames]
+        rows = [np.concatenate([pose.p, pose.q]) for pose in poses]
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def _call(build: Build, scene: Any, env: int) -> list[Any]:
-    """Return the entities that ``build`` returns; its errors become an InvalidArgumentError."""
+def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
+    """Return the entities and frames that ``build`` returns; its errors become an InvalidArgumentError."""
     try:
         returned = build(scene, env)
     except Exception as error:
@@ -130,14 +138,19 @@ def _call(build: Build, scene: Any, env: int) -> list[Any]:
         ) from error
     if returned is None:
         return []
-    entities = list(returned) if isinstance(returned, Iterable) else [returned]
-    for entity in entities:
-        if not isinstance(entity, sapien.Entity):
+    several = isinstance(returned, Iterable) and not isinstance(returned, str)
+    watched = []
+    for each in returned if several else [returned]:
+        if isinstance(each, str) and each in links:
+            watched.append(links[each])
+        elif isinstance(each, sapien.Entity):
+            watched.append((each, None))
+        else:
             raise InvalidArgumentError(
                 "build",
-                "returned something other than entities",
+                "returned something other than entities and names of the robot's links",
                 env=env,
-                value=type(entity).__name__,
-                remedy="return the entities whose poses are wanted, or None",
+                value=each if isinstance(each, str) else type(each).__name__,
+                remedy="return the entities and links whose poses are wanted, or None",
             )
-    return entities
+    return watched

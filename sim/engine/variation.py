@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.friction import Friction
-from sim.engine.building import SceneSpec
+from sim.engine.building import SceneSpec, add_point_mass, center_of_mass
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 
@@ -25,7 +25,7 @@ class Variation:
     """Differences of each env's robot from the model."""
 
     payload: Float64
-    """Mass added to ``link`` (envs,) [kg]."""
+    """Mass added at the center of mass of ``link`` (envs,) [kg]."""
     friction: Float64
     """Coulomb friction added to every joint (envs,) [N m or N]."""
     link: str
@@ -45,6 +45,7 @@ class VariedPack(Pack):
 
     def __init__(self, spec: SceneSpec, size: int, first_env: int, system_size: int, variation: Variation) -> None:
         self._variation, self._model, self._resolution = variation, scene_dynamics(spec), variation.resolution
+        self._carrier = center_of_mass(spec, variation.link)
         super().__init__(spec, size, first_env, system_size)
         self._pending = np.zeros((size, self.dof)) if variation.late else None
 
@@ -52,9 +53,10 @@ class VariedPack(Pack):
         """Return a new scene and the robot in it, with its payload."""
         scene, robot = super()._build(row, system)
         variation = self._variation
+        body, center = self._carrier
         for link in robot.links:
-            if link.name == variation.link:
-                link.set_mass(link.mass + float(variation.payload[row]))
+            if link.name == body:
+                add_point_mass(link, float(variation.payload[row]), center)
         return scene, robot
 
     def _friction(self) -> Friction:

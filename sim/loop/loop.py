@@ -55,6 +55,7 @@ class Loop:
             dissipation=robot.dissipation,
             ground=options.ground,
             fixed_base=robot.fixed_base,
+            merge_fixed=robot.merge_fixed,
             build=options.build,
         )
         self._steps = 0

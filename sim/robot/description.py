@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -95,6 +95,14 @@ class Link:
     triangle_excess: float = 0.0
 
 
+class Placement(NamedTuple):
+    """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz`` (4,)."""
+
+    link: str
+    position: Float64
+    wxyz: Float64
+
+
 class Dynamics(Protocol):
     """Dynamics and contact of one robot at given poses (n, dof); :class:`sim.engine.dynamics.Dynamics` is one."""
 
@@ -181,8 +189,9 @@ class Urdf:
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, those of ``all_joints`` that move. ``settings`` is None unless the robot is
-    bundled.
+    ``joints`` are the degrees of freedom, those of ``all_joints`` that move. ``bodies`` is the placement of every link,
+    by name: in the rigid body that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in
+    itself. ``settings`` is None unless the robot is bundled.
     """
 
     path: Path
@@ -190,6 +199,8 @@ class RobotDescription(Urdf):
     joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
+    merge_fixed: bool
+    bodies: Mapping[str, Placement]
     settings: Settings | None
 
     def __repr__(self) -> str:
@@ -294,7 +305,7 @@ class RobotDescription(Urdf):
 
     def run_info(self, **options: Any) -> RunInfo:
         """Return the info of a run of this robot; ``options`` are further fields of :class:`sim.RunInfo`."""
-        shared = ("joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation")
+        shared = ("joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed")
         return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:

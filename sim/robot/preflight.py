@@ -55,6 +55,8 @@ def check(
 
 def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
+    bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
+    solid = {bodies[link.name] for link in robot.links if link.inertial or link.collisions}
     for link in robot.links:
         if link.triangle_excess > EXCESS:
             percent = f"{100 * link.triangle_excess:.0f} %"
@@ -63,8 +65,10 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             )
             text += "the others; it is simulated as given"
             yield Finding("note", "inertia", text, "correct <inertia>", link=link.name)
-        if link.inertial or (robot.fixed_base and link.name not in carriers):
+        if link.inertial or (robot.fixed_base and bodies[link.name] not in carriers):
             continue
+        if not link.collisions and (link.name != bodies[link.name] or link.name in solid):
+            continue  # adds nothing to its body
         fixed = link.name in carriers and not carriers[link.name].moves
         if link.collisions:
             effect = "SAPIEN takes its mass from the collision shapes, at 1000 kg/m^3"

@@ -34,3 +34,16 @@ def from_rpy(rpy: ArrayLike) -> NDArray[np.float64]:
     """Return the rotation of a URDF's ``rpy`` [rad]: about the fixed x, then y, then z."""
     roll, pitch, yaw = (about(axis, angle) for axis, angle in zip(np.eye(3), np.asarray(rpy, float), strict=True))
     return multiply(yaw, multiply(pitch, roll))
+
+
+def to_rpy(q: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the ``rpy`` [rad] of a rotation (4,), the inverse of :func:`from_rpy`, exact at pitch +-pi/2 too.
+
+    With R = Rz(yaw) Ry(pitch) Rx(roll), yaw = atan2(R10, R00). Pitch and roll follow from Rz(-yaw) R = Ry(pitch)
+    Rx(roll), which has a solution for any yaw where cos(pitch) = 0.
+    """
+    columns = rotate(np.broadcast_to(np.asarray(q, float), (3, 4)), np.eye(3))
+    (r00, r10, r20), (r01, r11, _), (r02, r12, _) = columns
+    yaw = np.arctan2(r10, r00)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([np.arctan2(s * r02 - c * r12, c * r11 - s * r01), np.arctan2(-r20, c * r00 + s * r10), yaw])

@@ -1,0 +1,47 @@
+"""Spatial inertia of rigid bodies: mass, center of mass and inertia tensor, moved between frames and added.
+
+R. Featherstone, Rigid Body Dynamics Algorithms (2008), section 2.13.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robot.rotations import rotate
+
+Float64 = NDArray[np.float64]
+
+
+class SpatialInertia(NamedTuple):
+    """Mass [kg], center of mass (3,) [m] and inertia tensor about it (3, 3) [kg m^2], in the axes of one frame."""
+
+    mass: float
+    center: Float64
+    tensor: Float64
+
+    def moved(self, position: Float64, wxyz: Float64) -> SpatialInertia:
+        """Return the inertia as seen from a frame in which its own has this position and rotation: c' = p + R c.
+
+        The tensor about the center of mass turns with the axes: I' = R I R^T.
+        """
+        matrix = rotate(np.broadcast_to(wxyz, (3, 4)), np.eye(3)).T
+        return SpatialInertia(self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T)
+
+
+def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:
+    """Return the inertia of ``parts``, given in one frame, as one body (Huygens and Steiner).
+
+    m = sum m_i, c = sum m_i c_i / m, I = sum (I_i + m_i (d_i.d_i 1 - d_i d_i^T)) with d_i = c_i - c. The mass must be
+    positive.
+    """
+    mass = sum(part.mass for part in parts)
+    center = sum((part.mass * part.center for part in parts), start=np.zeros(3)) / mass
+    tensor = np.zeros((3, 3))
+    for part in parts:
+        d = part.center - center
+        tensor += part.tensor + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return SpatialInertia(mass, center, tensor)
