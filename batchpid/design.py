@@ -113,7 +113,8 @@ def design_gains(
     Parameters
     ----------
     robot
-        A :class:`sim.Robot`, or another :class:`Designable`.
+        A :class:`sim.Robot`, or another :class:`Designable`. If it has a ``coupling`` (:mod:`batchpid.coupling`), the
+        gains are for the inertia that moves with each leader. Followers get the same, which have no effect.
     bandwidth_hz, damping_ratio
         Of the closed loop, at the largest inertia. A step settles to 2 % in about 2 / bandwidth_hz seconds.
     integral_time
@@ -146,16 +147,21 @@ def design_gains(
         positive("integral_time", integral_time, "s")
     choice("gain_units", gain_units, CHOICES["gain_units"])
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
+    viscous, coupling = robot.damping, getattr(robot, "coupling", None)
+    if coupling is not None:
+        mass, viscous = coupling.reduced(mass), coupling.reduced_damping(viscous)
     own = np.diagonal(mass, axis1=1, axis2=2)
     inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
     # The loop with the whole mass matrix compensates the joints' damping.
-    damping = {"effort": robot.damping, "inertia": robot.damping / own.max(0), "mass_matrix": 0.0}[gain_units]
+    damping = {"effort": viscous, "inertia": viscous / own.max(0), "mass_matrix": 0.0}[gain_units]
     while True:
         gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
-        filter_time = _filter_time(mass, gains, dt, robot.damping, gain_units, margin)
+        filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin)
         if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
             break
         bandwidth *= BACK_OFF
+    if coupling is not None:
+        gains = {name: coupling.of_all(gain) for name, gain in gains.items()}
     designed = {
         **gains,
         "setpoint_weight": setpoint_weight if integrates else 1.0,

@@ -160,7 +160,8 @@ class Runner:
         Parameters
         ----------
         qpos, qvel
-            (dof,) or (envs, dof) [rad or m, and per second]; default the robot's start pose, at rest.
+            (dof,) or (envs, dof) [rad or m, and per second]; default the robot's start pose, at rest. Followers are put
+            where their leaders have them.
         mask
             Envs to reset (envs,) bool; default all. The others are not affected.
         """
@@ -168,6 +169,8 @@ class Runner:
         position = self._state("qpos", self.robot.start if qpos is None else qpos)
         velocity = self._state("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        if (coupling := self.robot.coupling) is not None:
+            position, velocity = coupling.positions(position), coupling.rates(velocity)
         self._limits.check("qpos", position[chosen])
         pool.run(Reset(chosen, position, velocity))
         self._faults.forget(chosen)
@@ -187,7 +190,9 @@ class Runner:
         Parameters
         ----------
         setpoint
-            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N].
+            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. What it has for a
+            follower (:attr:`sim.Robot.coupling`) is replaced by what the leader's means for it; an effort acts on the
+            leader.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity.
         feedforward
@@ -202,6 +207,7 @@ class Runner:
             None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate),
             None if feedforward is None else self._rows("feedforward", feedforward),
         )
+        command = self._coupled(command)
         if self.control != "effort":
             self._limits.check("setpoint", command.setpoint)
         self._run(pool, command.map(lambda rows: rows[None]), count)
@@ -246,6 +252,7 @@ class Runner:
             None if setpoint_rates is None else read("setpoint_rates", setpoint_rates),
             None if feedforwards is None else read("feedforwards", feedforwards),
         )
+        command = self._coupled(command)
         if self.control != "effort":
             self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
@@ -439,6 +446,14 @@ class Runner:
     def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
         """Return an argument as an array of ``shape``, or else (envs, dof), checked."""
         return array(name, value, shape or self._shape, self._joint_names, finite=self._finite)
+
+    def _coupled(self, command: Command) -> Command:
+        """Return ``command`` with followers as their leaders have them; efforts act on leaders in the loop."""
+        coupling, (setpoint, rate, feedforward) = self.robot.coupling, command
+        if coupling is None:
+            return command
+        setpoint = setpoint if self.control == "effort" else coupling.positions(setpoint)
+        return Command(setpoint, None if rate is None else coupling.rates(rate), feedforward)
 
     def _state(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         """Return positions or velocities (envs, dof) to reset to, checked."""

@@ -20,7 +20,8 @@ from batchpid.errors import RobotError
 from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
-from sim.robot.description import DISSIPATION, Joint
+from sim.robot.description import Joint
+from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
 from sim.robot.spatial_inertia import SpatialInertia, total
 
@@ -245,6 +246,8 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
         link.set_linear_damping(dissipation.link_damping)
         link.set_angular_damping(dissipation.link_damping)
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
+        if joint.mimic is not None and not joint.continuous:
+            built.set_limits([[joint.lower, joint.upper]])  # the URDF's may keep it from following
         built.set_friction(dissipation.joint_friction)
         if dissipation.modelled:
             # SAPIEN implements the URDF's damping as a drive, with an error that depends on the solver; this is exact,

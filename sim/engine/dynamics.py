@@ -13,6 +13,7 @@ from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid
 from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
 from sim.robot.description import RobotDescription
+from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
 
@@ -28,6 +29,7 @@ class Dynamics:
         self._scene, self._robot = build_scene(spec, self._system)
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
+        self._coupling = coupling_of(spec.joints)
         bodies = rigid_bodies(parse(spec))
         # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
@@ -41,7 +43,15 @@ class Dynamics:
         return _rowwise(self._model.compute_inverse_dynamics, qpos, qvel, qacc)
 
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
-        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included."""
+        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
+
+        Followers keep to their leaders: q'' = G M_r^-1 G^T (u - passive force).
+        """
+        if (coupling := self._coupling) is not None:
+            free = self.inverse_dynamics(qpos, qvel, np.zeros_like(np.asarray(qpos, np.float64)))
+            acting = (np.asarray(effort) - free) @ coupling.matrix
+            reduced = coupling.reduced(self.mass_matrix(qpos))
+            return np.linalg.solve(reduced, acting[..., None])[..., 0] @ coupling.matrix.T
         return _rowwise(self._model.compute_forward_dynamics, qpos, qvel, effort)
 
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:

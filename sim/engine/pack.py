@@ -27,11 +27,13 @@ from sim.engine.building import (
     set_collision_group,
 )
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
+from sim.engine.coupling import ConstraintEfforts
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.native import engine_calls
 from sim.engine.root_state import read_root, write_root
 from sim.engine.user_content import SceneContent
-from sim.robot.description import DISSIPATION
+from sim.robot.dissipation import DISSIPATION
+from sim.robot.mimics import coupling_of
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
@@ -48,7 +50,7 @@ class Pack:
     isolated
         Robots that have a system to themselves because contact was predicted (M,); none with ``isolates`` False.
     qf
-        Efforts last written, in the engine's precision.
+        Efforts last written, in the engine's precision; those of a coupling are not among them.
     friction
         Friction and damping that the loop has to apply to the joints.
     """
@@ -81,6 +83,13 @@ class Pack:
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
+        coupling = coupling_of(spec.joints)
+        self._constraint, self._joint_qf = None, self.qf
+        if coupling is not None:
+            self._joint_qf = np.zeros_like(self.qf)
+            self._armature = np.diag([joint.armature[0] for joint in self.robots[0].active_joints])
+            continuous = np.array([joint.continuous for joint in spec.joints])
+            self._constraint = ConstraintEfforts(coupling, continuous, spec.timestep)
         self._bind()
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
@@ -99,19 +108,33 @@ class Pack:
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
         self._calls = engine_calls(
-            robots, list(dict.fromkeys(self.systems)), self.qf[: len(robots)], self._suspended[: len(robots)]
+            robots, list(dict.fromkeys(self.systems)), self._joint_qf[: len(robots)], self._suspended[: len(robots)]
         )
         shared = [row for row in range(len(robots)) if self._isolates and not self.isolated[row]]
         self._get_contacts = [s.get_contacts for s in dict.fromkeys(self.systems[row] for row in shared)]
         self._links = {link: (row, i) for row in shared for i, link in enumerate(robots[row].links)}
 
-    def step(self) -> None:
-        """Do one sim step of every scene."""
+    def step(self, update: bool = True) -> None:
+        """Do one sim step of every scene, with constraint efforts on coupled joints.
+
+        Without ``update`` these take the mass matrix of an earlier step.
+        """
+        if self._constraint is not None:
+            self._write_coupled_qf(self._constraint, update)
         self._calls.step()
         for get_contacts in self._get_contacts:
             contacts = get_contacts()
             if contacts:
                 self.isolate(self._predicted_contacts(contacts))
+
+    def _write_coupled_qf(self, constraint: ConstraintEfforts, update: bool) -> None:
+        """Apply the efforts ``qf`` together with those of the coupling, which no sensor and no delay is between."""
+        qpos = self._calls.qpos(np.float64)
+        if update:
+            passive = self._calls.passive_force(True, True, np.float64)
+            constraint.update(scene_dynamics(self.spec).mass_matrix(qpos) + self._armature, passive)
+        self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
+        self._calls.write_qf()
 
     def _predicted_contacts(self, contacts: Iterable[Any]) -> list[int]:
         """Return the robots in shared systems for which contact is predicted."""
@@ -185,7 +208,8 @@ class Pack:
     def write_qf(self, effort: NDArray[Any]) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
-        self._calls.write_qf()
+        if self._constraint is None:
+            self._calls.write_qf()
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], root: NDArray[Any] | None = None

@@ -16,6 +16,7 @@ from batchpid.friction import Friction
 from sim.engine.building import SceneSpec, add_point_mass, center_of_mass
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
+from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
 
@@ -61,7 +62,9 @@ class VariedPack(Pack):
 
     def _friction(self) -> Friction:
         """Return the friction of the joints, with what is added."""
-        model, added = super()._friction(), self._variation.friction[:, None] + np.zeros((self.size, self.dof))
+        coupling = coupling_of(self.spec.joints)
+        where = np.ones(self.dof) if coupling is None else coupling.independent  # the coupling moves the others
+        model, added = super()._friction(), self._variation.friction[:, None] * where
         return model._replace(coulomb=added if model.coulomb is None else added + model.coulomb)
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:

@@ -16,6 +16,7 @@ from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
 from sim.options import ControlMode
+from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
 
@@ -36,6 +37,8 @@ class Plant(Protocol):
 class Control:
     """Base of the controls, for the M envs of ``plant``; it owns the state of the law.
 
+    Followers get no effort: their leaders move them, with the mass matrix and the passive force of both.
+
     Attributes
     ----------
     saturated
@@ -51,6 +54,7 @@ class Control:
 
     def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
         self._scene, self._plant, self.params = scene, plant, params
+        self._coupling = coupling_of(scene.joints)
         qpos = plant.read_qpos()
         self.saturated: NDArray[np.bool_] = np.zeros(qpos.shape, bool)
         self._state = bp.init(params, qpos)
@@ -61,6 +65,14 @@ class Control:
         """Change gains, limits and times; the state carries on."""
         self._state = self._state.matched_to(bp.init(params, self._plant.read_qpos()))
         self.params = params
+
+    def _without_followers(self, params: bp.PIDParams) -> bp.PIDParams:
+        """Return ``params`` with zero gains for followers, which move with their leaders."""
+        if self._coupling is None:
+            return params
+        independent = self._coupling.independent
+        gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
+        return params.replace(**{name: gain * independent for name, gain in gains.items() if gain is not None})
 
     def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
         """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
@@ -109,6 +121,7 @@ class PIDControl(Control):
         super().set_params(params)
         self._damping = damping if self._whole and damping.any() else None
         self._measures_rate = params.measurement_rate is not None
+        params = self._without_followers(params)
         self._coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
@@ -119,6 +132,8 @@ class PIDControl(Control):
             qvel = self._plant.read_qvel()
         if self._damping is not None and qvel is not None:
             viscous = self._damping * qvel
+            if self._coupling is not None:
+                viscous = self._coupling.efforts(viscous)
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate, _ = self._command
         last = step + 1 == self._substeps
@@ -147,7 +162,9 @@ class PIDControl(Control):
         if self._dynamics is None:
             self._dynamics = scene_dynamics(self._scene)
         matrix = self._dynamics.mass_matrix(qpos)
-        return matrix if damping is None else matrix + self._scene.timestep * np.diag(damping)
+        if damping is not None:
+            matrix = matrix + self._scene.timestep * np.diag(damping)
+        return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)
 
 
 class DriveControl(Control):
@@ -163,8 +180,10 @@ class DriveControl(Control):
         """Change gains, limits and times; the state carries on."""
         super().set_params(params)
         self.reads_qpos_each_step = params.ki is not None and bool(np.any(params.ki > 0))
+        params = self._without_followers(params)
         damping = np.zeros_like(params.kp) if params.kd is None else params.kd
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
+        self._acting = params
         self._plant.write_drive(params.kp, damping, limit)
         self.drive = damping, params.kp
 
@@ -182,14 +201,17 @@ class DriveControl(Control):
             setpoint, rate, _ = self._command
             rates = {"setpoint_rate": rate, "feedforward": feedforward}
             self._state, target = bp.drive_target(
-                self.params, self._state, setpoint, qpos, self._scene.timestep, **rates
+                self._acting, self._state, setpoint, qpos, self._scene.timestep, **rates
             )
             self._plant.write_drive_target(target)
         return feedforward
 
 
 class EffortControl(Control):
-    """qf = sat(the caller's effort + feedforward); the setpoint is the effort."""
+    """qf = sat(the caller's effort + feedforward); the setpoint is the effort.
+
+    Efforts on followers act on their leaders.
+    """
 
     reads_qpos_each_step = False
 
@@ -198,6 +220,8 @@ class EffortControl(Control):
     ) -> Float64 | None:
         """Add and saturate."""
         setpoint = self._command.setpoint
+        if self._coupling is not None:
+            setpoint = self._coupling.efforts(setpoint)
         total = setpoint if feedforward is None else setpoint + feedforward
         effort = clip(total, self.params.effort_min, self.params.effort_max, np)
         if step + 1 == self._substeps:

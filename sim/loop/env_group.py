@@ -16,6 +16,9 @@ from sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 
+COUPLING_STEPS = 4
+"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
+
 
 class EnvGroup:
     """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
@@ -28,6 +31,7 @@ class EnvGroup:
         compensated = options.compensate.split("+")
         self._gravity, self._coriolis = "gravity" in compensated, "coriolis" in compensated
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
+        self._coupling = options.robot.coupling
         self._control = CONTROLS[options.control](pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._friction = JointFriction(pack, self._control.drive)
@@ -136,7 +140,7 @@ class EnvGroup:
                 effort = friction.effort(motor, qvel, self._steps + step)
             if effort is not None:
                 pack.write_qf(effort)
-            pack.step()
+            pack.step(step % COUPLING_STEPS == 0)
             if reads_qpos:
                 qpos = pack.read_qpos()
                 if self._sound(qpos):
@@ -147,11 +151,13 @@ class EnvGroup:
             self._qpos = pack.read_qpos()
 
     def _feedforward(self, command: Command) -> Float64 | None:
-        """Return the compensation plus the caller's feedforward; None for zero."""
+        """Return the compensation plus the caller's feedforward, those of followers on their leaders; None for zero."""
         forward = command.feedforward
         if self._gravity:
             passive = self.pack.passive_force(self._gravity, self._coriolis)
             forward = passive if forward is None else passive + forward
+        if forward is not None and self._coupling is not None:
+            forward = self._coupling.efforts(forward)
         if self._compensates:
             friction = self._friction.feedforward(command, self._qpos)
             forward = friction if forward is None else friction + forward

@@ -12,7 +12,8 @@ from batchpid.elementwise import TURN, wrap
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
-from sim.robot.description import DISSIPATION
+from sim.robot.dissipation import DISSIPATION
+from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
 
@@ -38,6 +39,7 @@ class JointFriction:
 
     def __init__(self, pack: Pack, drive: tuple[Any, Any] = (0.0, 0.0)) -> None:
         self._pack, self._model, self.drive = pack, pack.friction, drive
+        self._coupling = coupling_of(pack.spec.joints)
         self.acts = any(leaf is not None for leaf in self._model)
         joints = pack.spec.joints
         modelled = DISSIPATION[pack.spec.dissipation].modelled
@@ -54,6 +56,8 @@ class JointFriction:
             return
         pack = self._pack
         velocity, load = pack.read_qvel(), pack.passive_force(True, True)
+        if self._coupling is not None:
+            load = self._coupling.efforts(load)
         fresh = friction.init(self._model, velocity, load, self._mass_matrix(), pack.spec.timestep, *self.drive)
         self._state = fresh if self._state.effort is None else friction.reset(self._state, fresh, mask)
 
@@ -79,4 +83,5 @@ class JointFriction:
         self._state = friction.FrictionState(**state)
 
     def _mass_matrix(self) -> Float64:
-        return scene_dynamics(self._pack.spec).mass_matrix(self._pack.read_qpos())
+        matrix = scene_dynamics(self._pack.spec).mass_matrix(self._pack.read_qpos())
+        return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)

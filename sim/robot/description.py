@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.coupling import Coupling
 from batchpid.errors import InvalidArgumentError
 from sim.observation import OBSERVED, RunInfo
+from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
 from sim.robot.findings import Finding
 
@@ -127,26 +129,6 @@ def register_dynamics(make: Callable[[RobotDescription, bool], Dynamics]) -> Non
     _make_dynamics[:] = [make]
 
 
-class Dissipation(NamedTuple):
-    """Friction and damping in the engine.
-
-    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
-    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.friction`, in the URDF's units,
-    and not the engine's.
-    """
-
-    joint_friction: float
-    link_damping: float
-    modelled: bool
-
-
-DISSIPATION = {
-    "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
-    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
-}
-"""Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""
-
-
 @dataclass(frozen=True)
 class Settings:
     """Tutorial's poses and gains of a bundled robot, in joint order.
@@ -189,9 +171,10 @@ class Urdf:
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, those of ``all_joints`` that move. ``bodies`` is the placement of every link,
-    by name: in the rigid body that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in
-    itself. ``settings`` is None unless the robot is bundled.
+    ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
+    among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
+    that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
+    unless the robot is bundled.
     """
 
     path: Path
@@ -202,6 +185,7 @@ class RobotDescription(Urdf):
     merge_fixed: bool
     bodies: Mapping[str, Placement]
     settings: Settings | None
+    coupling: Coupling | None = None
 
     def __repr__(self) -> str:
         mass = sum(link.mass or 0.0 for link in self.links)
@@ -250,7 +234,10 @@ class RobotDescription(Urdf):
             return given
         qpos, dynamics = self.sample(POSES), self.dynamics()
         gravity = dynamics.inverse_dynamics(qpos, np.zeros_like(qpos), np.zeros_like(qpos))
-        suggested = suggested_effort_limit(gravity, dynamics.mass_matrix(qpos), self.friction, self.damping)
+        mass_matrix = dynamics.mass_matrix(qpos)
+        if self.coupling is not None:
+            gravity, mass_matrix = self.coupling.efforts(gravity), self.coupling.mass_matrix(mass_matrix)
+        suggested = suggested_effort_limit(gravity, mass_matrix, self.friction, self.damping)
         return np.where(np.isfinite(given), given, suggested)
 
     @property
@@ -274,11 +261,20 @@ class RobotDescription(Urdf):
         return np.array([joint.friction for joint in self.joints]) * DISSIPATION[self.dissipation].modelled
 
     @property
+    def independent(self) -> Bool:
+        """Mask (dof,) of the joints that are not followers."""
+        return np.ones(self.dof, bool) if self.coupling is None else self.coupling.independent
+
+    def coupled(self, qpos: ArrayLike) -> Float64:
+        """Return ``qpos`` (..., dof) with the followers where their leaders have them."""
+        return np.asarray(qpos, np.float64) if self.coupling is None else self.coupling.positions(qpos)
+
+    @property
     def start(self) -> Float64:
         """Start pose (dof,) [rad or m]: the bundled settings', else zero, clipped to the joint limits."""
         if self.settings is not None:
             return self.settings.start.copy()
-        return np.clip(np.zeros(self.dof), self.lower, self.upper)
+        return self.coupled(np.clip(np.zeros(self.dof), self.lower, self.upper))
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
@@ -309,9 +305,9 @@ class RobotDescription(Urdf):
         return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """Return seeded poses (count, dof), uniform within the limits and within half a turn of the start pose."""
+        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start, and coupled."""
         low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
-        return np.random.default_rng(seed).uniform(low, high, (count, self.dof))
+        return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import array, choice, instance, number, within
-from sim.robot.description import DISSIPATION, Joint, RobotDescription
+from sim.robot.description import Joint, RobotDescription
+from sim.robot.dissipation import DISSIPATION
 from sim.robot.findings import SEVERITIES, Finding
 from sim.robot.stability import stability_report
-from sim.robot.urdf import mimic_works
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
 NEAR_BOUND = 0.5  # share of the stability range above which gains are reported: other poses may have less inertia
@@ -115,13 +115,8 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
         yield found("note", "friction", text, "load with dissipation='urdf' to keep it")
     if joint.mimic is not None:
         law = f"mimics {joint.mimic.joint!r} (multiplier {joint.mimic.multiplier:g}, offset {joint.mimic.offset:g})"
-        if mimic_works(joint, robot.all_joints):
-            text = f"{law}: a stiff tendon couples the two, and it is still one of the {robot.dof} degrees of freedom"
-            yield found("note", "mimic", text, "give both joints the same setpoint")
-        else:
-            text = f"{law}, which SAPIEN would mis-simulate: the mimic is removed, and the joint moves independently"
-            remedy = f"command it as {joint.mimic.multiplier:g} * {joint.mimic.joint} + {joint.mimic.offset:g}"
-            yield found("warning", "mimic", text, remedy)
+        text = f"{law}: it follows, one degree of freedom with its leader; its setpoints and gains have no effect"
+        yield found("note", "mimic", text, f"command {joint.mimic.joint!r}")
     if joint.continuous:
         remedy = "build params with robot.params(), which takes errors and rates the short way round"
         yield found("note", "continuous", "its position wraps: qpos jumps by whole turns", remedy)
@@ -149,7 +144,7 @@ def _stability(
     text = f"the sampled PID loop is at {report.robot_ratio:.2g} times its stability bound at the start pose: {effect}"
     times = f"use at most {0.5 / report.robot_ratio:.1g} times"
     yield Finding(severity, code, text, f"{times} these gains, a derivative_filter_time, or gain_units='inertia'")
-    for index in np.flatnonzero(report.joint_ratio >= NEAR_BOUND):
+    for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
         joint, ratio = robot.joints[index], report.joint_ratio[index]
         unit = "kg" if joint.type == "prismatic" else "kg m^2"
         text = (

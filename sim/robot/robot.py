@@ -17,9 +17,11 @@ import batchpid as bp
 from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
-from sim.robot.description import DISSIPATION, Joint, RobotDescription, Settings
+from sim.robot.description import Joint, RobotDescription, Settings
+from sim.robot.dissipation import DISSIPATION
 from sim.robot.findings import Finding
 from sim.robot.merging import place_links
+from sim.robot.mimics import couple, coupling_of
 from sim.robot.preflight import check
 from sim.robot.urdf import read_srdf, read_urdf
 
@@ -83,7 +85,7 @@ class Robot(RobotDescription):
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         urdf = read_urdf(path, folders, missing_meshes, strict)
-        joints = tuple(joint for joint in urdf.all_joints if joint.moves)
+        joints = couple([joint for joint in urdf.all_joints if joint.moves])
         if not joints:
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         srdf = path.with_suffix(".srdf")
@@ -93,6 +95,7 @@ class Robot(RobotDescription):
             path=path,
             srdf=read_srdf(srdf, urdf) if os.path.isfile(srdf) else None,
             joints=joints,
+            coupling=coupling_of(joints),
             dissipation=dissipation,
             fixed_base=fixed_base,
             merge_fixed=merge_fixed,

@@ -28,7 +28,8 @@ class StabilityReport(NamedTuple):
 
     ``inertia``: I of each joint, with the others free [kg m^2 or kg]; ``kd_dt``: kd dt / I, as the filter passes it;
     ``kp_dt2``: kp dt^2 / I; ``joint_ratio``, ``robot_ratio``: of each joint alone and of the whole robot, 1 is the
-    bound; ``participation``: share of each joint in the mode that is the first to become unstable.
+    bound; ``participation``: share of each joint in the mode that is the first to become unstable. Followers have the
+    figures of their leaders, with which they move.
     """
 
     inertia: Float64
@@ -42,21 +43,29 @@ class StabilityReport(NamedTuple):
 def stability_report(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float) -> StabilityReport:
     """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,)."""
     matrix = robot.mass_matrix(qpos)
-    dt, damping = timestep, robot.damping
+    dt, damping, coupling = timestep, robot.damping, robot.coupling
     kp, kd, tau = (
         np.zeros((1, robot.dof)) if leaf is None else np.asarray(leaf, np.float64)
         for leaf in (params.kp, params.kd, params.derivative_filter_time)
     )
+    if coupling is not None:
+        matrix, damping = coupling.reduced(matrix), coupling.reduced_damping(damping)
+        kp, kd, tau = (np.broadcast_to(leaf, (len(leaf), robot.dof))[:, coupling.independent] for leaf in (kp, kd, tau))
+    joints = matrix.shape[1]
     if isinstance(params.gain_units, PerInertia):
         diagonal = np.diagonal(matrix, axis1=1, axis2=2)
         kp, kd = kp * diagonal, kd * diagonal
     if isinstance(params.gain_units, PerMassMatrix):
-        matrix, damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
+        matrix, damping = np.eye(joints)[None], np.zeros(joints)
     matrices = np.broadcast_to(matrix, (params.num_envs, *matrix.shape[1:]))
     bound = bp.stability_bound(matrices, kp, kd, dt, filter_time=tau, damping=damping)
     worst = int(np.argmax(bound.ratio))
     inertia = 1 / np.diagonal(np.linalg.inv(matrix[0] + 0.5 * dt * np.diag(damping)))
-    kp, kd, tau = (np.broadcast_to(leaf, (params.num_envs, robot.dof))[worst] for leaf in (kp, kd, tau))
+    kp, kd, tau = (np.broadcast_to(leaf, (params.num_envs, joints))[worst] for leaf in (kp, kd, tau))
     kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
     joint_ratio = 0.5 * (kd_dt + 0.5 * kp_dt2)
-    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, float(bound.ratio[worst]), bound.participation[worst])
+    figures = [inertia, kd_dt, kp_dt2, joint_ratio, bound.participation[worst]]
+    if coupling is not None:
+        figures = [coupling.of_all(figure) for figure in figures]
+    inertia, kd_dt, kp_dt2, joint_ratio, participation = figures
+    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, float(bound.ratio[worst]), participation)

@@ -2,13 +2,12 @@
 
 SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
 and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
-mimic joint that SAPIEN would silently mis-simulate.
+mimic joint: SAPIEN's tendons shake a robot (:mod:`sim.engine.coupling`).
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -64,8 +63,8 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     links = [_read_link(element, path) for element in root.findall("link")]
     ordered = _breadth_first(links, joints, path)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
-        if joint.mimic is not None and not mimic_works(joint, joints):
-            element.remove(element.find("mimic"))  # SAPIEN would mis-simulate it; the preflight reports it
+        if joint.mimic is not None:
+            element.remove(element.find("mimic"))  # SAPIEN's tendons shake the robot; see sim.engine.coupling
     if strict:
         refuse(path, repairs)
     if (count := len(root.findall("link"))) > MAX_LINKS:
@@ -117,21 +116,6 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         multiplier, offset = number(mimic, "multiplier", "1", where), number(mimic, "offset", "0", where)
         fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return Joint(name, kind, parent, child, **fields)
-
-
-def mimic_works(joint: Joint, joints: Sequence[Joint]) -> bool:
-    """Return whether SAPIEN simulates the mimic of ``joint`` correctly, which it does by a stiff tendon.
-
-    It does for ``q = +-q_other`` where the other joint moves a sibling of this joint's link, or its parent. Any other
-    mimic SAPIEN silently drops or mis-simulates.
-    """
-    mimic = joint.mimic
-    if mimic is None or abs(mimic.multiplier) != 1 or mimic.offset != 0:
-        return False
-    other = next(other for other in joints if other.name == mimic.joint)
-    if not other.moves or other is joint:
-        return False
-    return joint.parent_link in (other.child_link, other.parent_link)
 
 
 def _read_link(element: etree._Element, path: Path) -> Link:

@@ -12,6 +12,8 @@ share of time in saturation.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,23 +61,28 @@ class Candidates:
     ) -> None:
         self.robot, self.moves, self.seconds, self.weights, self.headroom = robot, moves, seconds, weights, headroom
         self.designed = robot.designed(gain_units)
-        self.dimension = len(FACTORS) + (robot.dof if per_joint else 0)
+        joints = int(robot.independent.sum())
+        self.dimension = len(FACTORS) + (joints if per_joint else 0)
         self._band = absolute_band(robot)
         self._smooth = smooth_variation(robot, moves, 1.0)
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
         # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
         if gain_units == "mass_matrix":
-            self._mass, self._damping = np.eye(robot.dof)[None], np.zeros(robot.dof)
+            self._mass, self._damping = np.eye(joints)[None], np.zeros(joints)
         else:
             self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
+            if (coupling := robot.coupling) is not None:
+                self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
         inertia = gain_units == "inertia"
-        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(robot.dof)
+        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
 
     def params(self, points: Float64) -> bp.PIDParams:
         """Return params with one row for each of ``points`` (n, dimension)."""
         shared = np.exp(np.array(list(FACTORS.values())) * points[:, : len(FACTORS)])
         bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
-        joints = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
+        joints: Any = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
+        if self.dimension > len(FACTORS) and self.robot.coupling is not None:
+            joints = self.robot.coupling.of_all(joints)
         d = self.designed
         return d.replace(
             kp=d.kp * bandwidth**2 * stiffness * joints,
@@ -104,7 +111,7 @@ class Candidates:
             + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
             + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
             + w.saturation * bounded(m.saturation_share)
-        ).mean(2)
+        )[..., self.robot.independent].mean(2)
         lasted = rollout.ok.mean(0).reshape(count, -1)
         total = np.minimum(cost.mean(1) + cost.max(1), DIVERGED_COST)
         total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
@@ -112,10 +119,11 @@ class Candidates:
 
     def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
         """Return the penalty (count,) of candidates near the stability bound, which these moves may not show."""
+        leaves = np.stack(np.broadcast_arrays(params.kp, params.kd, params.derivative_filter_time))
         ratios = [
             stability_bound(
                 self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
             ).ratio.max()
-            for kp, kd, tau in zip(params.kp, params.kd, params.derivative_filter_time, strict=True)
+            for kp, kd, tau in zip(*leaves[..., self.robot.independent], strict=True)
         ]
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)

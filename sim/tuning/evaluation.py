@@ -86,9 +86,10 @@ def step_response_metrics(
 ) -> StepMetrics:
     """Return the metrics of a rollout from rest at ``start`` (envs, dof); those of envs that diverged are inf.
 
+    Followers have the metrics of their leaders.
     Without ``with_effort`` those of the efforts are undefined (NaN), as under control "drive".
     """
-    return step_metrics(
+    metrics = step_metrics(
         rollout.tick,
         rollout.setpoint,
         np.where(rollout.ok[..., None], rollout.qpos, np.nan),
@@ -98,12 +99,13 @@ def step_response_metrics(
         absolute_band=absolute_band(robot),
         continuous=robot.continuous,
     )
+    return metrics if robot.coupling is None else StepMetrics(*map(robot.coupling.of_leaders, metrics))
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     """Return which joints belong to the arm (dof,): those that carry more than one leaf link, so no fingers.
 
-    A robot with fewer than three such joints (legs, a bare chain) is all arm.
+    Followers do not count. A robot with fewer than three such joints (legs, a bare chain) is all arm.
     """
     above = {joint.child_link: joint for joint in robot.all_joints}
     leaves = Counter[str]()
@@ -112,7 +114,7 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
             leaves[above[link].name] += 1
             link = above[link].parent_link
     shared = np.array([leaves[name] > 1 for name in robot.joint_names])
-    return shared if shared.sum() >= 3 else np.ones(robot.dof, bool)
+    return (shared if shared.sum() >= 3 else np.ones(robot.dof, bool)) & robot.independent
 
 
 def run_moves(

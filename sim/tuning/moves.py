@@ -105,11 +105,13 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         if kind == "all alike":
             fraction[:] = fraction[0]
         if kind == "one joint":
+            if robot.coupling is not None:
+                joint = robot.coupling.leader[joint]
             fraction[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
         step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
-        start, target = _with_mimics(robot, start), _with_mimics(robot, target)
+        start, target = robot.coupled(start), robot.coupled(target)
         return None if dynamics.in_contact(start + line * (target - start)).any() else (start, target, kind)
 
     return draw_moves(robot, count, draw)
@@ -140,7 +142,7 @@ def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Fl
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:
     """Return the time of the shortest bang-bang motion along each move (moves,) [s]; inf if gravity forbids it."""
-    dynamics, limit = robot.dynamics(), robot.design_effort_limit
+    limit = robot.design_effort_limit
     t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
     early = t < 0.5
     z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
@@ -150,12 +152,18 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
         step = target - start
         qpos = start + z * step
         still = np.zeros_like(qpos)
-        gravity = dynamics.inverse_dynamics(qpos, still, still)
-        moving = dynamics.inverse_dynamics(qpos, rate * step, acceleration * step) - gravity
+        gravity = motion_effort(robot, qpos, still, still)
+        moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
         room = np.where(moving > 0, limit - gravity, limit + gravity)
         if (room > 0).all():
             durations[row] = np.sqrt((np.abs(moving) / room).max())
     return durations
+
+
+def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
+    """Return the efforts (n, dof) [N m or N] of a motion, gravity included; followers have none, their leaders more."""
+    effort = robot.dynamics().inverse_dynamics(qpos, qvel, qacc)
+    return effort if robot.coupling is None else robot.coupling.efforts(effort)
 
 
 def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200) -> Float64:
@@ -170,24 +178,16 @@ def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float
     qvel = step * (30 * t**2 - 60 * t**3 + 30 * t**4) / duration
     qacc = step * (60 * t - 180 * t**2 + 120 * t**3) / duration**2
     dissipation = robot.damping * qvel + robot.friction * np.sign(qvel)
-    return robot.dynamics().inverse_dynamics(qpos, qvel, qacc) + dissipation
+    return motion_effort(robot, qpos, qvel, qacc) + dissipation
 
 
 def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> Float64:
     """Return the total variation of :func:`smooth_effort` on each move (moves, dof) [N m or N].
 
     ``durations`` [s] are (moves,) or one for all. Less than a thousandth of the joint's effort limit counts as that.
+    Followers have the variation of their leaders.
     """
     rows = zip(moves.start, moves.target, np.broadcast_to(durations, len(moves.start)), strict=True)
     variation = [np.abs(np.diff(smooth_effort(robot, *row), axis=0)).sum(0) for row in rows]
-    return np.maximum(variation, 1e-3 * robot.design_effort_limit)
-
-
-def _with_mimics(robot: Robot, qpos: Float64) -> Float64:
-    """Return ``qpos`` (dof,) with mimic joints at the positions that their leaders give them."""
-    coupled = qpos.copy()
-    for index, joint in enumerate(robot.joints):
-        if joint.mimic is not None and joint.mimic.joint in robot.joint_names:
-            leader = qpos[robot.joint_names.index(joint.mimic.joint)]
-            coupled[index] = joint.mimic.multiplier * leader + joint.mimic.offset
-    return coupled
+    floored = np.maximum(variation, 1e-3 * robot.design_effort_limit)
+    return floored if robot.coupling is None else robot.coupling.of_leaders(floored)

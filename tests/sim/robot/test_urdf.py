@@ -183,33 +183,17 @@ def test_joints_are_in_the_order_of_sapien(tmp_path):
             pass  # building the scene compares the orders
 
 
-@pytest.mark.parametrize(
-    ("multiplier", "offset", "works"), [(1, 0, True), (-1, 0, True), (2, 0, False), (1, 0.1, False)]
-)
-def test_a_mimic_is_kept_only_where_sapien_simulates_it_correctly(multiplier, offset, works, tmp_path):
+@pytest.mark.parametrize(("multiplier", "offset"), [(1, 0), (-1, 0), (2, 0), (1, 0.1)])
+def test_sapien_never_gets_a_mimic_and_inspect_notes_it(multiplier, offset, tmp_path):
     mimic = f'<mimic joint="left" multiplier="{multiplier}" offset="{offset}"/>'
-    hand = Robot.load(
-        write(
-            tmp_path,
-            robot(
-                BASE,
-                link("l"),
-                link("r"),
-                joint("left", "base", "l", origin="0 1 1"),
-                joint("right", "base", "r", inner=LIMIT + mimic, origin="0 -1 1"),
-            ),
-        )
+    sides = (
+        joint("left", "base", "l", origin="0 1 1"),
+        joint("right", "base", "r", inner=LIMIT + mimic, origin="0 -1 1"),
     )
-    assert ("<mimic" in hand.urdf) == works
-    assert {finding.code: finding.severity for finding in hand.check()}["mimic"] == ("note" if works else "warning")
-    with Runner(hand, 1, workers=0, params=hand.params(kp=20.0, kd=3.0), ground=False) as runner:
-        for _ in range(100):
-            qpos = runner.step([0.5, 0.0]).qpos[0]
-    if works:
-        assert abs(qpos[1] - multiplier * qpos[0]) < 0.01
-        assert abs(qpos[0]) > 0.1
-    else:
-        np.testing.assert_allclose(qpos, [0.5, 0.0], atol=0.02)
+    hand = Robot.load(write(tmp_path, robot(BASE, link("l"), link("r"), *sides)))
+    assert "<mimic" not in hand.urdf
+    assert {finding.code: finding.severity for finding in hand.check()}["mimic"] == "note"
+    assert hand.independent.tolist() == [True, False]
 
 
 def test_links_tied_by_fixed_joints_do_not_push_each_other(tmp_path):

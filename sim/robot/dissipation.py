@@ -1,0 +1,25 @@
+"""Choices of the dissipation in the engine."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Dissipation(NamedTuple):
+    """Friction and damping in the engine.
+
+    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
+    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.friction`, in the URDF's units,
+    and not the engine's.
+    """
+
+    joint_friction: float
+    link_damping: float
+    modelled: bool
+
+
+DISSIPATION = {
+    "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
+}
+"""Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""

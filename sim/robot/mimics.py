@@ -1,0 +1,62 @@
+"""Mimic joints of a URDF as a coupling of its degrees of freedom."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from batchpid.coupling import Coupling, Follower
+from sim.robot.description import Joint
+
+
+@lru_cache(maxsize=32)
+def coupling_of(joints: tuple[Joint, ...]) -> Coupling | None:
+    """Return the coupling of the degrees of freedom ``joints``; None without mimic joints."""
+    indices = {joint.name: index for index, joint in enumerate(joints)}
+    followers = [
+        Follower(index, indices[joint.mimic.joint], joint.mimic.multiplier, joint.mimic.offset)
+        for index, joint in enumerate(joints)
+        if joint.mimic is not None
+    ]
+    return Coupling(len(joints), followers) if followers else None
+
+
+def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
+    """Return ``joints`` with what followers contribute to their leaders.
+
+    Their position limits narrow those of the leader, which are theirs then, multiplied; those that would leave no range
+    do not count. Their friction |m| F and damping m^2 B act on the leader, which is the same in the coupled motion.
+    """
+    joints = tuple(joints)
+    coupling = coupling_of(joints)
+    if coupling is None:
+        return joints
+    limits = [(joint.lower, joint.upper) for joint in joints]
+    for index in coupling.followers.tolist():
+        leader, multiplier, offset = (each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset))
+        if multiplier == 0 or joints[index].continuous:
+            continue
+        ends = sorted((end - offset) / multiplier for end in (joints[index].lower, joints[index].upper))
+        low, high = max(limits[leader][0], ends[0]), min(limits[leader][1], ends[1])
+        if low < high:
+            limits[leader] = (float(low), float(high))
+    for index in coupling.followers.tolist():
+        ends = [_image(coupling, index, end) for end in limits[coupling.leader[index]]]
+        limits[index] = (min(ends), max(ends))
+    share = np.abs(coupling.multiplier)
+    friction, damping = np.zeros((2, len(joints)))
+    np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
+    np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
+    return tuple(
+        replace(joint, lower=low, upper=high, friction=float(rubs), damping=float(damps))
+        for joint, (low, high), rubs, damps in zip(joints, limits, friction, damping, strict=True)
+    )
+
+
+def _image(coupling: Coupling, index: int, end: float) -> float:
+    """Return the position of follower ``index`` where its leader is at ``end``, which may be infinite."""
+    multiplier, offset = float(coupling.multiplier[index]), float(coupling.offset[index])
+    return offset if multiplier == 0 else multiplier * end + offset

@@ -1,0 +1,191 @@
+"""Coupled joints against the coupled dynamics, worked out by hand or by reduction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from sim import Robot, Runner
+from tests.sim.identical import assert_identical
+from tests.sim.tiny_urdf import write
+
+FREE_LIMIT = '<limit lower="-3" upper="3" effort="200" velocity="10"/>'
+
+
+def body(name: str, mass: float, at: str = "0 0 0.1", shape: str = "") -> str:
+    moments = " ".join(f'{key}="{mass * 0.01}"' for key in ("ixx", "iyy", "izz"))
+    inertia = f'<mass value="{mass}"/><inertia {moments} ixy="0" ixz="0" iyz="0"/>'
+    return f'<link name="{name}"><inertial><origin xyz="{at}"/>{inertia}</inertial>{shape}</link>'
+
+
+def hinge(
+    name: str, parent: str, child: str, axis: str, origin: str, inner: str = FREE_LIMIT, kind: str = "revolute"
+) -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/><axis xyz="{axis}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{inner}</joint>'
+
+
+def arm(
+    folder, multiplier: float = -1.0, offset: float = 0.0, fixed: bool = False, joints: int = 7, finger: float = 0.02
+) -> Robot:
+    """Return an arm with two sliding fingers and a claw on the first, all moved by the first finger or all fixed."""
+    parts = [body("base", 5.0), *(body(f"l{i}", 4.0 - 0.4 * i) for i in range(joints))]
+    for i in range(joints):
+        parent = f"l{i - 1}" if i else "base"
+        parts.append(hinge(f"j{i}", parent, f"l{i}", "0 1 0" if i % 2 else "0 0 1", "0 0 0.2"))
+    wrist, slide = f"l{joints - 1}", '<limit lower="0" upper="0.04" effort="20" velocity="1"/>'
+    wide = '<limit lower="-9" upper="9" effort="5" velocity="9"/>'
+    law = f'{wide}<mimic joint="left" multiplier="{multiplier}" offset="{offset}"/>'
+    claw = f'{wide}<mimic joint="right" multiplier="20" offset="0.3"/>'  # a chain of followers
+    parts += [body(name, finger, "0 0 0.03") for name in ("left_pad", "right_pad")] + [body("claw", finger, "0.02 0 0")]
+    for name, parent, child, origin, inner, kind in (
+        ("left", wrist, "left_pad", "0 0.05 0.2", slide, "prismatic"),
+        ("right", wrist, "right_pad", "0 -0.05 0.2", law, "prismatic"),
+        ("curl", "left_pad", "claw", "0 0 0.05", claw, "revolute"),
+    ):
+        parts.append(hinge(name, parent, child, "0 1 0", origin, "" if fixed else inner, "fixed" if fixed else kind))
+    return Robot.load(
+        write(folder, f'<robot name="arm">{"".join(parts)}</robot>', "fixed.urdf" if fixed else "arm.urdf")
+    )
+
+
+def constraint_error(robot: Robot, qpos: np.ndarray) -> float:
+    return float(np.abs(qpos - robot.coupling.positions(qpos)).max())
+
+
+@pytest.mark.parametrize(
+    ("multiplier", "offset", "physics"), [(-1.0, 0.0, "accurate"), (1.0, 0.0, "fast"), (0.5, 0.01, "accurate")]
+)
+def test_fast_moves_keep_the_coupling_and_settle_as_with_the_gripper_fixed(multiplier, offset, physics, tmp_path):
+    goal = np.array([0.8, -0.9, 0.7, 1.2, -1.0, 0.8, 1.1])
+    courses = []
+    for robot in (arm(tmp_path, multiplier, offset), arm(tmp_path, fixed=True)):
+        target = goal if robot.coupling is None else np.array([*goal, 0.03, 7.0, -7.0])  # a follower's is not used
+        with Runner(
+            robot,
+            1,
+            params=bp.design_gains(robot, 2.0, gain_units="mass_matrix"),
+            workers=0,
+            physics=physics,
+            ground=False,
+        ) as runner:
+            rollout = runner.rollout(np.tile(target, (100, 1)))
+        courses.append(rollout.qpos[:, 0, :7])
+        if robot.coupling is not None:
+            assert constraint_error(robot, rollout.qpos) < 1e-5
+            assert constraint_error(robot, rollout.setpoint) == 0
+            assert not rollout.effort[..., ~robot.independent].any()
+    np.testing.assert_allclose(*courses, atol=2e-3)
+    np.testing.assert_allclose(courses[0][-1], goal, atol=0.03)  # after 1 s
+
+
+def test_the_coupled_mass_is_that_of_two_bodies_by_hand(tmp_path):
+    """Two sliders of m1, m2 with q2 = k q1 under force F: (m1 + k^2 m2) q1'' = F."""
+    slide = '<limit lower="-9" upper="9" effort="100" velocity="9"/>'
+    m1, m2, k, force, ticks = 2.0, 0.5, -3.0, 1.5, 20
+    follows = f'{slide}<mimic joint="a" multiplier="{k}" offset="0.4"/>'
+    text = "".join(
+        [
+            body("base", 1.0),
+            body("one", m1),
+            body("two", m2),
+            hinge("a", "base", "one", "1 0 0", "0 0 1", slide, "prismatic"),
+            hinge("b", "base", "two", "1 0 0", "0 1 1", follows, "prismatic"),
+        ]
+    )
+    robot = Robot.load(write(tmp_path, f'<robot name="sliders">{text}</robot>'))
+    share = 0.25  # an effort u2 on the follower acts as k u2 on the leader
+    for effort in ([force, 0.0], [force * (1 - share), force * share / k]):
+        with Runner(robot, 1, control="effort", workers=0) as runner:
+            last = runner.rollout(np.tile(effort, (ticks, 1)))
+        expected = force / (m1 + k**2 * m2) * last.time[-1]
+        np.testing.assert_allclose(last.qvel[-1, 0], [expected, k * expected], rtol=2e-3)
+        np.testing.assert_allclose(last.effort[-1, 0], [force, 0.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
+    """Unforced swing under gravity: the engine against the coupled forward dynamics at a finer step."""
+    robot = arm(tmp_path, joints=3)
+    dynamics, free, still = robot.dynamics(), robot.independent, np.zeros((1, robot.dof))
+    q, v = robot.coupled([[0.3, 0.5, -0.4, 0.02, 0, 0]]), still.copy()
+    with Runner(
+        robot,
+        1,
+        control="effort",
+        compensate="none",
+        workers=0,
+        substeps=1,
+        physics=physics,
+        ground=False,
+        timestep=1 / 4000,
+    ) as runner:
+        runner.reset(q)
+        seen = runner.rollout(np.zeros((400, robot.dof)))
+    dt = 1 / 40000
+    for _ in range(4000):
+        v = v + dt * dynamics.forward_dynamics(q, v, still)
+        q = q + dt * v
+    assert constraint_error(robot, seen.qpos) < 1e-5
+    np.testing.assert_allclose(seen.qpos[-1, 0, free], q[0, free], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "control", ["pid", *(pytest.param(each, marks=pytest.mark.slow) for each in ("drive", "effort"))]
+)
+def test_results_do_not_depend_on_packs_workers_or_snapshots(control, tmp_path):
+    robot = arm(tmp_path, joints=2)
+    start = robot.sample(9, seed=1)
+    setpoints = np.zeros((6, 9, robot.dof)) if control == "effort" else np.tile(robot.sample(9, seed=2), (6, 1, 1))
+    params = robot.designed() if control == "pid" else None
+
+    def run(envs=slice(None), again: bool = False, **options):
+        options = {"control": control, "params": params, "substeps": 7, "workers": 0} | options
+        with Runner(robot, len(start[envs]), **options) as runner:
+            runner.reset(start[envs])
+            runner.rollout(setpoints[:3, envs])
+            snapshot = runner.snapshot()
+            rest = runner.rollout(setpoints[3:, envs])
+            if not again:
+                return rest
+            runner.restore(snapshot)
+            return runner.rollout(setpoints[3:, envs])
+
+    reference = run()
+    for options in ({"pack_size": 1}, {"workers": 2}, {"again": True}):
+        assert_identical(reference, run(**options), skip={"time"})
+    few = run(slice(3, 5))
+    for name in ("qpos", "qvel", "effort"):
+        assert getattr(reference, name)[:, 3:5].tobytes() == getattr(few, name).tobytes()
+
+
+def test_reset_puts_followers_in_place_and_a_blocked_follower_holds_its_leader(tmp_path):
+    """The right finger closes on a post that is fixed to the world; the left one touches nothing."""
+    pad = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision>'
+    post = '<collision><geometry><box size="0.05 0.02 0.3"/></geometry></collision>'
+    slide = '<limit lower="0" upper="0.08" effort="20" velocity="1"/>'
+    parts = [
+        body("base", 1.0, shape=post),
+        *(body(name, 0.02, "0 0 0.03", pad) for name in ("left_pad", "right_pad")),
+        hinge("left", "base", "left_pad", "0 -1 0", "0 0.2 0", slide, "prismatic"),
+        hinge("lift", "base", "frame", "0 0 1", "0 0 0", FREE_LIMIT),
+        body("frame", 0.5),
+        hinge("right", "frame", "right_pad", "0 1 0", "0 -0.06 0", f'{slide}<mimic joint="left"/>', "prismatic"),
+    ]
+    robot = Robot.load(write(tmp_path, f'<robot name="gripper">{"".join(parts)}</robot>'))
+    names = list(robot.joint_names)
+    left, right = names.index("left"), names.index("right")
+    for physics in ("accurate", "fast"):
+        with Runner(robot, 1, control="effort", workers=0, physics=physics, ground=False) as runner:
+            given = np.zeros(robot.dof)
+            given[left], given[right] = 0.01, 5.0
+            seen = runner.reset(given)
+            assert seen.qpos[0, right] == seen.qpos[0, left]
+            push = np.zeros(robot.dof)
+            push[left] = 10.0
+            rollout = runner.rollout(np.tile(push, (50, 1)))
+        assert rollout.ok.all()
+        # Surfaces meet at 0.045; half of 10 N goes through the coupling, whose stiffness is m / (8 dt^2).
+        np.testing.assert_allclose(rollout.qpos[-10:, 0, [left, right]], 0.045, atol=2e-3)
+        assert np.ptp(rollout.qpos[-10:, 0], axis=0).max() < 1e-4
