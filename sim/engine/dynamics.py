@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies
 from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
-from sim.robot.description import RobotDescription
+from sim.robot.description import Joint, RobotDescription
 from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
@@ -25,6 +26,7 @@ class Dynamics:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
+        self._spec = spec
         self._system = new_system(replace(spec, timestep=1e-6))
         self._scene, self._robot = build_scene(spec, self._system)
         self._model = self._robot.create_pinocchio_model()
@@ -37,6 +39,18 @@ class Dynamics:
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
         return _rowwise(self._model.compute_generalized_mass_matrix, qpos)
+
+    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+        """Return the mass matrices (n, dof, dof) that the joints show, on a floating base where the robot has one.
+
+        There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, those of the base.
+        """
+        if self._spec.fixed_base:
+            return self.mass_matrix(qpos)
+        base = len(_BASE)
+        full = scene_dynamics(_on_joints(self._spec)).mass_matrix(np.pad(qpos, ((0, 0), (base, 0))))
+        couples = full[:, :base, base:]
+        return full[:, base:, base:] - couples.transpose(0, 2, 1) @ np.linalg.solve(full[:, :base, :base], couples)
 
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
@@ -77,6 +91,31 @@ class Dynamics:
             first, second = (self._links.get(body, WORLD) for body in contact.bodies)
             pairs.append(NearPair(first, second, min(point.separation for point in contact.points)))
         return pairs
+
+
+_BASE = [(kind, axis) for kind in ("prismatic", "revolute") for axis in ("1 0 0", "0 1 0", "0 0 1")]
+"""Types and axes of the joints of a floating base."""
+
+
+def _on_joints(spec: SceneSpec) -> SceneSpec:
+    """Return ``spec`` with its floating base on six joints in front of the others; their links weigh 1e-6 kg."""
+    robot = ElementTree.fromstring(spec.urdf)
+    children = {child.get("link") for child in robot.iter("child")}
+    (root,) = [name for link in robot.iter("link") if (name := link.get("name")) not in children]
+    links, joints = [*(f"batchpid_base{number}" for number in range(len(_BASE))), str(root)], []
+    for (kind, axis), parent, child in zip(_BASE, links[:-1], links[1:], strict=True):
+        joints.append(Joint(parent, kind, parent, child))
+        ElementTree.SubElement(robot, "link", name=parent)
+        joint = ElementTree.SubElement(robot, "joint", name=parent, type=kind)
+        for tag, attributes in {
+            "parent": {"link": parent},
+            "child": {"link": child},
+            "axis": {"xyz": axis},
+            "limit": {"lower": "-9", "upper": "9"},
+        }.items():
+            ElementTree.SubElement(joint, tag, attributes)
+    urdf = ElementTree.tostring(robot, encoding="unicode")
+    return replace(spec, urdf=urdf, joints=(*joints, *spec.joints), fixed_base=True, build=None)
 
 
 def _rowwise(compute: Any, *tables: NDArray[Any]) -> Float64:

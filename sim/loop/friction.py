@@ -83,5 +83,5 @@ class JointFriction:
         self._state = friction.FrictionState(**state)
 
     def _mass_matrix(self) -> Float64:
-        matrix = scene_dynamics(self._pack.spec).mass_matrix(self._pack.read_qpos())
+        matrix = scene_dynamics(self._pack.spec).joint_mass_matrix(self._pack.read_qpos())
         return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)

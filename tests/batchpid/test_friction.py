@@ -1,0 +1,143 @@
+"""The friction model on robots that are equations: stability, stiction, energy, equality of NumPy and JAX."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from batchpid import friction
+from batchpid.friction import Friction
+
+DT = 1 / 2000
+
+
+def random_plant(seed):
+    """Mass matrix, Coulomb friction and damping of a robot of 1 to 7 coupled joints, of very different inertia."""
+    rng = np.random.default_rng(seed)
+    joints = rng.integers(1, 8)
+    basis, _ = np.linalg.qr(rng.normal(size=(joints, joints)))
+    scale = 10.0 ** rng.uniform(-2, 0, joints)
+    mass = scale[:, None] * (basis * 10.0 ** rng.uniform(-2, 0, joints)) @ basis.T * scale
+    coulomb = np.where(rng.random(joints) < 0.7, rng.uniform(0, 2, joints), 0.0)
+    viscous = np.diag(mass) / DT * 10.0 ** rng.uniform(-3, 1.3, joints) * (rng.random(joints) < 0.7)
+    return mass[None], Friction(coulomb[None], viscous[None])
+
+
+def simulate(mass, model, efforts, velocity=0.0, load=0.0):
+    """Return velocities and applied efforts (steps, envs, joints) under ``efforts`` (steps, envs, joints)."""
+    v = np.zeros_like(efforts[0]) + velocity
+    inverse = np.linalg.inv(mass + DT * model.viscous[..., None] * np.eye(v.shape[1]))
+    state = friction.init(model, v, np.zeros_like(v), mass, DT)
+    rows = []
+    for effort in efforts:
+        state, total = friction.advance(model, state, effort, v)
+        v = v + DT * (inverse @ (total - load)[..., None])[..., 0]
+        rows.append((v, total))
+    return tuple(map(np.array, zip(*rows, strict=True)))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_joints_come_to_rest_and_stay(seed):
+    """However the joints are coupled, and however heavy the damping."""
+    mass, model = random_plant(seed)
+    rng = np.random.default_rng(seed)
+    load = 0.9 * model.coulomb * rng.uniform(-1, 1, model.coulomb.shape)
+    stop = model.coulomb / np.diagonal(mass, axis1=1, axis2=2) * DT  # about the change of velocity in a step
+    start = stop * rng.uniform(-3, 3, model.coulomb.shape)
+    velocity, _ = simulate(mass, model, np.zeros((2500, *start.shape)), start, load)
+    rubbing = model.coulomb[0] > 0
+    assert np.abs(velocity).max() < 1e4 * (np.abs(start).max() + 1e-9)
+    if rubbing.all():  # stiction of joints that are coupled may ring, and dies away
+        assert np.abs(velocity[-1] / stop).max() < 0.01
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_friction_is_within_its_limit(seed):
+    mass, model = random_plant(seed)
+    rng = np.random.default_rng(seed)
+    efforts = 3 * rng.normal(size=(200, 1, mass.shape[1]))
+    velocity, total = simulate(mass, model, efforts)
+    before = np.concatenate([np.zeros_like(velocity[:1]), velocity[:-1]])
+    coulomb = total - efforts + model.viscous * before
+    assert (np.abs(coulomb) <= model.coulomb * (1 + 1e-9) + 1e-9 * np.abs(total)).all()
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1, 400.0])
+def test_a_joint_at_rest_holds_its_load_and_lets_go_above_its_friction(damping):
+    mass, model = np.full((1, 1, 1), 0.01), Friction(np.ones((1, 1)), np.full((1, 1), damping))
+    efforts = np.concatenate([np.full((500, 1, 1), 0.99), np.full((500, 1, 1), 1.5)])
+    velocity, total = simulate(mass, model, efforts)
+    assert (velocity[:500] == 0).all()
+    assert (total[:500] == 0).all()
+    implicit = velocity[-2] + DT * (0.5 - damping * velocity[-1]) / mass[0]
+    np.testing.assert_allclose(velocity[-1], implicit, rtol=1e-9)  # backward Euler
+
+
+def test_it_is_the_implicit_step_where_the_load_is_constant():
+    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ is what lies between both ends of Sgn."""
+    inertia, damping, coulomb, load = 0.02, 3.0, 0.7, 0.2
+    mass, model = np.full((1, 1, 1), inertia), Friction(np.full((1, 1), coulomb), np.full((1, 1), damping))
+    rng = np.random.default_rng(0)
+    efforts = np.repeat(rng.normal(size=(40, 1, 1)), 50, axis=0)
+    velocity, _ = simulate(mass, model, efforts, load=load)
+    exact, v = [], 0.0
+    for effort in efforts[:, 0, 0]:
+        ends = [(inertia * v + DT * (effort - load - sign * coulomb)) / (inertia + DT * damping) for sign in (1, -1)]
+        v = max(ends[0], 0.0) + min(ends[1], 0.0)
+        exact.append(v)
+    assert np.abs(velocity[:, 0, 0] - exact).max() < 0.02 * np.abs(exact).max()
+
+
+def test_envs_do_not_affect_each_other_and_are_reset_alone():
+    rng = np.random.default_rng(0)
+    mass = np.concatenate([np.eye(3)[None] * scale for scale in (0.1, 1e-4, 3.0)])
+    model = Friction(rng.uniform(0, 1, (3, 3)), rng.uniform(0, 1, (3, 3)))
+    efforts = rng.normal(size=(50, 3, 3))
+    together, _ = simulate(mass, model, efforts)
+    for env in range(3):
+        part = slice(env, env + 1)
+        alone, _ = simulate(mass[part], Friction(*(leaf[part] for leaf in model)), efforts[:, part])
+        np.testing.assert_array_equal(alone, together[:, part])
+    fresh = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
+    old = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
+    mixed = friction.reset(old, fresh, np.array([True, False, True]))
+    for new, before, after in zip(fresh, old, mixed, strict=True):
+        np.testing.assert_array_equal(after, np.stack([new[0], before[1], new[2]]))
+
+
+def test_nothing_is_done_without_friction():
+    effort = np.ones((2, 3))
+    state = friction.init(Friction(), effort, effort, np.eye(3)[None], DT)
+    assert friction.advance(Friction(), state, effort, effort) == (friction.FrictionState(), effort)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_compensation_never_exceeds_the_friction_it_works_against(seed):
+    rng = np.random.default_rng(seed)
+    coulomb, error, rate = rng.uniform(0, 2, 4), rng.normal(size=(3, 4)) * 1e-3, rng.normal(size=(3, 4)) * 1e-3
+    forward = friction.compensation(coulomb, error, rate, 1e-4)
+    assert (np.abs(forward) <= coulomb).all()
+    assert (forward * (error + friction.LOOKAHEAD * rate) >= 0).all()
+    far = np.abs(error) > 1e-4
+    still = friction.compensation(coulomb, error, None, 1e-4)
+    np.testing.assert_array_equal(still[far], (np.sign(error) * coulomb)[far])
+
+
+def test_jax_gives_the_same():
+    jax = pytest.importorskip("jax")
+    mass, model = random_plant(3)
+    mass = np.repeat(mass, 4, 0)
+    rng = np.random.default_rng(0)
+    v, load, effort = rng.normal(size=(3, 4, mass.shape[1]))
+    expected = friction.init(model, v, load, mass, DT)
+    with jax.enable_x64(True):
+        theirs = Friction(*map(jax.numpy.asarray, model))
+        state = friction.init(theirs, *map(jax.numpy.asarray, (v, load, mass)), DT)
+        advance = jax.jit(friction.advance)
+        for _ in range(5):
+            expected, ours = friction.advance(model, expected, effort, v)
+            state, total = advance(theirs, state, jax.numpy.asarray(effort), jax.numpy.asarray(v))
+            np.testing.assert_allclose(total, ours, rtol=1e-9)
