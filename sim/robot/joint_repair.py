@@ -129,33 +129,46 @@ def mimics(root: etree._Element) -> Iterator[Finding]:
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     sound: set[str | None] = set()  # joints whose chain of leaders ends
     for name, joint in joints.items():
-        if (mimic := joint.find("mimic")) is None:
+        if (problem := _mimic_problem(joint, joints)) is not None:
+            yield _independent(joint, problem)
             continue
-        leader = joints.get(mimic.get("joint"))
-        values = [readable(mimic, key, default) for key, default in (("multiplier", "1"), ("offset", "0"))]
-        problem = None
-        if joint.get("type") == "fixed":
-            joint.remove(mimic)
-            text = f"it is fixed, so it does not mimic {mimic.get('joint')!r}"
-            yield finding_of(joint, "note", "mimic", text, "remove <mimic>")
-            continue
-        if leader is None:
-            problem = "is not in the file"
-        elif leader.get("type") == "fixed":
-            problem = "does not move"
-        elif None in values or values[0] == (0.0,):
-            problem = f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot lead it"
-        else:
-            chain, each = {name}, mimic.get("joint")
-            while each in joints and each not in sound and each not in chain:
-                chain.add(each)
-                follows = joints[each].find("mimic")
-                each = None if follows is None else follows.get("joint")
-            if each == name:
-                problem = "mimics it in turn" if len(chain) > 1 else "is this joint itself"
-            elif each not in chain:
-                sound |= chain
-        if problem is not None:
-            text = f"it mimics {mimic.get('joint')!r}, which {problem}: it moves independently"
-            yield finding_of(joint, "warning", "mimic", text, "correct <mimic joint=>, or remove it")
-            joint.remove(mimic)
+        chain, each = {name}, _leader(joint)
+        while each in joints and each not in sound and each not in chain:
+            chain.add(each)
+            each = _leader(joints[each])
+        if each in chain:
+            yield _independent(joints[each], "mimics it in turn" if len(chain) > 1 else "is this joint itself")
+        sound |= chain
+
+
+def _leader(joint: etree._Element) -> str | None:
+    mimic = joint.find("mimic")
+    return None if mimic is None else mimic.get("joint")
+
+
+def _mimic_problem(joint: etree._Element, joints: dict[str | None, etree._Element]) -> str | None:
+    """Return the reason for which the leader of a joint cannot lead it, or None."""
+    if (mimic := joint.find("mimic")) is None:
+        return None
+    if joint.get("type") == "fixed":
+        return "cannot be followed by a fixed joint"
+    leader = joints.get(mimic.get("joint"))
+    if leader is None:
+        return "is not in the file"
+    if leader.get("type") == "fixed":
+        return "does not move"
+    multiplier, offset = readable(mimic, "multiplier", "1"), readable(mimic, "offset", "0")
+    if multiplier in (None, (0.0,)) or offset is None:
+        return f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot lead it"
+    return None
+
+
+def _independent(joint: etree._Element, problem: str) -> Finding:
+    """Remove the mimic of a joint and return the finding of it."""
+    mimic = joint.find("mimic")
+    joint.remove(mimic)
+    if joint.get("type") == "fixed":
+        text = f"it is fixed, so it does not mimic {mimic.get('joint')!r}"
+        return finding_of(joint, "note", "mimic", text, "remove <mimic>")
+    text = f"it mimics {mimic.get('joint')!r}, which {problem}: it moves independently"
+    return finding_of(joint, "warning", "mimic", text, "correct <mimic joint=>, or remove it")

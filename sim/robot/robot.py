@@ -26,6 +26,7 @@ from sim.robot.preflight import check
 from sim.robot.urdf import read_srdf, read_urdf
 
 _ASSETS = Path(assets.__file__).parent
+MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 
@@ -85,6 +86,10 @@ class Robot(RobotDescription):
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         urdf = read_urdf(path, folders, missing_meshes, strict)
+        bodies = place_links(urdf.urdf, merge_fixed)
+        if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
+            problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
+            raise RobotError(f"{path}: {problem}; {'split the robot' if merge_fixed else 'load with merge_fixed=True'}")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
         if not joints:
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
@@ -99,7 +104,7 @@ class Robot(RobotDescription):
             dissipation=dissipation,
             fixed_base=fixed_base,
             merge_fixed=merge_fixed,
-            bodies=place_links(urdf.urdf, merge_fixed),
+            bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
         )
 

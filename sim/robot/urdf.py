@@ -25,7 +25,6 @@ from sim.robot.repair import repair
 from sim.robot.xml import number, numbers, parse_xml
 
 MOST_READ = 4096  # links and joints of a file
-MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 MAX_PAIRS = 31  # SAPIEN has a bit for each pair of links that may not collide
 
 
@@ -61,15 +60,13 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
-    ordered = _breadth_first(links, joints, path)
+    added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
+    ordered = _breadth_first(links, joints, path, added)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
         if joint.mimic is not None:
             element.remove(element.find("mimic"))  # SAPIEN's tendons shake the robot; see sim.engine.coupling
     if strict:
         refuse(path, repairs)
-    if (count := len(root.findall("link"))) > MAX_LINKS:
-        remedy = "merge links that are joined by fixed joints, or split the robot"
-        raise RobotError(f"{path}: has {count} links; PhysX holds at most {MAX_LINKS} in one robot; {remedy}")
     text = etree.tostring(root, encoding="unicode")
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
 
@@ -137,8 +134,11 @@ def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]
     return {"origin": numbers(origin, "xyz", "0 0 0", where), "rpy": numbers(origin, "rpy", "0 0 0", where)}
 
 
-def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[Joint]:
-    """Return the joints level by level from the root, siblings in file order, if they form one tree."""
+def _breadth_first(links: list[Link], joints: list[Joint], path: Path, added: list[str]) -> list[Joint]:
+    """Return the joints level by level from the root, siblings in file order, if they form one tree.
+
+    ``added`` are links that joints name and the file does not hold.
+    """
     known, children = [link.name for link in links], [joint.child_link for joint in joints]
     moved, below = set(children), defaultdict(list)
     for joint in joints:
@@ -147,7 +147,8 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path) -> list[J
         raise RobotError(f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree")
     roots = [name for name in known if name not in moved]
     if len(roots) != 1:
-        raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; a robot must be one tree")
+        remedy = f"joints name {added}, not in the file: correct the names" if added else "a robot must be one tree"
+        raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}")
     ordered = below[roots[0]].copy()
     for joint in ordered:
         ordered += below[joint.child_link]

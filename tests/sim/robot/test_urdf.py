@@ -12,7 +12,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 from batchpid.errors import BatchPIDError, RobotError, RobotNotFoundError
 from sim import Robot, Runner
 
-BASE, ARM = link("base"), link("arm")
+BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")
 MESH = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
 
@@ -37,12 +37,16 @@ BAD = {
         "loop apart from the root",
     ),
     "two robots": (robot(BASE, ARM, link("other"), link("leg"), HINGE, joint("k", "other", "leg")), "one root.*other"),
+    "misspelt link": (
+        robot(BASE, ARM, TIP, joint("hinge", "base", "amr"), joint("k", "arm", "tip")),
+        r"one root link.*joints name \['amr'\], not in the file: correct",
+    ),
     "xacro": (robot(BASE, ARM, joint("${side}_hinge", "base", "arm")), r"'\$\{side\}_hinge'> is .*xacro.*expand it"),
     "too much": (robot(*map(link, map(str, range(4097))), HINGE), "more than 4096 links or joints"),
     "all in a loop": (robot(BASE, ARM, HINGE, joint("back", "arm", "base")), "exactly one root.*a loop"),
     "too many links": (
         robot(link("l0"), *(link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}") for n in range(255))),
-        "has 256 links; PhysX holds at most 255.*merge links",
+        "has 256 links that move; PhysX holds at most 255.*split",
     ),
     "no parent": (one_joint().replace('<parent link="base"/>', ""), "joint 'hinge'.*needs <parent"),
     "no joint": (robot(BASE), "without moving joints"),
@@ -80,6 +84,14 @@ def test_as_many_links_as_physx_holds_are_simulated(tmp_path):
     long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))
     with Runner(long, 1, workers=0, control="effort", substeps=1, ground=False) as runner:
         assert runner.step(np.zeros(254)).ok.all()
+
+
+def test_links_of_one_rigid_body_count_once(tmp_path):
+    frames = (link(f"f{n}", "") + joint(f"k{n}", "arm", f"f{n}", "fixed", "") for n in range(300))
+    path = write(tmp_path, robot(BASE, ARM, HINGE, *frames))
+    assert len(Robot.load(path).links) == 302
+    with pytest.raises(RobotError, match=r"has 302 links.*load with merge_fixed=True"):
+        Robot.load(path, merge_fixed=False)
 
 
 def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):
