@@ -86,13 +86,13 @@ class Robot(RobotDescription):
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         urdf = read_urdf(path, folders, missing_meshes, strict)
+        if not any(joint.moves for joint in urdf.all_joints):
+            raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         bodies = place_links(urdf.urdf, merge_fixed)
         if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
             raise RobotError(f"{path}: {problem}; {'split the robot' if merge_fixed else 'load with merge_fixed=True'}")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
-        if not joints:
-            raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         srdf = path.with_suffix(".srdf")
         bundled = path.parent == _ASSETS
         return cls(
