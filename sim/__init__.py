@@ -17,7 +17,7 @@ for _name in ("batchpid", "assets"):
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo
-from sim.options import RunnerOptions
+from sim.options import Controller, RunnerOptions
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, RobotDescription, register_dynamics
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sim.workers.pool import RecoveryWarning
 
 __all__ = [
+    "Controller",
     "Fault",
     "FaultWarning",
     "Finding",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import KW_ONLY, astuple, dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.computed_torque import check_gain_units
@@ -20,6 +20,35 @@ if TYPE_CHECKING:
     from sim.engine.variation import Variation
 
 ControlMode = Literal["pid", "drive", "effort"]
+
+
+class Controller(Protocol):
+    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), in SAPIEN's order, SI units.
+
+    It is called at every sim step, in the worker processes, for some of the envs at a time: the effort of an env must
+    depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
+    """
+
+    def init(self, robot: Robot, num_envs: int) -> Any:
+        """Return the state of so many envs at their start: None, an array, or tuples and dicts of these.
+
+        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots.
+        """
+
+    def __call__(
+        self,
+        state: Any,
+        setpoint: NDArray[Any],
+        qpos: NDArray[Any],
+        qvel: NDArray[Any],
+        passive: NDArray[Any],
+    ) -> tuple[Any, Any]:
+        """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
+
+        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward.
+        """
+
+
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
 PhysicsPreset = Literal["accurate", "fast"]
 FaultAction = Literal["hold", "reset"]
@@ -48,9 +77,9 @@ class RunnerOptions:
     """Time step of simulation and control [s]."""
     substeps: int = 20
     """Sim steps of one tick, all under the same setpoint; the control runs at every one of them."""
-    control: ControlMode = "pid"
+    control: ControlMode | Controller = "pid"
     """``"pid"``; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and damping;
-    ``"effort"``: the setpoint is the joint effort."""
+    ``"effort"``: the setpoint is the joint effort; or a :class:`Controller`."""
     compensate: Compensation = "gravity+coriolis+friction"
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
     "effort" friction is not compensated."""
@@ -96,7 +125,7 @@ class RunnerOptions:
             "num_envs": integer("num_envs", self.num_envs, 1, 1_000_000),
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
-            "control": choice("control", self.control, get_args(ControlMode)),
+            "control": _control(self.control),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
             "ground": flag("ground", self.ground),
             "pack_size": integer("pack_size", self.pack_size, 1, 65535),
@@ -134,6 +163,16 @@ class RunnerOptions:
         return self.physics if isinstance(self.physics, Physics) else PHYSICS[self.physics]
 
     @property
+    def control_name(self) -> str:
+        """Name of the control; of a :class:`Controller` its class."""
+        return self.control if isinstance(self.control, str) else type(self.control).__name__
+
+    @property
+    def sets_positions(self) -> bool:
+        """True if setpoints are joint positions."""
+        return self.control in ("pid", "drive")
+
+    @property
     def scenes_per_system(self) -> int:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
@@ -159,7 +198,7 @@ class RunnerOptions:
         if params.gain_units is not None and self.control != "pid":
             raise InvalidArgumentError(
                 "gain_units",
-                f"have no meaning under control {self.control!r}",
+                f"have no meaning under control {self.control_name!r}",
                 remedy="use control 'pid', or params with gain_units 'effort'",
             )
         check_gain_units(params)
@@ -186,7 +225,7 @@ class RunnerOptions:
             "joints": list(robot.joint_names),
             "num_envs": self.num_envs,
             "timestep": self.timestep,
-            "control": self.control,
+            "control": self.control_name,
             "compensate": self.compensate,
             "physics": list(astuple(self.solver)),
             "dissipation": robot.dissipation,
@@ -196,20 +235,26 @@ class RunnerOptions:
         }
 
 
-def default_params(robot: Robot, control: ControlMode = "pid") -> bp.PIDParams:
+def _control(value: object) -> Any:
+    if callable(value) and callable(getattr(value, "init", None)):
+        return value
+    return choice("control", value, get_args(ControlMode))
+
+
+def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> bp.PIDParams:
     """Return the params of a runner that is given none.
 
     - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
     - ``"drive"``: the drive gains of a bundled robot's settings, else those of ``robot.designed("effort")`` without
       ki: a drive has no setpoint weight, so that the integral would overshoot;
-    - ``"effort"``: zero gains and the robot's effort limits.
+    - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
 
     Raises
     ------
     InvalidArgumentError
         The robot ships no gains and none can be designed: its mass matrix is not positive definite.
     """
-    if control == "effort":
+    if control not in ("pid", "drive"):
         return robot.params(kp=0.0, ki=0.0, kd=0.0)
     settings = robot.settings
     if control == "drive":

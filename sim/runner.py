@@ -23,11 +23,13 @@ from batchpid.validate import array, env_mask, instance, integer, read_array, wi
 from batchpid.versions import package_versions
 from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
+from sim.loop.custom import initial_state
 from sim.loop.faults import Fault, FaultLog
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
     Compensation,
+    Controller,
     ControlMode,
     FaultAction,
     InvalidInputAction,
@@ -85,7 +87,7 @@ class Runner:
         workers: int | None = None,
         timestep: float = 1 / 2000,
         substeps: int = 20,
-        control: ControlMode = "pid",
+        control: ControlMode | Controller = "pid",
         compensate: Compensation = "gravity+coriolis+friction",
         physics: PhysicsPreset | Physics = "accurate",
         ground: bool = True,
@@ -145,7 +147,7 @@ class Runner:
         options, workers = self.options, len(self.pids)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
         return (
-            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {self.control!r}, compensate "
+            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
             f"{options.compensate!r},\n       physics {options.physics!r}, timestep {self.timestep:g} s, "
             f"{self.substeps} substeps, at {self.time:g} s)"
         )
@@ -208,7 +210,7 @@ class Runner:
             None if feedforward is None else self._rows("feedforward", feedforward),
         )
         command = self._coupled(command)
-        if self.control != "effort":
+        if self.options.sets_positions:
             self._limits.check("setpoint", command.setpoint)
         self._run(pool, command.map(lambda rows: rows[None]), count)
         return _copy(pool.present)
@@ -253,7 +255,7 @@ class Runner:
             None if feedforwards is None else read("feedforwards", feedforwards),
         )
         command = self._coupled(command)
-        if self.control != "effort":
+        if self.options.sets_positions:
             self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
@@ -327,7 +329,8 @@ class Runner:
         snapshot.check(self.options.about())
         self.options.check_params(snapshot.params)
         sizes = [size for part in pool.run(ReadContentSizes()) for size in part]
-        snapshot.states.check(self.num_envs, self.robot.dof, snapshot.params, self.options.has_stiction, sizes)
+        controller = initial_state(self.options, snapshot.params)
+        snapshot.states.check(self.num_envs, self.robot.dof, controller, self.options.has_stiction, sizes)
         pool.run(Restore(snapshot))
         self._steps, self._params = snapshot.steps, snapshot.params
         self._faults.restore(snapshot.states.containment["step"])
@@ -342,7 +345,7 @@ class Runner:
         return self.robot.run_info(
             timestep=self.timestep,
             substeps=self.substeps,
-            control=self.control,
+            control=self.options.control_name,
             compensate=self.options.compensate,
             physics=str(self.options.physics),
             params=self._params,
@@ -452,7 +455,7 @@ class Runner:
         coupling, (setpoint, rate, feedforward) = self.robot.coupling, command
         if coupling is None:
             return command
-        setpoint = setpoint if self.control == "effort" else coupling.positions(setpoint)
+        setpoint = coupling.positions(setpoint) if self.options.sets_positions else setpoint
         return Command(setpoint, None if rate is None else coupling.rates(rate), feedforward)
 
     def _state(self, name: str, value: ArrayLike) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command
-from sim.loop.control import CONTROLS
+from sim.loop.custom import make_control
 from sim.loop.faults import FaultContainment, finite
 from sim.loop.friction import JointFriction
 from sim.loop.snapshot import EnvStates
@@ -32,12 +32,12 @@ class EnvGroup:
         self._gravity, self._coriolis = "gravity" in compensated, "coriolis" in compensated
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         self._coupling = options.robot.coupling
-        self._control = CONTROLS[options.control](pack.spec, params, pack)
+        self._control = make_control(options, pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._friction = JointFriction(pack, self._control.drive)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._qpos = pack.read_qpos()
-        self._compensates = self._friction.compensates and "friction" in compensated and options.control != "effort"
+        self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
         self._steps = 0
 
     def set_params(self, params: bp.PIDParams) -> None:
@@ -105,7 +105,7 @@ class EnvGroup:
     def write(self, pack: Pack, states: EnvStates) -> None:
         """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
-        self._control = CONTROLS[self._options.control](pack.spec, self._control.params, pack)
+        self._control = make_control(self._options, pack.spec, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
         pack.isolate(np.flatnonzero(states.isolated).tolist())
@@ -192,7 +192,7 @@ class EnvGroup:
                 containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._place_failed()
         neutral, failed = (
-            (0.0 if self._options.control == "effort" else self._qpos, 0.0, 0.0),
+            (self._qpos if self._options.sets_positions else 0.0, 0.0, 0.0),
             containment.failed[:, None],
         )
         both = zip(command, neutral, strict=True)

@@ -64,11 +64,16 @@ class EnvStates:
         return EnvStates(**_nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
 
     def check(
-        self, num_envs: int, dof: int, params: bp.PIDParams, friction: bool, content_sizes: Sequence[int]
+        self,
+        num_envs: int,
+        dof: int,
+        controller: dict[str, NDArray[Any]],
+        friction: bool,
+        content_sizes: Sequence[int],
     ) -> None:
-        """Check that these are states of so many envs and joints, under ``params``, with content of such sizes (envs,).
+        """Check that these are states of so many envs and joints, with content of such sizes (envs,).
 
-        ``friction`` tells whether joints have Coulomb friction.
+        ``controller`` is a state of the control; ``friction`` tells whether joints have Coulomb friction.
 
         Raises
         ------
@@ -84,7 +89,7 @@ class EnvStates:
             content=np.zeros((num_envs, self.content.size // num_envs), np.float32),
             isolated=row,
             saturated=table > 0,
-            controller={name: leaf for name, leaf in bp.init(params, table)._asdict().items() if leaf is not None},
+            controller=controller,
             friction=dict.fromkeys(FrictionState._fields, table) if friction else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
