@@ -18,7 +18,7 @@ def random_plant(seed):
     basis, _ = np.linalg.qr(rng.normal(size=(joints, joints)))
     scale = 10.0 ** rng.uniform(-2, 0, joints)
     mass = scale[:, None] * (basis * 10.0 ** rng.uniform(-2, 0, joints)) @ basis.T * scale
-    coulomb = np.where(rng.random(joints) < 0.7, rng.uniform(0, 2, joints), 0.0)
+    coulomb = np.diag(mass) * np.where(rng.random(joints) < 0.7, rng.uniform(10, 200, joints), 0.0)
     viscous = np.diag(mass) / DT * 10.0 ** rng.uniform(-3, 1.3, joints) * (rng.random(joints) < 0.7)
     return mass[None], Friction(coulomb[None], viscous[None])
 

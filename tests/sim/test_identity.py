@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 from identical import assert_identical
-from robots import load_bundled
+from robots import RUBBING, load_bundled
 
 from sim import FaultWarning, Runner
 from sim.options import default_params
@@ -64,6 +64,14 @@ def test_other_controls(control):
 
 def test_another_robot():
     assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), reference("jaco2", ticks=20))
+
+
+@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
+def test_a_robot_with_friction_and_damping(control):
+    expected = reference(RUBBING, control=control, ticks=20)
+    assert_identical(run(RUBBING, ticks=20, workers=2, pack_size=3, control=control), expected)
+    alone = run(RUBBING, num_envs=1, ticks=20, workers=0, control=control)
+    assert_identical(alone, expected, slice(0, 1))
 
 
 def test_a_rollout_and_its_ticks_one_by_one(panda):

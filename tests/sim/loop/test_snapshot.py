@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 from identical import assert_identical
-from robots import load_bundled
+from robots import RUBBING, load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from sim import Runner, Snapshot
@@ -34,7 +34,7 @@ def params(robot, **options):
     return robot.params(**options)
 
 
-KINDS = [(name, control, 0) for name in ("panda", "jaco2") for control in ("pid", "drive", "effort")]
+KINDS = [(name, control, 0) for name in ("panda", RUBBING, "jaco2") for control in ("pid", "drive", "effort")]
 
 
 @pytest.mark.parametrize(("name", "control", "workers"), [*KINDS, ("jaco2", "pid", 2)])
