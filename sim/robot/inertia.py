@@ -3,7 +3,7 @@
 The principal moments a <= b <= c of a body are positive and satisfy the triangle inequality c <= a + b. This says that
 the density-weighted covariance tr(I)/2 - I has no negative eigenvalue: P. M. Wensing, S. Kim, J.-J. E. Slotine,
 "Linear matrix inequalities for physically consistent inertial parameter identification", IEEE Robotics and Automation
-Letters 3 (2018), section III.
+Letters 3 (2018).
 """
 
 from __future__ import annotations
