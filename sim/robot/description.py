@@ -232,12 +232,11 @@ class RobotDescription(Urdf):
         given = self.effort_limit
         if np.isfinite(given).all():
             return given
-        qpos, dynamics = self.sample(POSES), self.dynamics()
-        gravity = dynamics.inverse_dynamics(qpos, np.zeros_like(qpos), np.zeros_like(qpos))
-        mass_matrix = dynamics.mass_matrix(qpos)
+        qpos = self.sample(POSES)
+        mass_matrix = self.dynamics().mass_matrix(qpos)
         if self.coupling is not None:
-            gravity, mass_matrix = self.coupling.efforts(gravity), self.coupling.mass_matrix(mass_matrix)
-        suggested = suggested_effort_limit(gravity, mass_matrix, self.friction, self.damping)
+            mass_matrix = self.coupling.mass_matrix(mass_matrix)
+        suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
         return np.where(np.isfinite(given), given, suggested)
 
     @property
@@ -312,6 +311,12 @@ class RobotDescription(Urdf):
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
+
+    def holding_efforts(self, qpos: Float64) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders bear followers."""
+        still = np.zeros_like(qpos)
+        efforts = self.dynamics().inverse_dynamics(qpos, still, still)
+        return efforts if self.coupling is None else self.coupling.efforts(efforts)
 
     def dynamics(self, ground: bool = True) -> Dynamics:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN."""

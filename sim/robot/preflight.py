@@ -17,6 +17,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.validate import array, choice, instance, number, within
 from sim.robot.description import Joint, RobotDescription
 from sim.robot.dissipation import DISSIPATION
+from sim.robot.effort import POSES
 from sim.robot.findings import SEVERITIES, Finding
 from sim.robot.stability import stability_report
 
@@ -40,6 +41,7 @@ def check(
     findings = [*robot.repairs, *_links(robot), *_robot(robot, start), *_poses(robot, "start pose", start)]
     for joint in robot.joints:
         findings += _joint(joint, robot)
+    findings += _strength(robot)
     if setpoint is not None:
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
     if params is not None:
@@ -130,6 +132,22 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
         limit = f"{robot.design_effort_limit[robot.joints.index(joint)]:.3g} {joint.effort_unit}"
         text = f"it has no effort limit: designed and tuned gains stay within {limit}, from gravity and inertia"
         yield found("note", "no-effort-limit", text, "give <limit effort=>, or pass effort_limit= to robot.params()")
+
+
+def _strength(robot: RobotDescription) -> Iterator[Finding]:
+    """Yield the joints whose effort limit does not overcome gravity and friction in every pose."""
+    load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
+    needed = load + robot.friction
+    for index, (joint, limit) in enumerate(zip(robot.joints, robot.effort_limit, strict=True)):
+        share = float(np.mean(needed[:, index] >= limit))
+        if share == 0 or limit <= robot.friction[index]:
+            continue
+        friction = f" and friction of {joint.friction:g}" if robot.friction[index] else ""
+        text = (
+            f"its effort limit of {limit:g} {joint.effort_unit} does not overcome gravity of up to "
+            f"{load[:, index].max():.3g}{friction} in {100 * share:.0f} % of its poses: it cannot hold or leave them"
+        )
+        yield Finding("warning", "weak", text, "expect no moves there, or correct <limit effort=>", joint.name)
 
 
 def _stability(

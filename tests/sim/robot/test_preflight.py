@@ -17,6 +17,8 @@ from sim.robot.stability import stability_report
 COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 GAINS = {"kp": 1.0, "ki": 0.0, "kd": 0.1}
 
+OFF_CENTRE = INERTIAL.replace("<inertial>", '<inertial><origin xyz="0 0 1"/>')
+
 
 def codes(findings: list[Finding]) -> dict[str, Finding]:
     return {finding.code: finding for finding in findings}
@@ -197,3 +199,21 @@ def test_the_simulation_becomes_unstable_at_the_reported_bound(units, filter_tim
         speed = [np.abs(runner.step(start).qvel).max() for _ in range(4)]
         kept = runner.observe().ok[0] and speed[-1] < 1e-2
     assert kept == stays, speed
+
+
+def test_an_effort_limit_below_gravity_is_found(tmp_path):
+    text = one_joint('<limit lower="-1.5" upper="1.5" effort="4" velocity="2"/>', arm=OFF_CENTRE)
+    findings = {finding.code: finding for finding in Robot.load(write(tmp_path, text)).check()}
+    assert findings["weak"].joint == "hinge"
+    assert findings["weak"].severity == "warning"
+    assert "gravity of up to 9.7" in findings["weak"].text
+    strong = Robot.load(write(tmp_path, text.replace('effort="4"', 'effort="10"'), "strong.urdf"))
+    assert "weak" not in {finding.code for finding in strong.check()}
+
+
+def test_friction_counts_with_gravity(tmp_path):
+    text = one_joint(
+        '<limit lower="-1.5" upper="1.5" effort="10" velocity="2"/><dynamics friction="2"/>', arm=OFF_CENTRE
+    )
+    (finding,) = (each for each in Robot.load(write(tmp_path, text)).check() if each.code == "weak")
+    assert "and friction of 2" in finding.text
