@@ -20,10 +20,11 @@ from sim.observation import Observation, Rollout, RunInfo
 from sim.options import Controller, RunnerOptions
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
-from sim.robot.description import Dynamics, RobotDescription, register_dynamics
+from sim.robot.description import Dynamics, Engine, RobotDescription, register_engine
 from sim.robot.findings import Finding
 from sim.robot.limits import SetpointWarning
 from sim.robot.robot import Robot
+from sim.robot.self_collision import SelfContact
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
@@ -60,10 +61,16 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LOADS_SAPIEN[name]), name)
 
 
-def _dynamics(robot: RobotDescription, ground: bool = True) -> Dynamics:
+def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
     from sim.engine.dynamics import robot_dynamics
 
     return robot_dynamics(robot, ground)
 
 
-register_dynamics(_dynamics)
+def _self_contact(robot: RobotDescription) -> SelfContact:
+    from sim.engine.self_contact import self_contact
+
+    return self_contact(robot)
+
+
+register_engine(Engine(_dynamics, _self_contact))

@@ -85,8 +85,9 @@ class RunnerOptions:
     "effort" friction is not compensated."""
     physics: PhysicsPreset | Physics = "accurate"
     """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, or a :class:`sim.Physics`."""
-    ground: bool = True
-    """Add a ground plane at height 0 to every scene."""
+    ground: bool | None = None
+    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
+    so low that other links reach the ground at its start pose."""
     build: Callable[[Any, int], Any] | None = None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`sim.Runner.poses` reports. A
@@ -127,7 +128,7 @@ class RunnerOptions:
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "control": _control(self.control),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
-            "ground": flag("ground", self.ground),
+            "ground": robot.has_ground if self.ground is None else flag("ground", self.ground),
             "pack_size": integer("pack_size", self.pack_size, 1, 65535),
             "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
             "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),

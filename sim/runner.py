@@ -90,7 +90,7 @@ class Runner:
         control: ControlMode | Controller = "pid",
         compensate: Compensation = "gravity+coriolis+friction",
         physics: PhysicsPreset | Physics = "accurate",
-        ground: bool = True,
+        ground: bool | None = None,
         build: Callable[[Any, int], Any] | None = None,
         pack_size: int = 4,
         on_fault: FaultAction = "hold",

@@ -134,7 +134,7 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
 
     ``solver`` None is the equation of motion. ``refinement`` sim steps are made in each period.
     """
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, solver or PHYSICS["accurate"])
     finer = replace(spec, timestep=TIMESTEP / refinement)
     plant: Pack | EquationOfMotion
     if solver is None:

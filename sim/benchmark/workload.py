@@ -73,7 +73,7 @@ class Workload:
     def scene(self, gravity: bool) -> SceneSpec:
         """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
         robot, physics = self.robot, PHYSICS[self.physics]
-        spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, TIMESTEP, physics, dissipation="sapien")
+        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, physics, dissipation="sapien")
         return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
 
     def runner(self) -> Runner:

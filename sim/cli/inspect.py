@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from dataclasses import dataclass
 
 from batchpid.versions import package_versions
@@ -32,6 +33,7 @@ class InspectCommand:
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
         print(joint_table(robot, fixed_too=self.all) + "\n")
+        print(disabled_pairs(robot) + "\n")
         setpoint = None if robot.settings is None else robot.settings.target
         findings = robot.check(setpoint=setpoint, control="drive")  # without gains
         print("\n".join(map(str, findings)) or "Nothing odd about it.")
@@ -73,6 +75,16 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
         if fixed_too and not joint.moves
     ]
     return table(rows, HEADERS, "lllrrrrrl")
+
+
+def disabled_pairs(robot: Robot) -> str:
+    """Return the pairs of links that do not collide, by reason, and whether the robot's scenes have a ground."""
+    contact = robot.self_contact
+    lines = [] if robot.has_ground else ["No ground: links other than the fixed base reach it at the start pose."]
+    for reason in dict.fromkeys(pair.reason for pair in contact.pairs):
+        pairs = ", ".join(f"{pair.first} - {pair.second}" for pair in contact.pairs if pair.reason == reason)
+        lines.append(textwrap.fill(f"Do not collide, {reason!r}: {pairs}", 120, subsequent_indent="  "))
+    return "\n".join(lines) or "All links collide."
 
 
 def _bound(value: float) -> str:

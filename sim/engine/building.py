@@ -6,17 +6,17 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache, lru_cache, reduce
-from operator import or_
+from functools import cache, lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-from lxml import etree
 from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
+from sim.engine.collision_groups import Pair, Words, collision_groups
 from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
@@ -30,13 +30,14 @@ from sim.robot.spatial_inertia import SpatialInertia, total
 class SceneSpec:
     """Everything that a scene is built from, picklable.
 
-    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``joints`` are the degrees of freedom in SAPIEN's order.
-    With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
+    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
+    ``joints`` are the degrees of freedom in SAPIEN's order. With ``merge_fixed`` each rigid body is one link
+    (:mod:`sim.robot.merging`).
     Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
-    srdf: str | None
+    ignored: tuple[tuple[str, str], ...]
     joints: tuple[Joint, ...]
     timestep: float
     physics: Physics
@@ -57,13 +58,7 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     RobotError
         SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
-    if spec.merge_fixed:
-        builder = _load(merged(spec).urdf, None, spec.fixed_base)
-        used = reduce(or_, _srdf_bits(spec).values())
-    else:
-        builder, used = _load(spec.urdf, spec.srdf, spec.fixed_base), 0
-    _ignore_contacts_within_bodies(builder, used)
-    return builder
+    return _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
 
 
 @lru_cache(maxsize=8)
@@ -72,7 +67,7 @@ def merged(spec: SceneSpec) -> Merged:
 
     @cache
     def unmerged() -> dict[str, Any]:
-        return {link.name: link for link in _load(spec.urdf, None, spec.fixed_base).link_builders}
+        return {link.name: link for link in _load(spec.urdf, spec.fixed_base).link_builders}
 
     def inertia_of_shapes(link: str) -> SpatialInertia:
         return link_inertia(unmerged()[link].build_physx_component())
@@ -101,24 +96,34 @@ def add_point_mass(link: Any, mass: float, position: NDArray[np.float64]) -> Non
 
 
 @lru_cache(maxsize=8)
-def _srdf_bits(spec: SceneSpec) -> dict[str, int]:
-    """Return bits of the third collision group for each link of the URDF: pairs of the .srdf share one.
+def _collision_words(spec: SceneSpec) -> dict[str, Words]:
+    """Return the words by which PhysX ignores the pairs of ``spec``, for each link of the URDF that has shapes.
 
-    SAPIEN's loader does the same for links that are not merged. PhysX ignores contacts within a body, and with the
-    bodies that joints connect it to.
+    Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
+    contacts within a simulated link, and with its parent, unless that is the root of a fixed base.
     """
-    bodies = merged(spec).bodies
-    joined = {frozenset((bodies[joint.parent_link].link, bodies[joint.child_link].link)) for joint in spec.joints}
-    bits, number = dict.fromkeys(bodies, 0), 0
-    for element in etree.fromstring((spec.srdf or "<robot/>").encode()).findall("disable_collisions"):
-        links = element.get("link1"), element.get("link2")
-        if element.get("reason").lower() == "default" and len(pair := {bodies[link].link for link in links}) == 2:
-            if frozenset(pair) in joined:
-                continue
-            for link in links:
-                bits[link] |= 1 << number
-            number += 1
-    return bits
+    builder = parse(spec)
+    simulated = {name: at.link for name, at in place_links(spec.urdf, spec.merge_fixed).items()}
+    bodies = {name: rigid_bodies(builder)[link] for name, link in simulated.items()}
+    root = builder.link_builders[0].name if spec.fixed_base else None
+    joined = [(simulated[joint.parent_link], simulated[joint.child_link]) for joint in spec.joints]
+    neighbours = {frozenset(pair) for pair in joined if root not in pair}
+    links = list(dict.fromkeys(owner for owners in shape_owners(spec).values() for owner in owners))
+    ignored, free = {frozenset(pair) for pair in spec.ignored}, set[Pair]()
+    for first, second in combinations(links, 2):
+        pair = frozenset((simulated[first], simulated[second]))
+        if len(pair) == 1 or pair in neighbours:
+            free.add(frozenset((first, second)))
+        elif bodies[first] == bodies[second]:
+            ignored.add(frozenset((first, second)))
+    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free).words
+
+
+def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
+    """Return the link of the URDF that owns each collision shape of each simulated link, in the engine's order."""
+    if spec.merge_fixed:
+        return merged(spec).owners
+    return {link.name: [link.name] * len(link.collision_records) for link in parse(spec).link_builders}
 
 
 def link_inertia(link: Any) -> SpatialInertia:
@@ -127,10 +132,10 @@ def link_inertia(link: Any) -> SpatialInertia:
     return SpatialInertia(link.mass, np.zeros(3), principal).moved(np.asarray(at.p, float), np.asarray(at.q, float))
 
 
-def _load(urdf: str, srdf: str | None, fixed_base: bool) -> ArticulationBuilder:
+def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
     loader = HeadlessScene().create_urdf_loader()
     loader.fix_root_link = fixed_base
-    with _in_memory(urdf) as urdf_path, _in_memory(srdf or "<robot/>") as srdf_path:
+    with _in_memory(urdf) as urdf_path, _in_memory("<robot/>") as srdf_path:
         try:
             builders, actors, _ = loader.parse(urdf_path, srdf_path)
         except Exception as error:
@@ -147,26 +152,6 @@ def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
         fixed = link.parent is not None and link.joint_record.joint_type == "fixed"
         bodies[link.name] = bodies[link.parent.name] if fixed else link.name
     return bodies
-
-
-def _ignore_contacts_within_bodies(builder: ArticulationBuilder, used: int) -> None:
-    """Filter out contacts between links of one rigid body: they cannot move apart, and the solver would shake them.
-
-    PhysX filters a parent and its child only, not a hand whose flange is a separate link. Shapes that share a bit of
-    the third collision group never touch; each body gets one that no pair of the .srdf uses, as long as there are any:
-    neither one of ``used`` nor one of the builder's.
-    """
-    bodies = rigid_bodies(builder)
-    for link in builder.link_builders:
-        used |= link.collision_groups[2]
-    free = (1 << bit for bit in range(32) if not used >> bit & 1)
-    for body in dict.fromkeys(bodies.values()):
-        links = [link for link in builder.link_builders if bodies[link.name] == body]
-        solid = [link for link in links if link.collision_records]
-        if len(links) > 2 and len(solid) > 1:
-            bit = next(free, 0)
-            for link in solid:
-                link.collision_groups[2] |= bit
 
 
 @contextmanager
@@ -230,13 +215,10 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             files = ", ".join(record.filename for record in records if record.filename)
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
-    if spec.merge_fixed and spec.srdf is not None:
-        bits = _srdf_bits(spec)
-        for link in robot.links:
-            for shape, owner in zip(link.collision_shapes, merged(spec).owners[link.name], strict=True):
-                groups = list(shape.get_collision_groups())
-                groups[2] |= bits[owner]
-                shape.set_collision_groups(groups)
+    words, owners = _collision_words(spec), shape_owners(spec)
+    for link in robot.links:
+        for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
+            shape.set_collision_groups(words[owner])
     names, ours = [joint.name for joint in robot.active_joints], [joint.name for joint in spec.joints]
     if names != ours:
         raise RobotError(f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF")

@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies
+from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies, shape_owners
+from sim.engine.collision_groups import Pair
 from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
 from sim.robot.description import Joint, RobotDescription
@@ -32,7 +33,12 @@ class Dynamics:
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
         self._coupling = coupling_of(spec.joints)
-        bodies = rigid_bodies(parse(spec))
+        owners, bodies = shape_owners(spec), rigid_bodies(parse(spec))
+        self._owners = {
+            shape: owner
+            for link in self._robot.links
+            for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True)
+        }
         # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
 
@@ -81,6 +87,28 @@ class Dynamics:
             ]
         )
 
+    def link_distances(self, qpos: NDArray[Any]) -> dict[Pair, float]:
+        """Return the distances [m] of the pairs of links of the URDF that are near each other, at one pose (dof,).
+
+        Links joined by fixed joints do not count.
+        """
+        self.near_pairs(qpos)
+        distances: dict[Pair, float] = {}
+        for contact in self._system.get_contacts():
+            first, second = (self._bodies[self._links.get(body, WORLD)] for body in contact.bodies)
+            if first != second:
+                pair = frozenset(self._owners.get(shape, second) for shape in contact.shapes)
+                distance = min(point.separation for point in contact.points)
+                distances[pair] = min(distance, distances.get(pair, np.inf))
+        return distances
+
+    def height(self, qpos: NDArray[Any]) -> float:
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""
+        self._robot.set_qpos(qpos.astype(np.float32))
+        moving = (link for link in self._links if self._bodies[self._links[link]] != self._bodies[WORLD])
+        boxes = (link.compute_global_aabb_tight() for link in moving if link.collision_shapes)
+        return min((float(box[0, 2]) for box in boxes), default=np.inf)
+
     def near_pairs(self, qpos: NDArray[Any]) -> list[NearPair]:
         """Return the pairs of shapes that the engine lists as near each other, at one pose (dof,)."""
         self._robot.set_qpos(qpos.astype(np.float32))
@@ -128,7 +156,9 @@ def scene_dynamics(spec: SceneSpec) -> Dynamics:
     return Dynamics(spec)
 
 
-def robot_dynamics(robot: RobotDescription, ground: bool = True) -> Dynamics:
+def robot_dynamics(robot: RobotDescription, ground: bool | None = None) -> Dynamics:
     """Return the dynamics of ``robot`` on a fixed base, with or without a ground at height 0."""
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["fast"], merge_fixed=robot.merge_fixed)
-    return scene_dynamics(replace(spec, ground=ground))
+    spec = SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"], merge_fixed=robot.merge_fixed
+    )
+    return scene_dynamics(replace(spec, ground=robot.has_ground if ground is None else ground))

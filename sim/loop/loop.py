@@ -48,12 +48,12 @@ class Loop:
         self._first_env = envs.start
         self._scene = SceneSpec(
             urdf=robot.urdf,
-            srdf=robot.srdf,
+            ignored=robot.ignored_pairs,
             joints=robot.joints,
             timestep=options.timestep,
             physics=options.solver,
             dissipation=robot.dissipation,
-            ground=options.ground,
+            ground=bool(options.ground),
             fixed_base=robot.fixed_base,
             merge_fixed=robot.merge_fixed,
             build=options.build,

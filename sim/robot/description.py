@@ -20,6 +20,7 @@ from sim.observation import OBSERVED, RunInfo
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
 from sim.robot.findings import Finding
+from sim.robot.self_collision import SelfContact, Srdf
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -121,12 +122,19 @@ class Dynamics(Protocol):
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 
 
-_make_dynamics: list[Callable[[RobotDescription, bool], Dynamics]] = []
+class Engine(NamedTuple):
+    """Functions of the engine, which is a floor above, so that :mod:`sim` connects the two."""
+
+    dynamics: Callable[[RobotDescription, bool | None], Dynamics]
+    self_contact: Callable[[RobotDescription], SelfContact]
 
 
-def register_dynamics(make: Callable[[RobotDescription, bool], Dynamics]) -> None:
-    """Set what :meth:`RobotDescription.dynamics` calls: the engine is a floor above, so :mod:`sim` connects the two."""
-    _make_dynamics[:] = [make]
+_engine: list[Engine] = []
+
+
+def register_engine(engine: Engine) -> None:
+    """Set what :meth:`RobotDescription.dynamics` and :attr:`RobotDescription.self_contact` call."""
+    _engine[:] = [engine]
 
 
 @dataclass(frozen=True)
@@ -178,7 +186,8 @@ class RobotDescription(Urdf):
     """
 
     path: Path
-    srdf: str | None
+    srdf: Srdf
+    self_collision: str
     joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
@@ -318,9 +327,27 @@ class RobotDescription(Urdf):
         efforts = self.dynamics().inverse_dynamics(qpos, still, still)
         return efforts if self.coupling is None else self.coupling.efforts(efforts)
 
-    def dynamics(self, ground: bool = True) -> Dynamics:
-        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN."""
-        return _make_dynamics[0](self, ground)
+    def dynamics(self, ground: bool | None = None) -> Dynamics:
+        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN.
+
+        ``ground`` says whether there is one at height 0, by default :attr:`has_ground`.
+        """
+        return _engine[0].dynamics(self, ground)
+
+    @cached_property
+    def self_contact(self) -> SelfContact:
+        """Pairs of links that do not collide, and contact with the ground. Loads SAPIEN at the first use."""
+        return _engine[0].self_contact(self)
+
+    @property
+    def ignored_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of links that do not collide."""
+        return tuple((pair.first, pair.second) for pair in self.self_contact.pairs)
+
+    @property
+    def has_ground(self) -> bool:
+        """True if scenes have a ground by default: unless the base is fixed so low that links dip into it at rest."""
+        return not self.self_contact.reaches_ground
 
     def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
         """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""

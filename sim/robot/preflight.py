@@ -38,7 +38,13 @@ def check(
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names
     start = robot.start if qpos is None else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
-    findings = [*robot.repairs, *_links(robot), *_robot(robot, start), *_poses(robot, "start pose", start)]
+    findings = [
+        *robot.repairs,
+        *robot.srdf.findings,
+        *_links(robot),
+        *_robot(robot, start),
+        *_poses(robot, "start pose", start),
+    ]
     for joint in robot.joints:
         findings += _joint(joint, robot)
     findings += _strength(robot)
@@ -89,9 +95,7 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
         yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
     if robot.dynamics().in_contact(start[None])[0]:
         text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
-        remedy = (
-            "use another start pose, correct the collision shapes, or disable the pair in an .srdf next to the URDF"
-        )
+        remedy = "use another start pose, correct the collision shapes, or load with self_collision='auto'"
         yield Finding("warning", "touching", text, remedy)
 
 

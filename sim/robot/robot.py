@@ -23,7 +23,8 @@ from sim.robot.findings import Finding
 from sim.robot.merging import place_links
 from sim.robot.mimics import couple, coupling_of
 from sim.robot.preflight import check
-from sim.robot.urdf import read_srdf, read_urdf
+from sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
+from sim.robot.urdf import read_urdf
 
 _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
@@ -45,6 +46,7 @@ class Robot(RobotDescription):
         dissipation: str = "urdf",
         fixed_base: bool = True,
         merge_fixed: bool = True,
+        self_collision: str = "auto",
         strict: bool = False,
     ) -> Robot:
         """Load a bundled robot by name (``Robot.bundled()``), or any URDF by path.
@@ -63,6 +65,10 @@ class Robot(RobotDescription):
         merge_fixed
             True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
             steps. False keeps every link, and contacts of a link with those that it is joined to by way of others.
+        self_collision
+            ``"auto"``: links that are neighbours, overlap at the start pose, or touch in nearly every sampled pose do
+            not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
+            name, disables and enables further pairs. ``"none"``: no link collides with another.
         strict
             True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
 
@@ -78,6 +84,7 @@ class Robot(RobotDescription):
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, DISSIPATION)
+        choice("self_collision", self_collision, SELF_COLLISION)
         fixed_base, strict = flag("fixed_base", fixed_base), flag("strict", strict)
         merge_fixed = flag("merge_fixed", merge_fixed)
         if not isinstance(package_dirs, list | tuple):
@@ -98,7 +105,8 @@ class Robot(RobotDescription):
         return cls(
             **vars(urdf),
             path=path,
-            srdf=read_srdf(srdf, urdf) if os.path.isfile(srdf) else None,
+            srdf=read_srdf(srdf, [link.name for link in urdf.links]) if os.path.isfile(srdf) else Srdf(),
+            self_collision=self_collision,
             joints=joints,
             coupling=coupling_of(joints),
             dissipation=dissipation,

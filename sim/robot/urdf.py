@@ -25,7 +25,6 @@ from sim.robot.repair import repair
 from sim.robot.xml import number, numbers, parse_xml
 
 MOST_READ = 4096  # links and joints of a file
-MAX_PAIRS = 31  # SAPIEN has a bit for each pair of links that may not collide
 
 
 def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, strict: bool) -> Urdf:
@@ -155,30 +154,3 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path, added: li
     if len(ordered) != len(joints):
         raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")
     return ordered
-
-
-def read_srdf(path: Path, urdf: Urdf) -> str:
-    """Return the text of the .srdf at ``path``, checked for what SAPIEN's loader fails on.
-
-    Raises
-    ------
-    RobotError
-        What :func:`sim.robot.xml.parse_xml` refuses, a pair without reason or of unknown links, too many pairs.
-    """
-    root = parse_xml(path)
-    names = {link.name for link in urdf.links}
-    joined = {frozenset((joint.parent_link, joint.child_link)) for joint in urdf.all_joints}
-    pairs = 0
-    for element in root.findall("disable_collisions"):
-        first, second = element.get("link1"), element.get("link2")
-        where = f"{path}: <disable_collisions link1={first!r} link2={second!r}>"
-        if "reason" not in element.attrib:
-            raise RobotError(f"{where} has no reason; add reason='Default' for SAPIEN to apply it, or another")
-        if element.get("reason").lower() != "default":
-            continue  # SAPIEN applies no others
-        if first not in names or second not in names or first == second:
-            raise RobotError(f"{where} needs two links of the URDF; correct the names")
-        pairs += frozenset((first, second)) not in joined
-    if pairs > MAX_PAIRS:
-        raise RobotError(f"{path}: disables {pairs} pairs with reason 'Default'; SAPIEN takes {MAX_PAIRS}; remove some")
-    return etree.tostring(root, encoding="unicode")

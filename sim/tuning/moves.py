@@ -31,6 +31,8 @@ MAX_OVERSHOOT = 0.05
 _LINE = 24
 """Points of a move's line."""
 _EDGE = 0.02
+_PATIENCE = 50
+"""Draws in vain after which moves get smaller."""
 _NEARBY = 0.3
 
 
@@ -85,11 +87,13 @@ def _hardest(robot: Robot, moves: Moves) -> Moves:
     return moves.take([int(np.argmax(np.where(np.isfinite(duration), duration, -1.0)))])
 
 
-def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool = True) -> Moves:
+def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, ground: bool | None = None) -> Moves:
     """Return ``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
-    whole range] of them, by the :data:`KINDS` in turn. ``ground`` says whether there is one at height 0. Raises
+    whole range] of them, by the :data:`KINDS` in turn. A robot that is seldom free, such as one with many fingers or
+    legs, moves nearer to its start pose: after each 50 draws in vain, starts and steps lie within half the range.
+    ``ground`` says whether there is one at height 0, by default as :attr:`Robot.has_ground`. Raises
     InvalidArgumentError where ``count`` or ``size`` is out of range, or the robot touches itself in nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
@@ -97,10 +101,15 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     reach = np.ptp(robot.sample(1000, seed=0), axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
+    share, in_vain = 1.0, 0
 
     def draw(index: int) -> tuple[Float64, Float64, str] | None:
+        nonlocal share, in_vain
+        if in_vain == _PATIENCE:
+            share, in_vain = share / 2, 0
         kind = KINDS[index % len(KINDS)]
-        start = np.clip(robot.sample(1, seed=int(rng.integers(2**31)))[0], low, high)
+        drawn = robot.sample(1, seed=int(rng.integers(2**31)))[0]
+        start = np.clip(drawn if share == 1 else robot.start + share * (drawn - robot.start), low, high)
         joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
             fraction[:] = fraction[0]
@@ -109,10 +118,15 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
                 joint = robot.coupling.leader[joint]
             fraction[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
-        step = fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
+        step = share * fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
         start, target = robot.coupled(start), robot.coupled(target)
-        return None if dynamics.in_contact(start + line * (target - start)).any() else (start, target, kind)
+        path = start + line * (target - start)
+        if dynamics.in_contact(path[[0, -1]]).any() or dynamics.in_contact(path).any():
+            in_vain += 1
+            return None
+        in_vain = 0
+        return start, target, kind
 
     return draw_moves(robot, count, draw)
 

@@ -38,7 +38,7 @@ def main() -> None:
 def _run(make: Callable[..., Any]) -> list[NDArray[Any]]:
     """Return everything that is read in a run under varied efforts, which ends on the ground."""
     joints = (Joint("turn", "revolute", "base", "arm"), Joint("slide", "prismatic", "arm", "hand"))
-    spec = SceneSpec(_URDF, None, joints, 1e-2, PHYSICS["accurate"])
+    spec = SceneSpec(_URDF, (), joints, 1e-2, PHYSICS["accurate"])
     systems = [new_system(spec), new_system(spec)]
     scenes, robots = zip(*(build_scene(spec, systems[row // 2]) for row in range(4)), strict=True)
     qf, skip = np.zeros((4, 2), np.float32), np.array([False, False, False, True])

@@ -89,7 +89,7 @@ def test_prediction_has_no_order_and_more_speed_predicts_no_less(pairs, qvel, ra
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_no_link_is_faster_than_its_reach_allows(name):
     robot = load_bundled(name)
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS["fast"])
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, DT, PHYSICS["fast"])
     _scene, built = build_scene(spec, new_system(spec))
     reach = ContactPredictor(link_extents(built), robot.dof, DT).reach[:-1]
     body = Kinematics(robot)
@@ -108,7 +108,9 @@ def test_no_link_is_faster_than_its_reach_allows(name):
 def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
     """Solver, gravity and time step of the system; friction, damping, drives, qf and suspension of the robot."""
     robot = jaco2
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0))
+    spec = SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, DT, PHYSICS[physics], "sapien", gravity=(0.0, 1.0, -3.0)
+    )
     pack = Pack(spec, 4, system_size=4)
     pack.write_state(range(4), np.tile(robot.start, (4, 1)), np.full((4, robot.dof), 0.1))
     pack.write_drive(np.array(30.0), np.array(2.0), np.array(9.0))

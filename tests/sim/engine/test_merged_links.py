@@ -1,7 +1,5 @@
 """Merged links in the engine: the same motion as unmerged, with payloads, watched links and disabled pairs by name."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
@@ -9,6 +7,7 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner
 from sim.engine.building import SceneSpec, parse
+from sim.engine.collision_groups import may_touch
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
 from sim.engine.variation import Variation, VariedPack
@@ -19,7 +18,7 @@ CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry>
 
 def spec_of(loaded: Robot, merge_fixed: bool, physics: str = "accurate") -> SceneSpec:
     options = {"ground": False, "merge_fixed": merge_fixed}
-    return SceneSpec(loaded.urdf, loaded.srdf, loaded.joints, 1 / 2000, PHYSICS[physics], **options)
+    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1 / 2000, PHYSICS[physics], **options)
 
 
 def moved(pack: Pack, reference: Pack, qpos: np.ndarray, steps: int = 2000) -> np.ndarray:
@@ -125,12 +124,12 @@ def test_a_pair_disabled_by_an_srdf_names_links_within_bodies(tmp_path):
     text = '<robot name="r"><disable_collisions link1="base" link2="camera" reason="Default"/></robot>'
     write(tmp_path, text, "test.srdf")
     loaded = arm(tmp_path, BOX)
-    boxed = replace(spec_of(loaded, True), urdf=loaded.urdf.replace('<link name="base">', f'<link name="base">{BOX}'))
-    pack = Pack(boxed, 1)
+    write(tmp_path, loaded.path.read_text().replace('<link name="base">', f'<link name="base">{BOX}'))
+    pack = Pack(spec_of(Robot.load(loaded.path, self_collision="urdf"), True), 1)
     base, _, lower = pack.robots[0].links
-    words = [[shape.get_collision_groups()[2] for shape in each.collision_shapes] for each in (base, lower)]
-    assert words[0][0] & words[1][1]
-    assert not words[0][0] & words[1][0]
+    words = [[shape.get_collision_groups() for shape in each.collision_shapes] for each in (base, lower)]
+    assert not may_touch(words[0][0], words[1][1])
+    assert may_touch(words[0][0], words[1][0])
 
 
 def test_equal_specs_share_a_builder_and_differ_by_merging(tmp_path):

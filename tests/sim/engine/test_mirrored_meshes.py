@@ -27,8 +27,9 @@ def test_a_negative_scale_is_the_mirrored_mesh(signs, tmp_path):
             *("f {} {} {}".format(*np.add(f, 1)) for f in FACES),
         ]
         (tmp_path / name).write_text("\n".join(lines))
-    mirrored = Robot.load(write(tmp_path, arms("mirrored.obj", (2, 2, 2)), "a.urdf")).dynamics(ground=False)
-    scaled = Robot.load(write(tmp_path, arms("tip.obj", 2 * np.array(signs)), "b.urdf")).dynamics(ground=False)
+    texts = {"a.urdf": arms("mirrored.obj", (2, 2, 2)), "b.urdf": arms("tip.obj", 2 * np.array(signs))}
+    paths = [write(tmp_path, text, name) for name, text in texts.items()]
+    mirrored, scaled = (Robot.load(path, self_collision="urdf").dynamics(ground=False) for path in paths)
     poses = np.array([[0.0, 0.0], [0.3, -0.2], [0.0, np.pi]])
     np.testing.assert_allclose(scaled.mass_matrix(poses), mirrored.mass_matrix(poses), rtol=1e-5)
     assert scaled.in_contact(poses).tolist() == mirrored.in_contact(poses).tolist()

@@ -73,7 +73,7 @@ def test_workers_are_bit_identical_too(monkeypatch, panda):
 
 @needs_extension
 def test_a_robot_whose_scene_is_gone_raises(panda):
-    pack = Pack(SceneSpec(panda.urdf, panda.srdf, panda.joints, 1e-3, PHYSICS["fast"]), 1)
+    pack = Pack(SceneSpec(panda.urdf, panda.ignored_pairs, panda.joints, 1e-3, PHYSICS["fast"]), 1)
     pack.robots[0].get_links()[0].entity.scene.clear()
     with pytest.raises(RuntimeError):
         pack.read_qpos()

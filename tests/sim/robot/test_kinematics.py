@@ -45,7 +45,7 @@ def random_qpos(robot, count):
 
 
 def test_link_poses_are_those_of_sapien(robot):
-    spec = SceneSpec(robot.urdf, robot.srdf, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
     _scene, reference = build_scene(spec, new_system(spec))
     kinematics = Kinematics(robot)
     qpos = random_qpos(robot, 40)

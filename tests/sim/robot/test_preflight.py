@@ -106,7 +106,8 @@ def test_options_of_load_that_change_the_physics_are_reported(tmp_path):
 def test_links_that_overlap_at_the_start_are_reported(tmp_path):
     box = INERTIAL + COLLISION
     text = robot(link("b"), link("l", box), link("r", box), joint("j", "b", "l"), joint("k", "b", "r"))
-    assert "touching" in codes(Robot.load(write(tmp_path, text)).check())
+    assert "touching" not in codes(Robot.load(write(tmp_path, text)).check())
+    assert "touching" in codes(Robot.load(write(tmp_path, text), self_collision="urdf").check())
     apart = text.replace('xyz="0 0 1"', 'xyz="0 1 1"', 1)
     assert "touching" not in codes(Robot.load(write(tmp_path, apart)).check())
 

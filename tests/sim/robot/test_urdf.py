@@ -106,38 +106,6 @@ def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_r
         assert runner.step([0.1]).ok.all()
 
 
-PAIR = '<disable_collisions link1="base" link2="arm" reason="Default"/>'
-APART = "".join(link(f"l{n}") + joint(f"j{n}", "arm", f"l{n}") for n in range(9))
-BAD_SRDF = {
-    "no reason": (PAIR.replace(' reason="Default"', ""), "link1='base' link2='arm'> has no reason.*add"),
-    "unknown link": (PAIR.replace("arm", "leg"), "link2='leg'> needs two links of the URDF"),
-    "no link": (PAIR.replace('link1="base"', ""), "link1=None.*needs two links of the URDF"),
-    "one link twice": (PAIR.replace("arm", "base"), "link2='base'> needs two links of the URDF"),
-    "too many pairs": (
-        "".join(PAIR.replace("base", f"l{a}").replace("arm", f"l{b}") for a in range(9) for b in range(a)),
-        "disables 36 pairs with reason 'Default'; SAPIEN takes 31",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD_SRDF)
-def test_a_bad_srdf_has_its_error_with_its_own_name(case, tmp_path):
-    pairs, message = BAD_SRDF[case]
-    path = write(tmp_path, robot(BASE, ARM, HINGE, APART))
-    srdf = write(tmp_path, robot(pairs), "test.srdf")
-    with pytest.raises(RobotError, match=message) as info:
-        Robot.load(path)
-    assert str(srdf) in str(info.value)
-    assert "correct the URDF" not in str(info.value)
-
-
-def test_pairs_that_sapien_does_not_apply_need_no_links(tmp_path):
-    path = write(tmp_path, one_joint())
-    write(tmp_path, robot(PAIR, PAIR.replace("Default", "Never").replace("arm", "leg")), "test.srdf")
-    paired = Robot.load(path)
-    assert paired.dynamics(ground=False).mass_matrix(np.zeros((1, 1))) > 0
-
-
 def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "test.urdf"
     path.write_bytes(bytes(range(256)) * 10)

@@ -1,0 +1,135 @@
+"""Self-collision: which pairs of links do not collide, by an .srdf, the pose at rest and sampled poses."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_urdf import INERTIAL, joint, link, robot, write
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner
+from sim.robot.self_collision import disabled_pairs, read_srdf
+
+BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
+SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
+
+
+def sliders(*places: float) -> str:
+    """Return a robot of boxes of 0.2 m on slides along y from a base in the air, which they do not touch."""
+    parts = [link("base", INERTIAL)]
+    for index, place in enumerate(places):
+        parts.append(link(f"l{index}", INERTIAL + BOX))
+        parts.append(joint(f"j{index}", "base", f"l{index}", "prismatic", SLIDE, origin=f"0 {place} 1"))
+    return robot(*parts)
+
+
+def reasons(loaded: Robot) -> dict[tuple[str, str], str]:
+    return {(pair.first, pair.second): pair.reason for pair in loaded.self_contact.pairs}
+
+
+def touches(loaded: Robot) -> bool:
+    return bool(loaded.dynamics().in_contact(loaded.start[None])[0])
+
+
+def test_links_that_overlap_at_rest_do_not_collide(tmp_path):
+    path = write(tmp_path, sliders(0.0, 0.1, 0.45))
+    assert reasons(Robot.load(path)) == {("l0", "l1"): "Default"}
+    assert not touches(Robot.load(path))
+    assert reasons(Robot.load(path, self_collision="urdf")) == {}
+    assert touches(Robot.load(path, self_collision="urdf"))
+    assert len(reasons(Robot.load(path, self_collision="none"))) == 3
+    assert not touches(Robot.load(path, self_collision="none"))
+    with pytest.raises(InvalidArgumentError, match="self_collision"):
+        Robot.load(path, self_collision="srdf")
+
+
+def test_links_that_only_touch_at_rest_go_on_colliding(tmp_path):
+    assert reasons(Robot.load(write(tmp_path, sliders(0.0, 0.1995)))) == {}
+
+
+def test_links_that_touch_in_nearly_every_pose_do_not_collide(tmp_path):
+    for gap, expected in ((0.01, {("l0", "l1"): "Always"}), (0.1, {})):  # a post, and a beam that slides towards it
+        beam = sliders(0.0, -4.1 - gap).split("</link>", 2)[2]
+        text = sliders(0.0, -4.1 - gap).replace(beam, beam.replace('"0.2 0.2 0.2"', '"0.2 8 0.2"'))
+        text = text.replace('lower="-0.5" upper="0.5"', 'lower="0" upper="0.001"', 1).replace('"-0.5"', '"0"')
+        path = write(tmp_path, text)
+        assert reasons(Robot.load(path)) == expected, gap
+
+
+def test_neighbours_are_those_with_a_chain_of_links_without_shape_between_them(tmp_path):
+    text = robot(
+        link("base", INERTIAL + BOX),
+        link("hip", INERTIAL),
+        link("leg", INERTIAL + BOX),
+        link("foot", INERTIAL + BOX),
+        joint("a", "base", "hip"),
+        joint("b", "hip", "leg"),
+        joint("c", "leg", "foot"),
+    )
+    assert reasons(Robot.load(write(tmp_path, text))) == {("base", "leg"): "Adjacent", ("leg", "foot"): "Adjacent"}
+
+
+def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
+    path = write(tmp_path, sliders(0.0, 0.1, 0.2))
+    assert set(reasons(Robot.load(path))) == {("l0", "l1"), ("l1", "l2")}
+    write(
+        tmp_path,
+        robot(
+            '<disable_collisions link1="l2" link2="l0" reason="Never"/>',
+            '<disable_collisions link1="base" link2="l0"/>',
+            '<enable_collisions link1="l1" link2="l0"/>',
+            '<disable_collisions link1="l2" link2="l7" reason="Default"/><disable_collisions link1="l1" link2="l1"/>',
+        ),
+        "test.srdf",
+    )
+    loaded = Robot.load(path)
+    assert reasons(loaded) == {("l1", "l2"): "Default", ("l2", "l0"): "Never"}
+    assert reasons(Robot.load(path, self_collision="urdf")) == {("l2", "l0"): "Never"}
+    assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count("srdf-link") == 2
+    assert [pair.reason for pair in read_srdf(tmp_path / "test.srdf", ["base", "l0"]).disabled] == ["User"]
+
+
+def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
+    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
+    pairs = loaded.self_contact
+    assert loaded.self_contact is pairs
+    assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
+
+
+def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
+    high = write(tmp_path, sliders(0.0), "high.urdf")
+    low = write(tmp_path, sliders(0.0).replace('0.0 1"', '0.0 0.05"'), "low.urdf")
+    assert Robot.load(high).has_ground
+    assert not Robot.load(low).has_ground
+    assert Robot.load(low, fixed_base=False).has_ground
+    with Runner(Robot.load(low), 1, workers=0) as runner:
+        assert not runner.options.ground
+        assert abs(runner.step([[0.2]]).qpos[0, 0]) < 0.2
+    with Runner(Robot.load(low), 1, workers=0, ground=True) as runner:
+        assert runner.options.ground
+
+
+def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
+    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.1)))
+    with Runner(loaded, 1, workers=0, control="effort", substeps=200) as runner:
+        np.testing.assert_allclose(runner.step(np.zeros((1, 2))).qpos, 0.0, atol=1e-6)
+
+
+PAIRS = st.frozensets(st.sampled_from("abcdef"), min_size=2, max_size=2)
+
+
+@given(st.lists(PAIRS), st.lists(PAIRS), st.lists(st.lists(PAIRS), min_size=20, max_size=30))
+@settings(deadline=None, max_examples=50)
+def test_each_pair_is_listed_once_with_its_first_reason(adjacent, rest, samples):
+    listed = disabled_pairs("abcdef", adjacent, rest, samples)
+    assert len({pair.links for pair in listed}) == len(listed)
+    for pair in listed:
+        share = np.mean([pair.links in sample for sample in samples])
+        expected = "Adjacent" if pair.links in adjacent else "Default" if pair.links in rest else "Always"
+        assert pair.reason == expected
+        assert expected != "Always" or share > 0.95
+    assert {pair.links for pair in listed} >= {*adjacent, *rest}
