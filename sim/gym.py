@@ -43,8 +43,10 @@ MAX_SPEED = 100.0
 class ReachVectorEnv(VectorEnv):
     """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
-    - *Observation* (envs, 3 dof): qpos, qvel, goal [rad or m, and per second], clipped to the space.
-    - *Action* (envs, dof) in [-1, 1]: the setpoint within the joint limits, or an increment of the setpoint.
+    Joints are the independent ones (:attr:`sim.Robot.independent`): followers move with their leaders.
+
+    - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
+    - *Action* (envs, joints) in [-1, 1]: the setpoint within the joint limits, or an increment of the setpoint.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is within ``tolerance``.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if ``terminate_on_success``.
     - *Truncated*: after ``max_episode_steps``.
@@ -59,8 +61,8 @@ class ReachVectorEnv(VectorEnv):
     actions
         ``"setpoint"`` or ``"increment"``.
     max_increment
-        Change of the setpoint by an increment of 1, scalar or (dof,) [rad or m]; default the velocity limit times the
-        time of a step.
+        Change of the setpoint by an increment of 1, scalar or (joints,) [rad or m]; default the velocity limit times
+        the time of a step.
     tolerance
         Largest error of a reached goal [rad or m].
     autoreset_mode
@@ -106,25 +108,30 @@ class ReachVectorEnv(VectorEnv):
         timestep = options.get("timestep", RunnerOptions.timestep)
         substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
 
-        dof = self.robot.dof
-        self.low = np.where(np.isfinite(self.robot.lower), self.robot.lower, -np.pi)
-        self.high = np.where(np.isfinite(self.robot.upper), self.robot.upper, np.pi)
+        self._independent = np.flatnonzero(self.robot.independent)
+        lower, upper, fastest = (
+            limit[self._independent] for limit in (self.robot.lower, self.robot.upper, self.robot.velocity_limit)
+        )
+        self.joint_names = tuple(self.robot.joint_names[joint] for joint in self._independent)
+        self.low = np.where(np.isfinite(lower), lower, -np.pi)
+        self.high = np.where(np.isfinite(upper), upper, np.pi)
+        joints = len(self.joint_names)
         if max_increment is None:
-            max_increment = np.minimum(self.robot.velocity_limit, MAX_SPEED) * substeps * timestep
-        self.max_increment = array("max_increment", max_increment, (1, dof), self.robot.joint_names)[0]
-        speed = np.full(dof, MAX_SPEED)
+            max_increment = np.minimum(fastest, MAX_SPEED) * substeps * timestep
+        self.max_increment = array("max_increment", max_increment, (1, joints), self.joint_names)[0]
+        speed = np.full(joints, MAX_SPEED)
         self.single_observation_space = spaces.Box(
             np.concatenate([self.low - np.pi, -speed, self.low]).astype(np.float32),
             np.concatenate([self.high + np.pi, speed, self.high]).astype(np.float32),
         )
-        self.single_action_space = spaces.Box(-1.0, 1.0, (dof,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (joints,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
         self._generators = np.random.default_rng().spawn(self.num_envs)
-        self._goal, self._setpoint = np.zeros((2, self.num_envs, dof))
-        self._observation = np.zeros((self.num_envs, 3 * dof), np.float32)
+        self._goal, self._setpoint = np.zeros((2, self.num_envs, joints))
+        self._observation = np.zeros((self.num_envs, 3 * joints), np.float32)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
 
@@ -155,8 +162,8 @@ class ReachVectorEnv(VectorEnv):
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
-        """Apply an action (envs, dof) for one step; return observation, reward, terminated, truncated and info."""
-        action = np.clip(array("actions", actions, self._goal.shape, self.robot.joint_names), -1.0, 1.0)
+        """Apply an action (envs, joints) for one step; return observation, reward, terminated, truncated and info."""
+        action = np.clip(array("actions", actions, self._goal.shape, self.joint_names), -1.0, 1.0)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
@@ -165,7 +172,7 @@ class ReachVectorEnv(VectorEnv):
         else:
             setpoint = np.clip(self._setpoint + action * self.max_increment, self.low, self.high)
         self._setpoint = np.where(begins[:, None], self._setpoint, setpoint)
-        self._observe(self.runner.step(self._setpoint))
+        self._observe(self.runner.step(self._of_robot(self._setpoint)))
         self._steps += 1
 
         reward = 1.0 * self._success - (self._error / (self.high - self.low)).mean(1)
@@ -198,21 +205,28 @@ class ReachVectorEnv(VectorEnv):
         margin = MARGIN * (self.high - self.low)
         for env in np.flatnonzero(mask).tolist():
             generator = self._generators[env]
-            drawn = self.robot.start + generator.uniform(-SPREAD, SPREAD, self.robot.dof)
+            drawn = self.robot.start[self._independent] + generator.uniform(-SPREAD, SPREAD, len(self.joint_names))
             start[env] = np.clip(drawn, self.low, self.high)
             self._goal[env] = generator.uniform(self.low + margin, self.high - margin)
         self._setpoint = start
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        self._observe(self.runner.reset(start, mask=mask))
+        self._observe(self.runner.reset(self._of_robot(start), mask=mask))
+
+    def _of_robot(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return positions (envs, joints) of the independent joints for all joints of the robot (envs, dof)."""
+        rows = np.zeros((self.num_envs, self.robot.dof))  # the runner puts followers in place
+        rows[:, self._independent] = positions
+        return rows
 
     def _observe(self, observed: Observation) -> None:
         """Update the observation; an env that diverged keeps its last finite one."""
         space: Any = self.single_observation_space
-        joined = np.concatenate([observed.qpos, observed.qvel, self._goal.astype(np.float32)], axis=1)
+        state = (observed.qpos[:, self._independent], observed.qvel[:, self._independent])
+        joined = np.concatenate([*state, self._goal.astype(np.float32)], axis=1)
         self._diverged = ~observed.ok
         self._observation = np.where(observed.ok[:, None], np.clip(joined, space.low, space.high), self._observation)
-        self._error = np.abs(self._goal - self._observation[:, : self.robot.dof])
+        self._error = np.abs(self._goal - self._observation[:, : len(self.joint_names)])
         self._success = observed.ok & (self._error <= self.tolerance).all(1)
 
     def _info(self, mask: Bool) -> dict[str, Any]:
@@ -241,7 +255,7 @@ class ReachEnv(gymnasium.Env):
         return observation[0], self._single(info)
 
     def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
-        """Apply an action (dof,) for one step; return observation, reward, terminated, truncated and info."""
+        """Apply an action (joints,) for one step; return observation, reward, terminated, truncated and info."""
         observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
 

@@ -76,7 +76,7 @@ def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Itera
             f"DIVERGED: {diverged.size} of {num_envs} envs are no longer finite, the first after {first:.3g} s: "
             f"env {', '.join(map(str, diverged[:8]))}{more}. These gains are unstable on this robot."
         )
-    never = np.isinf(np.delete(metrics.settling_time, diverged, axis=0)).sum(0)
+    never = np.isinf(np.delete(metrics.settling_time, diverged, axis=0)).sum(0) * robot.independent
     unsettled = [f"{name} ({count})" for name, count in zip(robot.joint_names, never, strict=True) if count]
     if unsettled:
         yield f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {', '.join(unsettled)}."

@@ -41,7 +41,7 @@ def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArra
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
     poses = robot.start + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
     poses[0] = robot.start
-    return np.clip(poses, robot.lower, robot.upper)
+    return robot.coupled(np.clip(poses, robot.lower, robot.upper))
 
 
 def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], seconds: float) -> tuple[Rollout, str]:

@@ -123,11 +123,11 @@ class Panel:
         poses = {"start": robot.start} | ({} if robot.settings is None else {"target": robot.settings.target})
         buttons = gui.add_button_group("Go to", (*poses, "random"))
         watched_only = gui.add_checkbox("Watched robot only", False)
-        sliders: list[Any] = []
+        sliders: dict[int, Any] = {}
 
         def update() -> None:
-            for slider, value in zip(sliders, live.setpoint[self.env], strict=True):
-                slider.value = float(np.clip(value, slider.min, slider.max))
+            for index, slider in sliders.items():
+                slider.value = float(np.clip(live.setpoint[self.env, index], slider.min, slider.max))
 
         def go_to(pose: str) -> None:
             if pose == "random":
@@ -140,13 +140,14 @@ class Panel:
             live.set_setpoint(position, joint=joint, env=self.env if watched_only.value else None)
 
         self._on(buttons, go_to)
-        for index, (name, joint) in enumerate(zip(self._names, robot.joints, strict=True)):
+        for index in np.flatnonzero(robot.independent).tolist():  # followers move with their leaders
+            name, joint = self._names[index], robot.joints[index]
             low, high = max(joint.lower, -2 * math.pi), min(joint.upper, 2 * math.pi)
             low, high = math.ceil(1e3 * low) / 1e3, math.floor(1e3 * high) / 1e3  # fewer digits to read
             value = float(np.clip(live.setpoint[0, index], low, high))
             slider = gui.add_slider(f"{name} [{joint.unit}]", low, high, min(_slider_step(high - low), 0.01), value)
             self._on(slider, partial(move, index))
-            sliders.append(slider)
+            sliders[index] = slider
         self._robot.on_update(lambda _: self._requests.put(update))
 
     def _add_gains(self, live: LiveSimulation) -> None:

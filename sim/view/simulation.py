@@ -116,6 +116,7 @@ class LiveSimulation:
     def set_setpoint(self, position: ArrayLike, *, joint: int | None = None, env: int | None = None) -> None:
         """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env of each group or all."""
         self.setpoint[slice(None) if env is None else env, slice(None) if joint is None else joint] = position
+        self.setpoint = self.robot.coupled(self.setpoint)
 
     def randomize_setpoints(self) -> None:
         """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start pose."""

@@ -11,8 +11,9 @@ from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E40
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError  # noqa: E402
-from sim import FaultWarning, Runner  # noqa: E402
+from sim import FaultWarning, Robot, Runner  # noqa: E402
 from sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
+from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
 ID = "sim.gym:batchpid/Reach-v0"
 
@@ -169,3 +170,20 @@ def test_closing_a_single_env_closes_its_runner():
     env.close()
     gc.collect()
     assert runner.closed
+
+
+def test_actions_and_observations_are_those_of_independent_joints(tmp_path):
+    follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
+    parts = link("base"), link("l"), link("r"), follower, joint("left", "base", "l", origin="0 1 1")
+    hand = Robot.load(write(tmp_path, robot(*parts)))
+    env = ReachVectorEnv(2, hand, workers=0)
+    observation, _ = env.reset(seed=0)
+    assert env.single_action_space.shape == (1,)
+    assert observation.shape == (2, 3)
+    for _ in range(3):
+        observation, *_ = env.step(np.array([[0.5], [-0.5]], np.float32))
+    qpos = env.runner.observe().qpos
+    left, right = hand.joint_names.index("left"), hand.joint_names.index("right")
+    np.testing.assert_array_equal(observation[:, 0], qpos[:, left])
+    np.testing.assert_allclose(qpos[:, right], -0.5 * qpos[:, left], atol=1e-5)
+    env.close()
