@@ -52,6 +52,9 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
     axis = joint.find("axis")
     if axis is None or joint.get("type") == "fixed":
         return
+    if axis.get("xyz") is None:
+        joint.remove(axis)  # the default of the URDF, on which SAPIEN fails
+        return
     direction = readable(axis, "xyz", "1 0 0")
     length = 0.0 if direction is None else math.hypot(*direction)
     if direction is None or length < 1e-12:
@@ -65,24 +68,26 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
 def _limits(joint: etree._Element) -> Iterator[Finding]:
     """Repair the limits: what is no limit, or a placeholder, is infinite."""
     limit, kind = joint.find("limit"), joint.get("type")
-    if kind == "fixed":
-        return
     if limit is None:
         limit = etree.SubElement(joint, "limit")
+    placeholders = []
     for key in ("effort", "velocity"):
         values = readable(limit, key, "inf", limit=True)
         if values is not None and values[0] > 0:
             continue
         text = limit.attrib.pop(key)
-        if values is not None and values[0] < 0:
+        if values is None:
+            problem = f"<limit {key}={text!r}> is no number: the joint has no {key} limit"
+            yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
+        elif values[0] < 0:
             limit.set(key, repr(-values[0]))
-            yield finding_of(
-                joint, "warning", "limits", f"{key} limit {text}: its magnitude is used", "make it positive"
-            )
+            problem = f"{key} limit {text}: its magnitude is used"
+            yield finding_of(joint, "warning", "limits", problem, "make it positive")
         else:
-            code, meaning = ("placeholder", "a placeholder") if values else ("limits", "no number")
-            problem = f"<limit {key}={text!r}> is {meaning}: it counts as not given, so there is no {key} limit"
-            yield finding_of(joint, "warning", code, problem, f"give <limit {key}=> of the motor")
+            placeholders.append(f"{key}={text!r}")
+    if placeholders:
+        problem = f"<limit {' '.join(placeholders)}>, a placeholder, counts as not given: there is no such limit"
+        yield finding_of(joint, "warning", "placeholder", problem, "give <limit effort= velocity=> of the motor")
     if kind in ("revolute", "prismatic"):
         yield from _range(joint, limit)
 

@@ -65,14 +65,17 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
     bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
     solid = {bodies[link.name] for link in robot.links if link.inertial or link.collisions}
+    loaded = set(solid)  # bodies with mass in them or in what they carry
+    for joint in reversed(robot.all_joints):
+        if bodies[joint.child_link] in loaded:
+            loaded.add(bodies[joint.parent_link])
     for link in robot.links:
         if link.triangle_excess > EXCESS:
             percent = f"{100 * link.triangle_excess:.0f} %"
             text = (
-                f"no body has its inertia tensor: the largest principal moment is {percent} of itself above the sum of "
+                f"no body has its inertia tensor: a principal moment exceeds the sum of the others by {percent} of it"
             )
-            text += "the others; it is simulated as given"
-            yield Finding("note", "inertia", text, "correct <inertia>", link=link.name)
+            yield Finding("note", "inertia", f"{text}; it is simulated as given", "correct <inertia>", link=link.name)
         if link.inertial or (robot.fixed_base and bodies[link.name] not in carriers):
             continue
         if not link.collisions and (link.name != bodies[link.name] or link.name in solid):
@@ -82,9 +85,14 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             effect = "SAPIEN takes its mass from the collision shapes, at 1000 kg/m^3"
         elif fixed:
             effect = "SAPIEN makes it a link of 1e-6 kg, which costs time in every step"
+        elif bodies[link.name] in loaded:
+            effect = "SAPIEN makes it a link of 1e-6 kg; the mass is in what it carries"
         else:
-            effect = "SAPIEN makes it a link of 1e-6 kg: the joint that moves it is all but impossible to control"
-        severity, text = "note" if fixed else "warning", f"no mass and inertia; {effect}"
+            effect = (
+                "SAPIEN makes it a link of 1e-6 kg, and it carries none: gains per unit of effort cannot control it"
+            )
+        light = not link.collisions and bodies[link.name] in loaded
+        severity, text = "note" if fixed or light else "warning", f"no mass and inertia; {effect}"
         remedy = "add <inertial> with mass and inertia, or merge it into its parent"
         yield Finding(severity, "no-inertia", text, remedy, link=link.name)
 

@@ -28,7 +28,13 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
     ("text", "code", "severity", "message"),
     [
         (one_joint(arm=COLLISION), "no-inertia", "warning", "link 'arm': no mass.*collision shapes, at 1000"),
-        (one_joint(arm=""), "no-inertia", "warning", "link 'arm': .*1e-6 kg"),
+        (one_joint(arm=""), "no-inertia", "warning", "link 'arm': .*1e-6 kg, and it carries none"),
+        (
+            robot(link("b"), link("m", ""), link("a"), joint("h", "b", "m"), joint("k", "m", "a")),
+            "no-inertia",
+            "note",
+            "link 'm': .*1e-6 kg; the mass is in what it carries",
+        ),
         (
             one_joint(arm=INERTIAL.replace('mass value="1"', 'mass value="0"')),
             "no-inertia",

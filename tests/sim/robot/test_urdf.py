@@ -97,13 +97,16 @@ def test_links_of_one_rigid_body_count_once(tmp_path):
 def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):
     """SAPIEN's parser fails on each of these; none has a meaning for the simulation."""
     inertial = INERTIAL.replace('ixy="0" ixz="0" ', "").replace('iyz="0" ', "")
-    parts = link("base"), link("arm", inertial + "<visual/>"), link("tip")
+    parts = link("base"), link("arm", inertial + "<visual/>"), link("tip"), link("end")
     joints = HINGE.replace("</joint>", "<calibration rising='x'/><safety_controller/></joint>"), "<material/>"
     fixed = joint("f", "arm", "tip", "fixed", '<limit lower="x"/>').replace("0 1 0", "x")
-    odd = Robot.load(write(tmp_path, robot(*parts, *joints, fixed, "<transmission/>", "<sensor><camera/></sensor>")))
-    assert [link.inertial for link in odd.links] == [True, True, True]
+    default = joint("k", "tip", "end").replace(' xyz="0 1 0"', "")
+    odd = Robot.load(
+        write(tmp_path, robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"))
+    )
+    assert [link.inertial for link in odd.links] == [True] * 4
     with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
-        assert runner.step([0.1]).ok.all()
+        assert runner.step([0.1, 0.1]).ok.all()
 
 
 def test_a_binary_file_is_refused(tmp_path):
