@@ -85,7 +85,7 @@ def test_links_without_mass_cost_time_only_where_they_are_not_merged(tmp_path):
     assert Robot.load(heavy).check() == []
     found = {finding.link: str(finding) for finding in Robot.load(light, merge_fixed=False).check()}
     assert "costs time" in found["tip"]
-    assert "impossible to control" in found["a"]
+    assert "carries none" in found["a"]
 
 
 def test_a_sound_robot_has_no_findings(tmp_path, panda):
