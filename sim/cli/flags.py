@@ -63,7 +63,7 @@ Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]
 Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
 Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")]
-Friction = Annotated[float, _flag("With --variation: largest joint friction [PhysX's coefficient].")]
+Friction = Annotated[float, _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")]
 
 
 def output_path(argument: str, path: P, suffixes: Collection[str]) -> P:

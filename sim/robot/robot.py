@@ -58,8 +58,9 @@ class Robot(RobotDescription):
         missing_meshes
             ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or ``"error"``.
         dissipation
-            ``"urdf"``: joint friction and damping as the URDF says, no link damping. ``"sapien"``: SAPIEN's defaults,
-            joint friction 0.05 and link damping 0.05, for comparison with its tutorial.
+            ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the model of
+            :mod:`batchpid.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction 0.05 and
+            link damping 0.05, for comparison with its tutorial.
         fixed_base
             True to fix the root link to the world.
         merge_fixed

@@ -27,11 +27,11 @@ def draw_variation(
     """Return a variation for ``num_envs`` envs, with payload and friction drawn uniformly.
 
     Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; joint friction from 0
-    to ``friction`` (PhysX's coefficient). ``resolution`` and ``late`` are those of :class:`Variation`. Raises
+    to ``friction`` [N m or N]. ``resolution`` and ``late`` are those of :class:`Variation`. Raises
     InvalidArgumentError for a number out of range.
     """
     num_envs, seed = integer("num_envs", num_envs, 1, 1_000_000), integer("seed", seed, 0, 2**63 - 1)
-    payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "1")
+    payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "N m or N")
     rng, kinematics = np.random.default_rng(seed), Kinematics(robot)
     return Variation(
         payload=rng.uniform(0, min(payload, payload_capacity(robot)), num_envs),
