@@ -9,11 +9,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from lxml import etree
+from numpy.typing import NDArray
 
 from sim.robot.xml import LARGEST
 
@@ -69,8 +71,22 @@ def _stl(data: bytes) -> bool:
 
 
 def _obj(data: bytes) -> bool:
-    """Three vertices and a face."""
-    return len(re.findall(rb"^\s*v\s", data, re.M)) >= 3 and re.search(rb"^\s*f\s", data, re.M) is not None
+    """Three vertices and a face, of numbers, and no face of other vertices."""
+    vertices, faces = (re.findall(rb"^[ \t]*%b[ \t](.*)$" % kind, data, re.M) for kind in (b"v", b"f"))
+    corners = _numbers(b" ".join(vertices))
+    indices = _numbers(re.sub(rb"/\S*", b"", b" ".join(faces)))
+    inside = (indices != 0) & (np.abs(indices) <= len(vertices))
+    return len(vertices) >= 3 and len(indices) >= 3 and bool((np.abs(corners) <= LARGEST).all() and inside.all())
+
+
+def _numbers(text: bytes) -> NDArray[np.float64]:
+    """Return the numbers in ``text``, separated by blanks. Raises ValueError if there is anything else."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # by which NumPy tells of a word that is no number
+        try:
+            return np.fromstring(text.decode("ascii"), sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(str(error)) from error
 
 
 def _dae(data: bytes) -> bool:

@@ -87,6 +87,11 @@ BAD |= {
     "STL with an infinity": ("a.stl", stl()[:96] + struct.pack("<f", np.inf) + stl()[100:]),
     "STL of 1e30 m": ("a.stl", stl()[:96] + struct.pack("<f", 1e30) + stl()[100:]),
     "OBJ without faces": ("d.obj", obj().split(b"\nf")[0]),
+    "OBJ with a NaN": ("d.obj", obj().replace(b"1.0", b"nan")),
+    "OBJ of 1e30 m": ("d.obj", obj().replace(b"1.0", b"1e30")),
+    "OBJ with a word for a number": ("d.obj", obj().replace(b"1.0", b"one")),
+    "OBJ with a face of vertices that it lacks": ("d.obj", obj().replace(b"f 1 3 2", b"f 1 3 9")),
+    "OBJ with vertex 0": ("d.obj", obj().replace(b"f 1 3 2", b"f 0 3 2")),
     "STL named OBJ": ("d.obj", stl()),
     "DAE that claims 16 GB": ("e.dae", dae().replace(b'count="12"', b'count="%d"' % CLAIM)),
     "DAE of 4 billion triangles": ("e.dae", dae().replace(b'triangles count="4"', b'triangles count="%d"' % CLAIM)),
@@ -164,7 +169,7 @@ def test_a_mesh_too_large_to_be_read_is_refused_without_reading_it_all(tmp_path)
 
 
 def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path):
-    (tmp_path / "odd.obj").write_bytes(obj().replace(b"1.0", b"nan"))
+    (tmp_path / "odd.obj").write_bytes(obj().replace(b"1.0", b"1e-7"))
     loaded = Robot.load(write(tmp_path, arm("odd.obj")))
     for use in (loaded.check, lambda: Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0))):
         with pytest.raises(RobotError, match=r"link 'arm'.*collision shape from .*odd\.obj; repair"):
