@@ -231,6 +231,7 @@ class RunnerOptions:
             "physics": list(astuple(self.solver)),
             "dissipation": robot.dissipation,
             "ground": self.ground,
+            "ignored_pairs": hashlib.sha256(repr(robot.ignored_pairs).encode()).hexdigest(),
             "fixed_base": robot.fixed_base,
             "merge_fixed": robot.merge_fixed,
         }

@@ -16,7 +16,7 @@ from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
-from sim.engine.collision_groups import Pair, Words, collision_groups
+from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
 from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
@@ -96,7 +96,7 @@ def add_point_mass(link: Any, mass: float, position: NDArray[np.float64]) -> Non
 
 
 @lru_cache(maxsize=8)
-def _collision_words(spec: SceneSpec) -> dict[str, Words]:
+def link_groups(spec: SceneSpec) -> CollisionGroups:
     """Return the words by which PhysX ignores the pairs of ``spec``, for each link of the URDF that has shapes.
 
     Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
@@ -116,7 +116,7 @@ def _collision_words(spec: SceneSpec) -> dict[str, Words]:
             free.add(frozenset((first, second)))
         elif bodies[first] == bodies[second]:
             ignored.add(frozenset((first, second)))
-    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free).words
+    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free)
 
 
 def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
@@ -215,7 +215,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             files = ", ".join(record.filename for record in records if record.filename)
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
-    words, owners = _collision_words(spec), shape_owners(spec)
+    words, owners = link_groups(spec).words, shape_owners(spec)
     for link in robot.links:
         for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
             shape.set_collision_groups(words[owner])

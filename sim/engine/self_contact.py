@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from itertools import combinations, product
 
-from sim.engine.building import SceneSpec
+from sim.engine.building import SceneSpec, link_groups
 from sim.engine.dynamics import Dynamics
 from sim.engine.physics import PHYSICS
 from sim.robot.description import Joint, RobotDescription
@@ -36,8 +37,13 @@ def self_contact(robot: RobotDescription) -> SelfContact:
         samples = [[pair for pair, distance in distances.items() if distance < 0] for distances in poses]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, samples)
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
-    pairs = (pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid))
-    return SelfContact(tuple(pairs), robot.fixed_base and dynamics.height(robot.start) < PENETRATION)
+    pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
+    left_over = link_groups(replace(spec, ignored=tuple((pair.first, pair.second) for pair in pairs))).left_over
+    return SelfContact(
+        pairs=tuple(pair for pair in pairs if pair.links not in left_over),
+        left_over=tuple(pair for pair in pairs if pair.links in left_over),
+        reaches_ground=robot.fixed_base and dynamics.height(robot.start) < PENETRATION,
+    )
 
 
 def _rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:

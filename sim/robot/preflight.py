@@ -101,6 +101,10 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
     if not robot.fixed_base:
         text = "SAPIEN's passive force does not compensate gravity on a floating base"
         yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
+    if left_over := robot.self_contact.left_over:
+        names = ", ".join(f"{pair.first} - {pair.second}" for pair in left_over)
+        text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all: {names}"
+        yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
     if robot.dynamics().in_contact(start[None])[0]:
         text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
         remedy = "use another start pose, correct the collision shapes, or load with self_collision='auto'"

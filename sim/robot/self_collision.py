@@ -52,11 +52,13 @@ class Srdf(NamedTuple):
 class SelfContact(NamedTuple):
     """Contact of a robot's links with each other and with the ground.
 
-    ``pairs`` do not collide; ``reaches_ground`` is True if a link other than the base touches the ground at the start
-    pose.
+    ``pairs`` do not collide. Those ``left_over`` should not, but do: PhysX's filter holds all pairs of up to 31 links,
+    any 62 pairs of more links, and mostly many more. ``reaches_ground`` is True if a link other than the base touches
+    the ground at the start pose.
     """
 
     pairs: tuple[DisabledPair, ...]
+    left_over: tuple[DisabledPair, ...]
     reaches_ground: bool
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import pickle
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner
+from sim.engine.dynamics import robot_dynamics
 from sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
@@ -100,6 +104,19 @@ def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
     assert vars(pickle.loads(pickle.dumps(loaded)))["self_contact"] == pairs
 
 
+def test_pairs_that_the_filter_cannot_hold_go_on_colliding_and_are_told(tmp_path):
+    rng, count = np.random.default_rng(0), 60
+    path = write(tmp_path, sliders(*(0.0 for _ in range(count))))
+    pairs = [(a, b) for a, b in combinations(range(count), 2) if rng.random() < 0.5]
+    lines = (f'<disable_collisions link1="l{a}" link2="l{b}"/>' for a, b in pairs)
+    write(tmp_path, robot(*lines), "test.srdf")
+    loaded = Robot.load(path, self_collision="urdf")
+    contact = loaded.self_contact
+    assert len(contact.pairs) + len(contact.left_over) == len(pairs)
+    assert len(contact.left_over) > 0
+    assert next(f for f in loaded.check() if f.code == "pairs-left-over").text.startswith(str(len(contact.left_over)))
+
+
 def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
     high = write(tmp_path, sliders(0.0), "high.urdf")
     low = write(tmp_path, sliders(0.0).replace('0.0 1"', '0.0 0.05"'), "low.urdf")
@@ -119,17 +136,39 @@ def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
         np.testing.assert_allclose(runner.step(np.zeros((1, 2))).qpos, 0.0, atol=1e-6)
 
 
-PAIRS = st.frozensets(st.sampled_from("abcdef"), min_size=2, max_size=2)
+@given(st.integers(0, 2**32), st.booleans())
+@settings(deadline=None, max_examples=8)
+def test_physx_reports_contact_of_all_pairs_but_the_disabled_and_the_neighbours(seed, merge_fixed):
+    rng = np.random.default_rng(seed)
+    parts, body = [link("base", INERTIAL)], {}
+    for arm in range(5):  # all at one place, each with a tool; the last on the first
+        parent = "arm0" if arm == 4 else "base"
+        for name, other, kind in ((f"arm{arm}", parent, "prismatic"), (f"tool{arm}", f"arm{arm}", "fixed")):
+            parts += [link(name, INERTIAL + BOX), joint(name, other, name, kind, SLIDE, origin="0 0 0")]
+            body[name] = f"arm{arm}"
+    pairs = list(combinations(body, 2))
+    disabled = [pair for pair in pairs if rng.random() < rng.uniform(0, 1)]
+    with TemporaryDirectory() as folder:
+        path = write(Path(folder), robot(*parts))
+        lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
+        write(Path(folder), robot(*lines), "test.srdf")
+        loaded = Robot.load(path, self_collision="urdf", merge_fixed=merge_fixed)
+        seen = robot_dynamics(loaded, ground=False).link_distances(loaded.start)
+    far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
+    neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
+    assert set(seen) - neighbours == far - neighbours - set(map(frozenset, disabled))
 
 
-@given(st.lists(PAIRS), st.lists(PAIRS), st.lists(st.lists(PAIRS), min_size=20, max_size=30))
-@settings(deadline=None, max_examples=50)
-def test_each_pair_is_listed_once_with_its_first_reason(adjacent, rest, samples):
-    listed = disabled_pairs("abcdef", adjacent, rest, samples)
-    assert len({pair.links for pair in listed}) == len(listed)
-    for pair in listed:
-        share = np.mean([pair.links in sample for sample in samples])
-        expected = "Adjacent" if pair.links in adjacent else "Default" if pair.links in rest else "Always"
-        assert pair.reason == expected
-        assert expected != "Always" or share > 0.95
-    assert {pair.links for pair in listed} >= {*adjacent, *rest}
+@given(st.integers(0, 2**32), st.integers(1, 60))
+@settings(deadline=None, max_examples=30)
+def test_each_pair_is_listed_once_with_its_first_reason(seed, count):
+    rng, pairs = np.random.default_rng(seed), [frozenset(pair) for pair in combinations("abcdef", 2)]
+    share = rng.choice([0.05, 0.9, 0.95, 1.0], len(pairs))
+    adjacent, rest = ([pair for pair in pairs if rng.random() < 0.2] for _ in range(2))
+    samples = [[pair for pair, s in zip(pairs, share, strict=True) if rng.random() < s] for _ in range(count)]
+    listed = {pair.links: pair.reason for pair in disabled_pairs("abcdef", adjacent, rest, samples)}
+    for pair in pairs:
+        always = sum(pair in sample for sample in samples) > 0.95 * count
+        reasons = {"Adjacent": pair in adjacent, "Default": pair in rest, "Always": always}
+        assert listed.get(pair) == next((reason for reason, applies in reasons.items() if applies), None)
+    assert len(disabled_pairs("abcdef", adjacent, rest, samples)) == len(listed)
