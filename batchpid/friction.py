@@ -3,7 +3,8 @@ r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs
 With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and Coulomb friction F,
 a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves and any |f| <= F that holds it at rest.
 In steps of dt both are taken at the end of the step (backward Euler), which is stable at any ratio of B dt and F dt to
-the inertia::
+the inertia (R. Kikuuwe et al., "Fixed-step friction simulation: from classical Coulomb model to modern continuous
+models", IROS 2005)::
 
     M (v+ - v) = dt (tau - h - B v+ - f),      f in F Sgn(v+)
 

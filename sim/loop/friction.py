@@ -45,7 +45,8 @@ class JointFriction:
         modelled = DISSIPATION[pack.spec.dissipation].modelled
         self._known = np.array([joint.friction * modelled for joint in joints])  # the controller knows the URDF's
         self._band = np.array([BAND[joint.unit] for joint in joints])
-        self._turns = np.array([joint.continuous / TURN for joint in joints])
+        turns = np.array([joint.continuous / TURN for joint in joints])
+        self._turns = turns if turns.any() else None
         self.compensates = bool(self._known.any())
         self._state = friction.FrictionState()
         self.reset(np.ones(pack.size, bool))

@@ -3,10 +3,12 @@ r"""Moves to evaluate gains on: seeded, free of contact, with the shortest durat
 A move is a step of the setpoint from rest at ``start`` to ``target``. The straight line between them, which good gains
 follow, is tested for contact, and so is its continuation by as much as a good move may overshoot. On that line
 q(z) = start + z (target - start) all joints move in proportion, so that the effort of a motion z(t) in time T is
-gravity(q) + h / T^2, with h from the inverse dynamics of the same motion in unit time. The shortest bang-bang motion,
-accelerating up to half the way and braking from there, has in closed form::
+gravity(q) + h / T^2 + B q' / T + F sgn(q'), with h and q' those of the same motion in unit time, joint damping B and
+friction F. The shortest bang-bang motion, accelerating up to half the way and braking from there, has in closed form::
 
-    T^2 = max over joints and line of |h_j| / (limit_j -+ gravity_j)
+    T = max over joints and line of the positive root of room_j T^2 - B_j |q_j'| T - |h_j|
+
+    room_j = limit_j -+ gravity_j - F_j         B and F without effect where they help to brake
 
 Such a motion exists, so the shortest of all motions takes no longer.
 """
@@ -168,9 +170,11 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
         still = np.zeros_like(qpos)
         gravity = motion_effort(robot, qpos, still, still)
         moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
-        room = np.where(moving > 0, limit - gravity, limit + gravity)
+        along = moving * step > 0  # there friction and damping take their share of the effort
+        room = np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
         if (room > 0).all():
-            durations[row] = np.sqrt((np.abs(moving) / room).max())
+            drag = along * robot.damping * np.abs(rate * step)  # room T^2 - drag T - |moving| >= 0
+            durations[row] = ((drag + np.sqrt(drag**2 + 4 * room * np.abs(moving))) / (2 * room)).max()
     return durations
 
 

@@ -8,6 +8,7 @@ from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
 from sim import Robot, Runner
+from sim.engine.variation import Variation
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]
@@ -158,6 +159,12 @@ def test_friction_beyond_all_efforts_keeps_the_pose(fixed_base, gravity, tmp_pat
     rollout = push(robot, [0.0, 30.0], 0.5, qpos=start, compensate=gravity)
     assert np.abs(rollout.qpos - start).max() < 1e-4
     assert rollout.ok.all()
+
+
+def test_friction_of_a_variation_is_in_the_urdfs_units(tmp_path):
+    variation = Variation(payload=np.zeros(3), friction=np.array([0.0, 0.4, 2.0]), link="arm")
+    rollout = push(wheel(tmp_path, 0.1, friction=0.1), np.ones(3), 0.5, variation=variation)
+    np.testing.assert_allclose(rollout.qvel[-1, :, 0], [0.9 / 0.1 * 0.5, 0.5 / 0.1 * 0.5, 0.0], rtol=1e-3)
 
 
 def test_without_friction_and_damping_the_effort_is_that_of_the_motor(tmp_path):
