@@ -1,7 +1,7 @@
 """Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for a view that has no SAPIEN renderer.
 
-A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files is missing, by its collision
-shapes. The triangles are made, or read from mesh files, by ``trimesh`` (extra "view").
+A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
+collision shapes. The triangles are made, or read from mesh files, by ``trimesh`` (extra "view").
 """
 
 from __future__ import annotations
@@ -62,8 +62,12 @@ def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surf
     }
     collisions = {link.get("name"): link.findall("collision") for link in sanitised.findall("link")}
     result = []
+    undrawn = {link.name for link in robot.links}
     for link in original.findall("link"):
-        name = link.get("name")
+        name = link.get("name", "").strip()
+        if name not in undrawn:
+            continue  # left out of the robot: see sim.robot.repair
+        undrawn.remove(name)
         where = f"{robot.path}: link {name!r}"
         parts: dict[Rgba, list[Any]] = {}
         for elements in (link.findall("visual"), collisions.get(name, [])):
@@ -89,7 +93,7 @@ def segments_of(radius: float, deviation: float) -> int:
 
 
 def _mesh(element: etree._Element, urdf: Path, deviation: float, where: str) -> Any:
-    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None if there is no such mesh."""
+    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None without a readable mesh."""
     from trimesh import Trimesh, creation, load
 
     shape = element.find("geometry/*")
@@ -98,7 +102,12 @@ def _mesh(element: etree._Element, urdf: Path, deviation: float, where: str) -> 
         path = find_mesh(shape.get("filename", ""), urdf, ())
         if path is None:
             return None
-        loaded: Any = load(path, force="mesh", process=False)
+        try:
+            loaded: Any = load(path, force="mesh", process=False)
+        except Exception:  # trimesh has an error of its own for each fault of a file
+            return None
+        if not len(loaded.faces):
+            return None
         mesh: Any = Trimesh(loaded.vertices, loaded.faces, process=False)
         mesh.apply_scale(numbers(shape, "scale", "1 1 1", where))
     elif kind == "box":

@@ -87,12 +87,13 @@ def _lenient(data: bytes) -> etree._Element:
 def numbers(
     element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
 ) -> tuple[float, ...]:
-    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing one.
+    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing or empty one.
 
     They are finite and at most LARGEST in magnitude, those of a joint ``limit`` at most LARGEST_LIMIT or infinite, or a
     RobotError is raised, whose message begins with ``where``.
     """
-    text, count = default if element is None else element.get(key, default), len(default.split())
+    given = default if element is None else element.get(key, default)
+    text, count = given if given.strip() else default, len(default.split())
     largest = LARGEST_LIMIT if limit else LARGEST
     try:
         values = tuple(float(word) for word in text.split() if word.isascii() and "_" not in word)

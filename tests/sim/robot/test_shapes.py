@@ -126,3 +126,14 @@ def test_without_trimesh_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh.util", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'batchpid\[view\]'"):
         surfaces(load(tmp_path, a=visual(BOX)))
+
+
+def test_what_was_repaired_is_drawn(tmp_path):
+    """Loose links and copies are left out, empty attributes are defaults, an unreadable mesh is the collision shape."""
+    (tmp_path / "pointer.stl").write_text("version https://git-lfs.github.com/spec/v1")
+    seen = visual('<mesh filename="pointer.stl"/>') + visual(BOX, kind="collision")
+    parts = link("a"), link(" b ", INERTIAL + seen), link("b", visual(BOX)), link("loose", visual(BOX))
+    text = robot(*parts, joint("j", "a", "b")).replace('xyz="0 0 0.0"', 'xyz=""')
+    (surface,) = surfaces(Robot.load(write(tmp_path, text)))
+    assert surface.link == "b"
+    np.testing.assert_allclose(np.ptp(surface.vertices, axis=0), (0.4, 0.2, 0.1), atol=1e-9)
