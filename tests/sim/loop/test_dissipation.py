@@ -8,6 +8,9 @@ from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
 from sim import Robot, Runner
+from sim.engine.building import SceneSpec
+from sim.engine.dynamics import scene_dynamics
+from sim.engine.physics import PHYSICS
 from sim.engine.variation import Variation
 
 DT = 1 / 2000
@@ -209,3 +212,17 @@ def test_light_joints_neither_chatter_nor_diverge(control, tmp_path):
         rollout = runner.rollout(np.zeros((800, 1, 1)) + (0.0 if control == "effort" else 0.3))
     assert rollout.ok.all()
     assert np.abs(rollout.qvel[700:]).max() < 0.05
+
+
+@pytest.mark.parametrize("fixed_base", [True, False])
+def test_the_mass_matrix_of_the_joints_is_the_engines(fixed_base, tmp_path):
+    robot, pose = Robot.load(pendulum(tmp_path, 3, 0.0, 0.0).path, fixed_base=fixed_base), np.array([0.3, 0.4, -0.2])
+    efforts = np.eye(3)
+    with Runner(robot, 3, control="effort", compensate="none", ground=False, substeps=1, workers=0) as runner:
+        runner.reset(pose)
+        fall = runner.step(np.zeros(3)).qvel
+        runner.reset(pose)
+        velocity = runner.step(efforts).qvel - fall
+    spec = SceneSpec(robot.urdf, (), robot.joints, DT, PHYSICS["fast"], ground=False, fixed_base=fixed_base)
+    matrix = scene_dynamics(spec).joint_mass_matrix(pose[None])[0]
+    np.testing.assert_allclose(velocity @ matrix / DT, efforts, atol=2e-3)
