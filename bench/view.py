@@ -75,7 +75,7 @@ def main(options: Options) -> None:
             chrome.add_argument(flag)
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
         # Without fixedDpr viser lowers the resolution in a slow browser, which would spoil a picture.
-        page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
+        page.get(view.url if options.picture is None else f"{view.url}?fixedDpr=1")
         browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
         for process in browser:
             process.nice(19)
