@@ -55,7 +55,9 @@ class Gate:
         """Port that is listened on."""
         self._bound = ipaddress.ip_address(self._socket.getsockname()[0])
         self._token = secrets.token_urlsafe(16)
-        shown = "127.0.0.1" if self._bound == ipaddress.IPv4Address(0) else f"[{host}]" if ":" in host else host
+        shown = f"[{host}]" if ":" in host else host
+        if self._bound.is_unspecified:
+            shown = "127.0.0.1" if self._bound.version == 4 else "[::1]"
         self._loop: asyncio.AbstractEventLoop | None = None
         self._connections: WeakSet[_Connection] = WeakSet()
         self.url = f"http://{shown}:{self.port}/{self._token}/"
@@ -128,7 +130,9 @@ class Gate:
         try:
             address = ipaddress.ip_address(name)
         except ValueError:
-            return name in ("localhost", self._host) or (not self._bound.is_loopback and name == _machine())
+            # Of a machine that others reach, its name in any domain.
+            named = name.partition(".")[0] == socket.gethostname().lower().partition(".")[0]
+            return name in ("localhost", self._host) or (named and not self._bound.is_loopback)
         # A page cannot choose the address in its Host header, and the one in front of a container is not known here.
         return address.is_loopback or address == self._bound or self._bound.is_unspecified
 
@@ -177,7 +181,3 @@ class _Connection(ServerConnection):
                 self._refuse(str(error))
             else:
                 return data
-
-
-def _machine() -> str:
-    return socket.gethostname().lower()

@@ -156,7 +156,11 @@ def test_pages_of_other_sites_and_requests_without_the_token_get_403(view):
 def test_which_hosts_are_this_server():
     for bound, ours, foreign in (
         ("127.0.0.1", ("127.0.0.1", "LOCALHOST:80", "[::1]:1"), ("10.0.0.1", "a.localhost", socket.gethostname())),
-        ("0.0.0.0", ("10.0.0.1:8080", "localhost", socket.gethostname()), ("evil.example", "")),
+        (
+            "0.0.0.0",
+            ("10.0.0.1:8080", "localhost", socket.gethostname(), socket.gethostname() + ".lab.example:1"),
+            ("evil.example", ""),
+        ),
     ):
         gate = Gate(bound, 18210, print)
         gate.start(lambda: viser.ViserServer(verbose=False)).stop()
