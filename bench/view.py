@@ -24,6 +24,7 @@ import tyro
 from PIL import Image
 from selenium import webdriver
 
+from batchpid.files import write_atomically
 from sim import Robot
 from sim.view import LiveSimulation, View
 
@@ -118,7 +119,8 @@ def _picture(page: webdriver.Chrome, live: LiveSimulation, target: np.ndarray, p
     live.set_setpoint(target)
     _until(live, 2.0)
     with Image.open(io.BytesIO(page.get_screenshot_as_png())) as image:
-        image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+        small = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
+    write_atomically(path, lambda file: small.save(file, "PNG", optimize=True))
 
 
 def _until(live: LiveSimulation, seconds: float) -> None:

@@ -24,6 +24,8 @@ class InspectCommand:
     """Exit with status 1 if a finding is worse than a note."""
     missing_meshes: flags.MissingMeshes = "error"
 
+    imports = ("sim.engine.dynamics",)
+
     def run(self) -> int:
         """Run the command and return its exit status."""
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)

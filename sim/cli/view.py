@@ -47,6 +47,8 @@ class ViewCommand:
     """Port, or the next free one if it is taken."""
     time_limit: flags.TimeLimit = None
 
+    imports = ("sim.view",)
+
     def run(self) -> None:
         """Run the command."""
         from sim.view import View

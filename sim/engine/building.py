@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import sapien.wrapper.urdf_loader  # noqa: F401 - its packages suppress a Ctrl-C while they are imported: not amid a run
 from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
