@@ -210,6 +210,8 @@ class Recorder:
                 self.partial.unlink()
                 raise
         except (OSError, RuntimeError) as error:
+            if not isinstance(error, FileExistsError):  # on a full disk HDF5 leaves an empty file
+                self.partial.unlink(missing_ok=True)
             raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
         return file, datasets
 
