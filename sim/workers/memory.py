@@ -9,9 +9,9 @@ from pathlib import Path
 from batchpid.errors import InvalidArgumentError
 from sim.options import RunnerOptions
 
-ENV_BYTES, JOINT_BYTES, SYSTEM_BYTES = 10_000, 8_000, 460_000
-"""Resident bytes of an env, for each of its joints, and of a PhysX system: measured on chains of 1 to 30 boxes and on
-jaco2. Collision meshes come on top: three times as much for a panda."""
+ENV_BYTES, JOINT_BYTES, SYSTEM_BYTES = 5_000, 6_000, 400_000
+"""Resident bytes of an env, for each of its joints, and of a PhysX system, at least: chains of 1 to 30 boxes and jaco2
+take 15 to 35 % more. Large collision meshes come on top: a panda takes 2.7 times as much."""
 WORKER_BYTES = 130_000_000
 """Resident bytes of a worker process without envs: SAPIEN and NumPy."""
 WORKER_ADDRESS_SPACE = 470_000_000
@@ -71,19 +71,18 @@ def _cgroup_memory() -> Iterator[int]:
     """Yield the bytes that are left of each limit of the control groups that this process is in, as in a container."""
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
-        names = (
-            ("memory.max", "memory.current") if not controllers else ("memory.limit_in_bytes", "memory.usage_in_bytes")
-        )
+        names = ("limit_in_bytes", "usage_in_bytes") if controllers else ("max", "current")
+        total = "total_" if controllers else ""
         if controllers and "memory" not in controllers.split(","):
             continue
         root = _CGROUPS / ("memory" if controllers else "")
-        group = Path(path)
-        for folder in (group, *group.parents):
+        for folder in (Path(path), *Path(path).parents):
             try:
                 here = root / folder.relative_to("/")
                 limit, used = ((here / f"memory.{name}").read_text() for name in names)
-                cached = dict(line.split() for line in (here / "memory.stat").read_text().splitlines())
-                yield int(limit) - int(used) + int(cached.get("inactive_file", 0))
+                stat = dict(line.split() for line in (here / "memory.stat").read_text().splitlines())
+                cached = sum(int(stat.get(f"{total}{kind}_file", 0)) for kind in ("active", "inactive"))
+                yield int(limit) - int(used) + cached
             except (OSError, ValueError):  # there is none, or it is "max"
                 continue
 
