@@ -12,12 +12,11 @@ thread needs: they put items into queues that are written in C, and wait in ways
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
 import os
-import re
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -29,22 +28,19 @@ from numpy.typing import NDArray
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
 from batchpid.validate import flag, instance, integer
 from sim.loop.faults import Fault
-from sim.observation import RECORDED, Observation, RunInfo
+from sim.observation import RECORDED, Observation
 from sim.recording import files
 from sim.recording.files import RecordingError
+from sim.recording.partial_file import PartialFile
 from sim.workers.background import Job, start_thread
 
 if TYPE_CHECKING:
-    import h5py
-
     from sim.runner import Runner
 
 WRITE_PERIOD = 0.5
 """Time from one write to the next [s]."""
 MAX_LAG = 0.75
 """Age of the oldest row that is not on disk at which the next tick waits for it [s]."""
-METADATA_BYTES = 1 << 18
-"""Disk space that is kept for what HDF5 notes about the next rows."""
 MAX_BUFFER = 64 << 20
 """Bytes that may wait to be written."""
 _RETRY = 0.002  # seconds between two looks whether a tick may go on
@@ -56,15 +52,6 @@ class _Row(NamedTuple):
     time: float
     setpoint: NDArray[Any]
     observation: Observation
-
-
-class _End(NamedTuple):
-    """End of a recording."""
-
-    complete: bool = False
-    faults: str = ""
-    discard: bool = False
-    """Remove the file."""
 
 
 class Recorder:
@@ -104,7 +91,7 @@ class Recorder:
             raise InvalidArgumentError(
                 "runner", f"is being recorded already, to {runner.recorder.path}", remedy="close that Recorder first"
             )
-        self._overwrite, self._runner = flag("overwrite", overwrite), runner
+        overwrite, self._runner = flag("overwrite", overwrite), runner
         self.path: Path = files.check_path(path, files.HDF5, overwrite=overwrite)
         self.partial: Path = _free_name(self.path)
         seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
@@ -115,17 +102,20 @@ class Recorder:
         self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
         self._oldest = math.inf  # when the oldest row was recorded that is being written
         self._faults: deque[Fault] = runner.faults  # up to the last row
-        self._end: _End | None = None
-        self._error: Exception | None = None
+        self._end: Callable[[PartialFile], None] | None = None
+        self._error: RecordingError | None = None
         self._has_raised = False
-        self._creation = creation = Job(lambda: self._create(info))
+        tick = runner.timestep * runner.substeps
+        self._creation = creation = Job(
+            lambda: PartialFile(self.path, self.partial, info, runner.num_envs, tick, overwrite=overwrite)
+        )
         self._writing = writing = Job(self._write_rows)
         try:
             start_thread(creation.run, writing.run)
             creation.result()
             runner.recorder = self
         except BaseException:
-            self._finish_with(_End(discard=True))
+            self._finish_with(PartialFile.discard)
             raise
 
     def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
@@ -157,7 +147,8 @@ class Recorder:
                     failure = error
                 self._faults = runner.faults
             runner.recorder = None
-        self._finish_with(_End(complete, files.faults_text(self._faults)))
+        faults = files.faults_text(self._faults)
+        self._finish_with(lambda file: file.finish(complete, faults))
         try:
             self._writing.result()
             self._check()
@@ -177,12 +168,10 @@ class Recorder:
 
     def _check(self) -> None:
         if self._error is not None:
-            raise RecordingError(
-                f"{self.partial}: cannot be written: {_cause(self._error)}; what was recorded before can be read"
-            ) from self._error
+            raise self._error
 
-    def _finish_with(self, end: _End) -> None:
-        """Let the thread end the recording; the first ``end`` counts."""
+    def _finish_with(self, end: Callable[[PartialFile], None]) -> None:
+        """Let the thread write the remaining rows and call ``end``, the first one that is given."""
         if self._end is None:
             self._end = end
         self._rows.put(None)
@@ -193,47 +182,14 @@ class Recorder:
 
     # -- in the thread -----------------------------------------------------------------------------------------------
 
-    def _create(self, info: RunInfo) -> tuple[h5py.File, dict[str, h5py.Dataset]]:
-        h5py, runner = files.load_h5py(), self._runner
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            file = h5py.File(self.partial, "x", libver="latest", rdcc_nbytes=files.CHUNK_BYTES, rdcc_w0=1.0)
-            try:
-                self._reserve(0)
-                datasets = files.create_datasets(file, info, runner.num_envs, runner.timestep * runner.substeps)
-                file.flush()
-                file.swmr_mode = True
-            except BaseException:
-                _redirect_to_memory(file)
-                with contextlib.suppress(Exception):
-                    file.close()
-                self.partial.unlink()
-                raise
-        except (OSError, RuntimeError) as error:
-            if not isinstance(error, FileExistsError):  # on a full disk HDF5 leaves an empty file
-                self.partial.unlink(missing_ok=True)
-            raise RecordingError(f"{self.partial}: cannot be made: {_cause(error)}") from error
-        return file, datasets
-
-    def _reserve(self, end: int, size: int = 0) -> None:
-        """Allocate disk space after ``end`` for ``size`` bytes of rows: HDF5 can crash after a write that failed."""
-        chunk = max(files.CHUNK_BYTES, 8 * self._runner.num_envs * self._runner.robot.dof)
-        size += 2 * len(files.DTYPES) * chunk + METADATA_BYTES  # a chunk of each dataset is not full
-        with self.partial.open("r+b") as disk:
-            try:
-                os.posix_fallocate(disk.fileno(), end, size)
-            except OSError as error:
-                if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
-                    raise  # with another error the file system does not offer it
-
     def _write_rows(self) -> None:
         """Write the recorded rows every half second until the end, and end the file."""
         try:
-            file, datasets = self._creation.result()
+            file = self._creation.result()
         except Exception:
-            return  # it is raised by the constructor
+            return  # the constructor raises it
+        last: Observation | None = None
         try:
-            last: Observation | None = None
             while (first := self._rows.get()) is not None:
                 self._oldest = first.recorded
                 self._pause()
@@ -242,23 +198,15 @@ class Recorder:
                     if row.observation is not last:  # otherwise the first of two calls was interrupted
                         rows.append((row.time, row.setpoint, *row.observation))
                     last = row.observation
-                columns = map(np.array, zip(*rows, strict=True))
                 if rows:
-                    arrays = dict(zip(("time", *RECORDED), columns, strict=True))
-                    self._reserve(file.id.get_filesize(), sum(array.nbytes for array in arrays.values()))
-                    files.append_rows(datasets, arrays)
+                    columns = map(np.array, zip(*rows, strict=True))
+                    file.append(dict(zip(("time", *RECORDED), columns, strict=True)))
                 self._oldest = math.inf
-        except Exception as error:
-            _redirect_to_memory(file)
+        except RecordingError as error:
             self._error = error
-        size = file.id.get_filesize()
-        with contextlib.suppress(Exception):  # the error before, if any, is the one to raise
-            file.close()
-        if self._end is not None and self._error is None:
-            if self._end.discard:
-                self.partial.unlink()
-            else:
-                self._complete(self._end, size)
+            return
+        assert self._end is not None
+        self._end(file)
 
     def _pause(self) -> None:
         """Wait for the time of the next write."""
@@ -278,53 +226,6 @@ class Recorder:
                 break
             rows.append(row)
         return rows
-
-    def _complete(self, end: _End, size: int) -> None:
-        try:
-            self._reserve(size, len(end.faults))
-            # Without a lock, because a reader may hold one.
-            with files.load_h5py().File(self.partial, "r+", locking=False) as file:
-                try:
-                    file.attrs["complete"] = end.complete
-                    file.attrs["faults"] = end.faults
-                    file.attrs["checksum"] = files.attribute_checksum(file.attrs)
-                    file.flush()
-                except BaseException:
-                    _redirect_to_memory(file)
-                    raise
-            with self.partial.open("rb") as whole:
-                os.fsync(whole.fileno())
-            if end.complete and self._overwrite:
-                self.partial.replace(self.path)
-            else:
-                os.link(self.partial, self.path)  # fails where a file exists by now
-                self.partial.unlink()
-        except FileExistsError:
-            if end.complete:
-                raise RecordingError(
-                    f"{self.path} was made by another program meanwhile; the recording is in {self.partial}"
-                ) from None
-        except (OSError, RuntimeError) as error:
-            raise RecordingError(
-                f"{self.partial}: cannot be completed: {_cause(error)}; all that was recorded is in it"
-            ) from error
-
-
-def _cause(error: Exception) -> str:
-    """Return the system's message, out of HDF5's long one."""
-    found = re.search(r"error message = '([^']+)'", str(error))
-    return found[1] if found else getattr(error, "strerror", None) or str(error)
-
-
-def _redirect_to_memory(file: h5py.File | None) -> None:
-    """Make HDF5 write the rest of ``file`` to memory, after an error; what is on disk stays unchanged.
-
-    HDF5 writes its caches when it closes a file, and can crash the process where it cannot.
-    """
-    with contextlib.suppress(Exception):
-        memory = os.memfd_create("batchpid-rest", os.MFD_CLOEXEC)
-        os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)  # type: ignore[union-attr]
-        os.close(memory)
 
 
 def _free_name(path: Path) -> Path:
