@@ -21,6 +21,10 @@ Params say how to control, a state is carried from step to step, and every array
 NumPy alone is needed; JAX, PyYAML and ruckig are imported by what uses them.
 """
 
+from batchpid import startup
+
+startup.prepare()
+
 from batchpid import presets
 from batchpid.bumpless import track
 from batchpid.coefficients import Coefficients, discretise

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import signal
 import sys
 from pathlib import Path
 
 
 def main() -> int:
+    """Run the command line as a program, with three standard streams."""
+    _open_closed_streams()
+    try:
+        return _run()
+    finally:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # at the end of Python it would print a traceback
+
+
+def _run() -> int:
     """Hand over to the command line, unless the user's own ``sim.py`` or ``assets.py`` would be imported for it."""
     for name in ("sim", "assets"):
         origin = getattr(importlib.util.find_spec(name), "origin", None)
@@ -18,6 +30,18 @@ def main() -> int:
     from sim.cli import main
 
     return main()
+
+
+def _open_closed_streams() -> None:
+    """Open the null device for each standard stream that is closed, before another file takes its number."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # as stderr, for any file name
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
-"""Atomic writes of files."""
+"""Atomic writes of files, and trials of whether a file can be written."""
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+TRIAL_BYTES = 4096
+"""Size of the file that :func:`try_writing` writes: a block of most file systems [B]."""
 
 
 @contextmanager
@@ -23,12 +28,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         The file cannot be written.
     """
     path = Path(os.path.realpath(path))
-    temporary = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
+    temporary = _temporary(path)
     try:
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error  # named as the caller named it
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -52,3 +61,40 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callab
             content(file)
         else:
             file.write(content.encode() if isinstance(content, str) else content)
+
+
+def try_writing(path: str | os.PathLike[str]) -> None:
+    """Raise OSError unless a file can be written at ``path``, whose folder need not exist; leave nothing behind.
+
+    The trial is a small file in the same folder, or in the nearest folder above that exists.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written to, the disk is full, or ``path`` is no regular file or may not be changed.
+    """
+    path = Path(os.path.realpath(path))
+    try:
+        kept = os.stat(path)
+    except FileNotFoundError:
+        pass
+    else:
+        if not stat.S_ISREG(kept.st_mode):
+            number = errno.EISDIR if stat.S_ISDIR(kept.st_mode) else errno.EINVAL
+            raise OSError(number, os.strerror(number), str(path))
+        if not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    folder = path.parent
+    while not folder.exists():
+        folder = folder.parent
+    trial = _temporary(folder / path.name)
+    try:
+        with trial.open("xb") as file:
+            file.write(bytes(TRIAL_BYTES))
+    finally:
+        trial.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    """Return the path of a new hidden file in the same folder, with the same suffix."""
+    return path.with_name(f".{secrets.token_hex(8)}{path.suffix}")

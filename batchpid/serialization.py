@@ -132,14 +132,21 @@ def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _read(path: str | os.PathLike[str]) -> Any:
     path = file_path("path", path, SUFFIXES)
-    return _parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}"
+        raise InvalidArgumentError(str(path), problem, remedy="check its name and your rights") from None
+    return _parse(str(path), content, SUFFIXES[path.suffix.lower()])
 
 
 def _parse(source: str, text: str | bytes, format: str) -> Any:
     try:
         text = text.decode() if isinstance(text, bytes) else text
         return _parse_json(text) if format == "json" else _parse_yaml(text)
-    except (ValueError, RecursionError) as error:
+    except Exception as error:  # a damaged text can make the parser raise anything
         said = " ".join(str(error).split())[:300] or type(error).__name__
         raise InvalidArgumentError(source, f"cannot be read: {said}", remedy="correct the file") from None
 
@@ -260,7 +267,4 @@ def _parse_yaml(text: str) -> Any:
                 raise ValueError(f"a key is given twice{node.start_mark}")
             return mapping
 
-    try:
-        return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from None
+    return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only

@@ -32,6 +32,10 @@ class PIDState(NamedTuple):
         """Return the state of some envs (a slice or an index array)."""
         return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
 
+    def leaves(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+
     def matched_to(self, fresh: PIDState) -> PIDState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped."""
         both = zip(self, fresh, strict=True)

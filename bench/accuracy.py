@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from batchpid.files import write_atomically
 from sim import Robot
 from sim.benchmark.accuracy import REFERENCES, measure_errors
 from sim.benchmark.workload import TIMESTEP
@@ -59,7 +60,7 @@ def main(options: Options) -> None:
     print(table(rows, [*labels, "max [rad]", "RMS [rad]"], "llllrr"))
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps({"accuracy": figures}) + "\n")
+        write_atomically(options.json, json.dumps({"accuracy": figures}) + "\n")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from batchpid.files import write_atomically
 from sim.plots.figures import save
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -64,7 +65,7 @@ def main(options: Options) -> None:
     figures = json.loads(path.read_text()) if path.is_file() else {}
     if options.folder is not None:
         figures |= gather(options.folder, figures)
-        path.write_text(json.dumps(figures, indent=1) + "\n")
+        write_atomically(path, json.dumps(figures, indent=1) + "\n")
     save(draw_speed(figures), DOCS / "images" / "performance.png")
     save(draw_accuracy(figures["accuracy"]), DOCS / "images" / "accuracy.png")
     page = DOCS / "performance.md"
@@ -72,7 +73,7 @@ def main(options: Options) -> None:
     for name, table in tables(figures).items():
         marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
         text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
-    page.write_text(text)
+    write_atomically(page, text)
 
 
 # -- figures -----------------------------------------------------------------------------------------------------

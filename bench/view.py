@@ -24,6 +24,7 @@ import tyro
 from PIL import Image
 from selenium import webdriver
 
+from batchpid.files import write_atomically
 from sim import Robot
 from sim.view import LiveSimulation, View
 
@@ -75,7 +76,7 @@ def main(options: Options) -> None:
             chrome.add_argument(flag)
         page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
         # Without fixedDpr viser lowers the resolution in a slow browser, which would spoil a picture.
-        page.get(view.url if options.picture is None else f"{view.url}/?fixedDpr=1")
+        page.get(view.url if options.picture is None else f"{view.url}?fixedDpr=1")
         browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
         for process in browser:
             process.nice(19)
@@ -118,7 +119,8 @@ def _picture(page: webdriver.Chrome, live: LiveSimulation, target: np.ndarray, p
     live.set_setpoint(target)
     _until(live, 2.0)
     with Image.open(io.BytesIO(page.get_screenshot_as_png())) as image:
-        image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+        small = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
+    write_atomically(path, lambda file: small.save(file, "PNG", optimize=True))
 
 
 def _until(live: LiveSimulation, seconds: float) -> None:

@@ -14,6 +14,7 @@ for _name in ("batchpid", "assets"):
     if _origin and Path(_origin) != Path(__file__).parents[1] / _name / "__init__.py":
         raise ImportError(f"{_origin} hides the package {_name!r} that sim needs; rename it or run in another folder")
 
+import batchpid.startup  # noqa: F401 - checks the import path before NumPy is imported
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo

@@ -5,6 +5,7 @@ Longer than 300 lines because the public signatures and their documentation are 
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -12,19 +13,19 @@ from functools import cached_property
 from operator import methodcaller
 from pathlib import Path
 from time import strftime
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.errors import ClosedError, InvalidArgumentError
+from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
 from sim.loop.custom import initial_state
-from sim.loop.faults import Fault, FaultLog
+from sim.loop.faults import Fault, FaultLog, FaultWarning
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
@@ -39,8 +40,9 @@ from sim.options import (
 )
 from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
-from sim.workers.pool import WorkerPool
-from sim.workers.requests import ReadContentSizes, ReadPoses, Reset, Restore, Run, SetParams, TakeSnapshot
+from sim.workers.ledger import Commit, Ledger
+from sim.workers.pool import RecoveryWarning, WorkerPool
+from sim.workers.requests import ReadContentSizes, ReadPoses, Request, Reset, Restore, Run, SetParams, TakeSnapshot
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
@@ -55,7 +57,22 @@ class TickRecorder(Protocol):
     path: Path
 
     def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof)."""
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof).
+
+        After an interrupt it is called again, with the same ``observation``; it is to be recorded once.
+        """
+
+
+class _Books(NamedTuple):
+    """Everything about a runner that changes with its commands, apart from the workers."""
+
+    params: bp.PIDParams
+    faults: FaultLog
+    steps: int = 0
+    steps_since_checkpoint: int = 0
+    work_seconds: NDArray[np.float64] = np.zeros(0)
+    unrecorded: tuple[tuple[float, NDArray[Any], Observation], ...] = ()
+    """Ticks for the recorder: arguments of :meth:`TickRecorder.append`."""
 
 
 class Runner:
@@ -101,7 +118,7 @@ class Runner:
         checkpoint_steps: int | None = 8000,
         timeout: float = 60.0,
     ) -> None:
-        self._pool: WorkerPool | None = None
+        self._ledger: Ledger[_Books] | None = None
         self.options = RunnerOptions(
             robot,
             num_envs,
@@ -126,18 +143,18 @@ class Runner:
         options = self.options
         self.robot, self.num_envs, self.control = options.robot, options.num_envs, options.control
         self.timestep, self.substeps = options.timestep, options.substeps
-        self._params = options.check_params(default_params(robot, control) if params is None else params)
+        params = options.check_params(default_params(robot, control) if params is None else params)
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
         self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
-        self._steps = self._steps_since_checkpoint = 0
-        self._faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
-        self.work_seconds = np.zeros(0)
-        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks of one request."""
-        self._pool = WorkerPool(options, self._params)
+        self._has_warned = False
+        faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
+        self._pool = WorkerPool(options, params)
+        self._ledger = Ledger(self._pool, _Books(params, faults))
         try:
+            self._pool.open()
             self.reset()
         except BaseException:
             self.close()
@@ -167,17 +184,20 @@ class Runner:
         mask
             Envs to reset (envs,) bool; default all. The others are not affected.
         """
-        pool = self._open_pool()
+        self._settle()
         position = self._state("qpos", self.robot.start if qpos is None else qpos)
         velocity = self._state("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
         if (coupling := self.robot.coupling) is not None:
             position, velocity = coupling.positions(position), coupling.rates(velocity)
         self._limits.check("qpos", position[chosen])
-        pool.run(Reset(chosen, position, velocity))
-        self._faults.forget(chosen)
-        self._faults.note(pool.present, stacklevel=3)
-        return self.observe()
+
+        def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
+            present = self._pool.present
+            return books._replace(faults=books.faults.without(chosen).noting(present)), _copy(present)
+
+        observation: Observation = self._execute(Reset(chosen, position, velocity), commit)
+        return observation
 
     def step(
         self,
@@ -202,7 +222,7 @@ class Runner:
         substeps
             Sim steps of this tick; default the runner's.
         """
-        pool = self._open_pool()
+        self._settle()
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
         command = Command(
             self._rows("setpoint", setpoint),
@@ -212,8 +232,8 @@ class Runner:
         command = self._coupled(command)
         if self.options.sets_positions:
             self._limits.check("setpoint", command.setpoint)
-        self._run(pool, command.map(lambda rows: rows[None]), count)
-        return _copy(pool.present)
+        self._run(command.map(lambda rows: rows[None]), count)
+        return _copy(self._pool.present)
 
     def rollout(
         self,
@@ -234,7 +254,7 @@ class Runner:
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        pool, dof = self._open_pool(), self.robot.dof
+        steps, pool, dof = self._settle().steps, self._pool, self.robot.dof
         shape = read_array("setpoints", setpoints).shape
         if len(shape) not in (2, 3) or shape[0] == 0:
             raise InvalidArgumentError(
@@ -258,13 +278,13 @@ class Runner:
         if self.options.sets_positions:
             self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
-        times = (self._steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
+        times = (steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
         for tick in range(ticks) if progress is None else progress(range(ticks)):
             if tick == done:
-                done = min(ticks, tick + self._max_ticks(pool))
+                done = min(ticks, tick + self._max_ticks())
                 part = slice(tick, done)
-                self._run(pool, command.map(lambda rows, part=part: rows[part]), self.substeps)
+                self._run(command.map(lambda rows, part=part: rows[part]), self.substeps)
                 for table, rows in zip(seen, pool.arrays.observation, strict=True):
                     table[part] = rows[: done - tick]
         info = replace(info, faults=tuple(self.faults))
@@ -272,7 +292,8 @@ class Runner:
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
-        return _copy(self._open_pool().present)
+        self._settle()
+        return _copy(self._pool.present)
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z [m], w, x, y, z.
@@ -282,7 +303,7 @@ class Runner:
         InvalidArgumentError
             There is no ``build``, or it returned more entities for one env than for another.
         """
-        rows = [row for part in self._open_pool().run(ReadPoses()) for row in part]
+        rows = [row for part in self._execute(ReadPoses(), _read) for row in part]
         counts = [len(row) for row in rows]
         if not rows or len(set(counts)) > 1:
             raise InvalidArgumentError(
@@ -295,24 +316,28 @@ class Runner:
     @property
     def params(self) -> bp.PIDParams:
         """PID parameters; assign new ones to change gains, limits or times in flight (bumpless in the integral)."""
-        return self._params
+        return self._books.params
 
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
-        pool = self._open_pool()
-        pool.run(SetParams(self.options.check_params(params)))
-        self._params = params
+        self._settle()
+        request = SetParams(self.options.check_params(params))
+        self._execute(request, lambda books, _: (books._replace(params=params), None))
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
 
         It is a barrier: this runner, too, goes on as if restored from it, so that both are bit-identical from here on.
         """
-        pool = self._open_pool()
+        self._settle()
         self._refuse_variation()
-        states = EnvStates.join(pool.run(TakeSnapshot()))
-        snapshot = Snapshot(self.options.about(), self._steps, self._params, states)
-        self._set_checkpoint(snapshot)
+
+        def commit(books: _Books, results: list[Any]) -> tuple[_Books, Snapshot]:
+            snapshot = Snapshot(self.options.about(), books.steps, books.params, EnvStates.join(results))
+            self._pool.start_replay_from(Restore(snapshot))
+            return books._replace(steps_since_checkpoint=0), snapshot
+
+        snapshot: Snapshot = self._execute(TakeSnapshot(), commit)
         return snapshot
 
     def restore(self, snapshot: Snapshot) -> Observation:
@@ -323,19 +348,35 @@ class Runner:
         InvalidArgumentError
             It is of another robot, number of envs, timestep, control, ...
         """
-        pool = self._open_pool()
+        self._settle()
         self._refuse_variation()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
         snapshot.check(self.options.about())
         self.options.check_params(snapshot.params)
-        sizes = [size for part in pool.run(ReadContentSizes()) for size in part]
+        sizes = [size for part in self._execute(ReadContentSizes(), _read) for size in part]
         controller = initial_state(self.options, snapshot.params)
         snapshot.states.check(self.num_envs, self.robot.dof, controller, self.options.has_stiction, sizes)
-        pool.run(Restore(snapshot))
-        self._steps, self._params = snapshot.steps, snapshot.params
-        self._faults.restore(snapshot.states.containment["step"])
-        self._set_checkpoint(snapshot)
-        return self.observe()
+
+        def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
+            self._pool.start_replay_from(Restore(snapshot))
+            books = books._replace(
+                params=snapshot.params,
+                steps=snapshot.steps,
+                steps_since_checkpoint=0,
+                faults=books.faults.restored(snapshot.states.containment["step"]),
+            )
+            return books, _copy(self._pool.present)
+
+        observation: Observation = self._execute(Restore(snapshot), commit)
+        return observation
+
+    def settle(self) -> None:
+        """Complete a command whose call was interrupted (Ctrl-C), as every other method does first.
+
+        A closed runner passes on to the recorder what was completed before.
+        """
+        if self._ledger is not None:
+            self._ledger.settle(self._record)
 
     # -- properties ------------------------------------------------------------------------------------------------
 
@@ -348,7 +389,7 @@ class Runner:
             control=self.options.control_name,
             compensate=self.options.compensate,
             physics=str(self.options.physics),
-            params=self._params,
+            params=self.params,
             start=self.observe().qpos,
             versions=self._versions,
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
@@ -362,7 +403,7 @@ class Runner:
     @property
     def faults(self) -> deque[Fault]:
         """Envs that failed, latest last: the last ten thousand."""
-        return self._faults.faults
+        return self._books.faults.faults
 
     @property
     def backend(self) -> str:
@@ -372,28 +413,33 @@ class Runner:
     @property
     def time(self) -> float:
         """Simulated time since the start [s]."""
-        return self._steps * self.timestep
+        return self._books.steps * self.timestep
+
+    @property
+    def work_seconds(self) -> NDArray[np.float64]:
+        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks of one request."""
+        return self._books.work_seconds
 
     @property
     def recoveries(self) -> int:
         """Number of lost workers that were replaced."""
-        return 0 if self._pool is None else self._pool.recoveries
+        return 0 if self._ledger is None else self._pool.recoveries
 
     @property
     def pids(self) -> tuple[int, ...]:
         """Process ids of the workers."""
-        workers = [] if self._pool is None else self._pool.workers
+        workers = [] if self._ledger is None else self._pool.workers
         return tuple(worker.pid for worker in workers if worker.pid is not None)
 
     def close(self) -> None:
-        """End the workers and free the scenes. May be called again."""
-        if self._pool is not None:
-            self._pool.close()
+        """End the workers and free the scenes. May be called again, as after an interrupt."""
+        if self._ledger is not None:
+            self._ledger.close()
 
     @property
     def closed(self) -> bool:
         """True after :meth:`close`, or after a worker was lost for good."""
-        return self._pool is None or self._pool.closed
+        return self._ledger is None or self._pool.closed
 
     def __enter__(self) -> Runner:
         return self
@@ -402,32 +448,76 @@ class Runner:
         self.close()
 
     def __del__(self) -> None:
-        if getattr(self, "_pool", None) is not None:
+        if getattr(self, "_ledger", None) is not None:
             self.close()
 
     # -- inside --------------------------------------------------------------------------------------------------
 
-    def _run(self, pool: WorkerPool, command: Command, substeps: int) -> None:
+    def _execute(self, request: Request, commit: Commit[_Books], stacklevel: int = 3) -> Any:
+        """Execute a command, then warn of what it brought; return its result."""
+        assert self._ledger is not None
+        result = self._ledger.execute(request, commit, self._record)
+        if self._pool.recovery is not None:
+            message, self._pool.recovery = self._pool.recovery, None
+            warnings.warn(message, RecoveryWarning, stacklevel=stacklevel)
+        faults = self._ledger.books.faults.faults
+        if faults and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"{faults[0]}; see runner.faults for more, of which there is no further warning",
+                FaultWarning,
+                stacklevel=stacklevel,
+            )
+        return result
+
+    def _run(self, command: Command, substeps: int) -> None:
         """Run ticks under ``command`` (ticks, envs, dof)."""
-        every = self.options.checkpoint_steps
-        if every is not None and self._steps_since_checkpoint >= every:
+        every, pool, ledger = self.options.checkpoint_steps, self._pool, self._ledger
+        assert ledger is not None
+        if every is not None and ledger.books.steps_since_checkpoint >= every:
             self.snapshot()
         ticks = len(command.setpoint)
-        before, self._steps = self._steps, self._steps + ticks * substeps
-        self._steps_since_checkpoint += ticks * substeps
-        self.work_seconds = np.array(pool.run(Run.under(command, substeps))) / ticks
-        for done, arrays in enumerate(pool.ticks[:ticks], start=1):
-            self._faults.note(arrays)
-            if self.recorder is not None:
-                time = (before + done * substeps) * self.timestep
-                self.recorder.append(time, command.setpoint[done - 1], _copy(arrays))
+        request = Run.under(command, substeps)
 
-    def _max_ticks(self, pool: WorkerPool) -> int:
+        def commit(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
+            faults, unrecorded = books.faults, books.unrecorded
+            for done, arrays in enumerate(pool.ticks[:ticks], start=1):
+                faults = faults.noting(arrays)
+                if self.recorder is not None:
+                    time = (books.steps + done * substeps) * self.timestep
+                    unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
+            steps = ticks * substeps
+            books = _Books(
+                books.params,
+                faults,
+                books.steps + steps,
+                books.steps_since_checkpoint + steps,
+                np.array(seconds) / ticks,
+                unrecorded,
+            )
+            return books, None
+
+        self._execute(request, commit, stacklevel=4)
+
+    def _record(self) -> None:
+        """Pass on the ticks that are not recorded yet."""
+        ledger = self._ledger
+        assert ledger is not None
+        while ticks := ledger.books.unrecorded:
+            try:
+                if self.recorder is not None:
+                    self.recorder.append(*ticks[0])
+            except BatchPIDError:  # the recorder cannot record any more
+                ledger.books = ledger.books._replace(unrecorded=())
+                raise
+            ledger.books = ledger.books._replace(unrecorded=ticks[1:])
+
+    def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
-        most, every = len(pool.ticks), self.options.checkpoint_steps
+        most, every = len(self._pool.ticks), self.options.checkpoint_steps
         if every is None:
             return most
-        left = every - self._steps_since_checkpoint % every
+        left = every - self._settle().steps_since_checkpoint % every
         return min(most, -(-left // self.substeps))
 
     def _refuse_variation(self) -> None:
@@ -436,15 +526,22 @@ class Runner:
                 "variation", "is not part of snapshots", remedy="make the runner without variation="
             )
 
-    def _set_checkpoint(self, snapshot: Snapshot) -> None:
-        self._steps_since_checkpoint = 0
-        self._open_pool().start_replay_from(Restore(snapshot))
-
-    def _open_pool(self) -> WorkerPool:
-        if self._pool is None or self.closed:
+    def _settle(self) -> _Books:
+        """Complete an interrupted command; return the books."""
+        if self._ledger is None or self._pool.closed:
             raise ClosedError("this Runner is closed; make a new one")
-        self._pool.settle()
-        return self._pool
+        ledger = self._ledger
+        if not ledger.is_settled or ledger.books.unrecorded:
+            ledger.settle(self._record)
+        return ledger.books
+
+    @property
+    def _books(self) -> _Books:
+        """State after the last command; that of the last completed one during a call and after the end."""
+        assert self._ledger is not None
+        if not (self._ledger.is_settled or self._ledger.in_use or self._pool.closed):
+            self._ledger.settle(self._record)
+        return self._ledger.books
 
     def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
         """Return an argument as an array of ``shape``, or else (envs, dof), checked."""
@@ -468,3 +565,8 @@ class Runner:
 
 def _copy(arrays: Arrays) -> Observation:
     return Observation._make(map(methodcaller("copy"), arrays.observation))
+
+
+def _read(books: _Books, results: list[Any]) -> tuple[_Books, list[Any]]:
+    """Commit of a command that changes nothing."""
+    return books, results

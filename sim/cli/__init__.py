@@ -1,27 +1,33 @@
 """The command line: each command is a frozen dataclass whose fields are its flags.
 
 To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. Its ``run()`` returns the exit
-status (None: 0) and imports what loads SAPIEN, Matplotlib or JAX, so that ``--help`` answers at once.
+status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
+parsed, so that ``--help`` answers at once, and before ``run()``: Ctrl-C ends the program at once until then, because
+some packages suppress a KeyboardInterrupt while they are imported.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import tyro
 
 from batchpid.errors import BatchPIDError
+from batchpid.startup import exit_at_once
 from batchpid.versions import package_versions
 from sim.cli.bench import BenchCommand
 from sim.cli.compare import CompareCommand
 from sim.cli.demo import DemoCommand
 from sim.cli.inspect import InspectCommand
 from sim.cli.plot import PlotCommand
+from sim.cli.progress import close_bars
 from sim.cli.render import RenderCommand
 from sim.cli.rollout import RolloutCommand
 from sim.cli.survey import SurveyCommand
@@ -45,29 +51,47 @@ COMMANDS: dict[str, type[Any]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
 
-    0: success. 2: bad input. 130: Ctrl-C. 141: the reader of stdout closed it, as in ``| head``.
+    0: success. 2: bad input, or a file that cannot be written. 130: Ctrl-C. 141: the reader of stdout closed it, as in
+    ``| head``. All but 0 come with one line on stderr, 141 with none.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    message = None
     try:
-        if arguments == ["--version"]:
-            print(package_versions(["batchpid"]).get("batchpid", "not installed: running from its source tree"))
-            return 0
-        with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
-            status = parse(arguments).run()
-            sys.stdout.flush()
+        status = _run(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
     except BatchPIDError as error:
-        return _fail(str(error))
+        status, message = 2, str(error)
     except KeyboardInterrupt:
-        return _fail("interrupted", 128 + signal.SIGINT)
+        status, message = 128 + signal.SIGINT, "interrupted"
     except BrokenPipeError:
-        # Python flushes stdout once more at exit, which must not fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
+        status = 128 + signal.SIGPIPE
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}")
-    return status or 0
+        status, message = 2, f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
+    if message is not None:
+        _complain(message)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # Python flushes it once more at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return status
+
+
+def _run(arguments: list[str]) -> int:
+    """Run one command and return its exit status, or raise its error."""
+    if arguments == ["--version"]:
+        print(package_versions(["batchpid"]).get("batchpid", "not installed: running from its source tree"))
+        return 0
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            command = parse(arguments)
+        except SystemExit as end:  # after --help, or a message about unknown flags
+            return int(end.code or 0)
+        for name in command.imports:
+            importlib.import_module(name)
+        if signal.getsignal(signal.SIGINT) is exit_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return command.run() or 0
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -87,10 +111,13 @@ def parse(arguments: Sequence[str]) -> Any:
     return app.cli(prog="batchpid", description=about, args=arguments, config=options)
 
 
-def _fail(message: str, status: int = 2) -> int:
-    print(f"batchpid: {message}", file=sys.stderr)
-    return status
+def _complain(message: str) -> None:
+    """Print ``message`` as one line on stderr, if that can be written."""
+    with suppress(OSError):
+        close_bars()
+        print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    print(f"batchpid: warning: {message}", file=sys.stderr)
+    with suppress(OSError):
+        print(f"batchpid: warning: {message}", file=sys.stderr)

@@ -17,6 +17,7 @@ from batchpid.validate import integer
 from batchpid.versions import package_versions
 from sim import Robot
 from sim.cli import flags
+from sim.cli.progress import bar
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,14 @@ class BenchCommand:
     out: flags.OptionalPath = None
     """Figures to write, with the machine and the versions: .json."""
 
+    imports = ("sim.benchmark.benchmark",)
+
     def run(self) -> None:
         """Run the command."""
         from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
         from sim.benchmark.peers import PEERS, installed_peers
         from sim.benchmark.workload import Workload
         from sim.cli.report import table
-        from sim.cli.run import bar
         from sim.engine.native import status as native_status
 
         out = flags.output_path("out", self.out, (".json",))
@@ -102,6 +104,7 @@ class BenchCommand:
                 "cases": cases,
                 "microseconds_per_env_step": phases,
             }
+            out.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(out, json.dumps(figures, indent=2) + "\n")
             print(f"\nwritten: {out}")
 

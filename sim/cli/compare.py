@@ -30,6 +30,8 @@ class CompareCommand:
     picture: flags.OptionalPath = None
     """First two sets on the first move, to draw: .png or .svg."""
 
+    imports = ("sim.plots", "sim.runner")
+
     def run(self) -> None:
         """Run the command."""
         from sim import plots

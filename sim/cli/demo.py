@@ -34,6 +34,8 @@ class DemoCommand:
     viewer: flags.Switch = False
     """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
 
+    imports = ("sim.plots", "sim.runner")
+
     def run(self) -> None:
         """Run the command."""
         from sim import Runner, plots

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.files import try_writing
 from batchpid.validate import file_path
 
 P = TypeVar("P", bound=Path | None)
@@ -66,19 +66,24 @@ Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less w
 Friction = Annotated[float, _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")]
 
 
-def output_path(argument: str, path: P, suffixes: Collection[str]) -> P:
-    """Return ``path`` if a file can be written there, and make its folder; None is returned as None.
+def output_path(argument: str, path: P, suffixes: Collection[str], source: Path | None = None) -> P:
+    """Return ``path`` after a trial whether a file can be written there; None is returned as None.
+
+    The run that follows may take hours, so nothing is left for its end that can be known before. The folder of
+    ``path`` is made when the file is written, and nothing before.
 
     Raises
     ------
     InvalidArgumentError
-        Its suffix is not one of ``suffixes``, it is a folder, or its folder cannot be written to.
-    OSError
-        Its folder cannot be made.
+        Its suffix is not one of ``suffixes``, it cannot be written, or it is the file ``source`` that is read.
     """
     if path is not None:
         file_path(argument, path, suffixes)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-            raise InvalidArgumentError(argument, "cannot be written", value=str(path), remedy="choose another file")
+        problem = "is the file to read" if source is not None and path.resolve() == source.resolve() else None
+        try:
+            try_writing(path)
+        except OSError as error:
+            problem = f"cannot be written: {error.strerror}"
+        if problem is not None:
+            raise InvalidArgumentError(argument, problem, value=str(path), remedy="choose another file")
     return path

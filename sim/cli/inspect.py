@@ -28,6 +28,8 @@ class InspectCommand:
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
+    imports = ("sim.engine.dynamics",)
+
     def run(self) -> int:
         """Run the command and return its exit status."""
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)

@@ -34,13 +34,17 @@ class PlotCommand:
     picture: flags.OptionalPath = None
     """Picture to draw: .png or .svg. Default: a .png named as the recording."""
 
+    imports = ("sim.plots",)
+
     def run(self) -> None:
         """Run the command."""
         from sim import plots
 
         every = integer("every", self.every, 1, 10**9)
+        if not self.recording.is_file():  # before a picture is named after it
+            read_recording(self.recording)
         named_alike = self.recording.parent / f"{self.recording.name.partition('.')[0]}.png"
-        picture = flags.output_path("picture", self.picture or named_alike, plots.FORMATS)
+        picture = flags.output_path("picture", self.picture or named_alike, plots.FORMATS, source=self.recording)
         rollout = _read(self.recording, every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)

@@ -9,6 +9,7 @@ import tyro
 
 from batchpid.validate import integer
 from sim.cli import flags
+from sim.cli.progress import bar
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,15 @@ class RenderCommand:
     out: Path = Path("out/film.mp4")
     """Film to write: .mp4 or .gif."""
 
+    imports = ("sim.view.film",)
+
     def run(self) -> None:
         """Run the command."""
-        from sim.cli.run import bar, read_run
+        from sim.cli.run import read_run
         from sim.view.film import FORMATS, write_film
         from sim.view.layout import MAX_ROBOTS
 
-        out = flags.output_path("out", self.out, FORMATS)
+        out = flags.output_path("out", self.out, FORMATS, source=self.recording)
         rollout, robot = read_run(self.recording, self.robot, self.missing_meshes)
         rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")

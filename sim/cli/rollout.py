@@ -47,6 +47,8 @@ class RolloutCommand:
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
 
+    imports = ("sim.plots", "sim.runner")
+
     def run(self) -> None:
         """Run the command."""
         from sim import Runner, plots
@@ -72,13 +74,13 @@ class RolloutCommand:
             compensate=self.compensate,
             physics=self.physics,
         ) as runner:
-            streamed = out is not None and out.suffix != ".npz"
+            streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():
                 rollout, report = hold_setpoint(runner, start, setpoint, seconds)
+        if out is not None and not streamed:
+            write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)
-        if out:
-            if not streamed:
-                write_recording(rollout, out, seed=self.seed, overwrite=True)
+        if out is not None:
             print(f"written: {out}")
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer, number
 from sim import Robot, Rollout, Runner, read_recording
+from sim.cli.progress import bar
 from sim.cli.report import run_report
 from sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from sim.tuning.gain_sets import GainSet
 from sim.tuning.moves import Moves, random_moves, tutorial_move
 from sim.tuning.randomization import draw_variation
-
-
-def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
-    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options`` go to tqdm."""
-    # A log file keeps every state of the bar, so it gets few.
-    options |= {"delay": 1.0, "mininterval": 0.1 if sys.stderr.isatty() else 5.0, "leave": False, "dynamic_ncols": True}
-    return lambda items: tqdm(items, desc=label, **options)
 
 
 def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArray[np.float64]:

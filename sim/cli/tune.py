@@ -11,6 +11,7 @@ import tyro
 from batchpid import save_params
 from sim import Robot
 from sim.cli import flags
+from sim.cli.progress import bar
 from sim.tuning.gain_sets import GainSet
 from sim.tuning.weights import Weights
 
@@ -50,11 +51,13 @@ class TuneCommand:
     picture: flags.OptionalPath = None
     """Before and after on the first move, to draw: .png or .svg. Default: named as the params file."""
 
+    imports = ("sim.plots", "sim.tuning.search")
+
     def run(self) -> None:
         """Run the command."""
         from sim import plots
         from sim.cli.report import draw_first_move, evaluation_table
-        from sim.cli.run import bar, evaluate_sets
+        from sim.cli.run import evaluate_sets
         from sim.tuning.evaluation import arm_joints
         from sim.tuning.search import tune
 
@@ -63,6 +66,7 @@ class TuneCommand:
         out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
         picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)
         history = out.with_suffix(".search.json")
+        out.parent.mkdir(parents=True, exist_ok=True)
         if not self.resume:
             history.unlink(missing_ok=True)
         variation = {"payload": self.payload, "friction": self.friction} if self.variation else None

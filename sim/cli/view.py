@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -42,22 +42,28 @@ class ViewCommand:
     """Recorded run to show: .npz or .h5."""
     fps: flags.Fps = 30.0
     host: str = "127.0.0.1"
-    """Address to listen on. Everyone who reaches it can move the sliders."""
+    """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""
     port: int = 8080
     """Port, or the next free one if it is taken."""
     time_limit: flags.TimeLimit = None
 
+    imports = ("sim.view",)
+
     def run(self) -> None:
         """Run the command."""
         from sim.view import View
+        from sim.view.address import resolve
 
         port = integer("port", self.port, 1, 65535)
         number("fps", self.fps, 1.0, 120.0, "frames per second")
+        resolve(self.host)  # before the robots are loaded
         source = self._live() if self.play is None else self._recorded(self.play)
-        with View(source, host=self.host, port=port) as view:
+        with closing(source), View(source, host=self.host, port=port) as view:
             if self.host not in LOOPBACK:
-                warning = f"listening on {self.host}: everyone who reaches it can move the sliders"
+                warning = f"listening on {self.host}, unencrypted: everyone who sees the address can move the robots"
                 print(f"batchpid: warning: {warning}", file=sys.stderr)
+            if view.port != port:
+                print(f"port {port} is in use; the page is at {view.port}")
             print(f"Open in a browser: {view.url}  (Ctrl-C ends it)", flush=True)
             with suppress(KeyboardInterrupt):
                 view.run(self.time_limit)

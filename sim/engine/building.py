@@ -11,6 +11,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+import sapien.wrapper.urdf_loader  # noqa: F401 - its packages suppress a Ctrl-C while they are imported: not amid a run
 from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder

@@ -94,7 +94,7 @@ class Control:
 
     def read(self) -> dict[str, NDArray[Any]]:
         """Return the state of the law by name, for :meth:`write`."""
-        return {name: leaf for name, leaf in self._state._asdict().items() if leaf is not None}
+        return self._state.leaves()
 
     def write(self, state: dict[str, NDArray[Any]], saturated: NDArray[np.bool_]) -> None:
         """Set the state of the law, and :attr:`saturated`."""

@@ -86,8 +86,7 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDA
     """Return the state of the control of all envs at their start, by name."""
     if not isinstance(options.control, str):
         return flatten(options.control.init(options.robot, options.num_envs))
-    state = bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32))
-    return {name: leaf for name, leaf in state._asdict().items() if leaf is not None}
+    return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
 
 
 def flatten(state: Any, name: str = "") -> dict[str, NDArray[Any]]:

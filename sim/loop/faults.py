@@ -6,8 +6,8 @@ put that env into a state from which it can be simulated.
 
 from __future__ import annotations
 
+import copy
 import math
-import warnings
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -51,40 +51,38 @@ class FaultWarning(UserWarning):
 
 
 class FaultLog:
-    """Faults of a runner's envs, the last 10 000; the first one is also a warning."""
+    """Faults of a runner's envs, the last 10 000. It is not changed: methods return a log that is."""
 
     def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
         self.faults: deque[Fault] = deque(maxlen=10_000)
+        """Latest last."""
         self._joint_names, self._timestep, self._action = joint_names, timestep, action
         self._steps = np.full(num_envs, -1)
-        self._warned = False
 
-    def forget(self, mask: Bool) -> None:
-        """Forget the last fault of the envs of ``mask`` (envs,), which were reset."""
-        self._steps[mask] = -1
+    def without(self, mask: Bool) -> FaultLog:
+        """Return a log that knows no last fault of the envs of ``mask`` (envs,), which were reset."""
+        return self.restored(np.where(mask, -1, self._steps))
 
-    def restore(self, steps: NDArray[Any]) -> None:
-        """Set the steps of the envs' last faults (envs,), which are known."""
-        self._steps = steps.copy()
+    def restored(self, steps: NDArray[Any]) -> FaultLog:
+        """Return a log that knows the steps of the envs' last faults (envs,)."""
+        log = copy.copy(self)
+        log._steps = steps.copy()
+        return log
 
-    def note(self, arrays: Arrays, stacklevel: int = 4) -> None:
-        """Append the faults of ``arrays`` that are not known yet."""
-        fault = arrays.fault
+    def noting(self, arrays: Arrays) -> FaultLog:
+        """Return a log with the faults of ``arrays`` that this one does not know."""
         if arrays.observation.ok.all():
-            return
-        steps = fault.step.copy()
-        for env in np.flatnonzero((steps >= 0) & (steps != self._steps)).tolist():
-            step = int(steps[env])
+            return self
+        fault = arrays.fault
+        log = self.restored(fault.step)
+        new = np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist()
+        if new:
+            log.faults = self.faults.copy()
+        for env in new:
+            step = int(log._steps[env])
             joint, cause = self._joint_names[fault.joint[env]], CAUSES[fault.cause[env]]
-            self.faults.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
-        self._steps = steps
-        if self.faults and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"{self.faults[0]}; see runner.faults for more, of which there is no further warning",
-                FaultWarning,
-                stacklevel=stacklevel,
-            )
+            log.faults.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
+        return log
 
 
 class FaultContainment:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,16 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.choices import CHOICE_TYPES
+from batchpid.choices import CHOICES, Everywhere
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
 from batchpid.friction import FrictionState
-from batchpid.validate import file_path
+from batchpid.npz import read_npz
+from batchpid.validate import file_path, integer, names
 from sim.loop.faults import CAUSES, FaultContainment
 
 _FORMAT = 4
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, EOFError)
-"""Errors that np.load and the steps after it raise for files that are no snapshot."""
+_CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
+_CHOICES["conditional"] = (Everywhere(),)
+"""Params that hold no numbers, by name, with their values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +146,7 @@ class Snapshot:
             if self.about.get(key) != ours:
                 raise InvalidArgumentError(
                     "snapshot",
-                    f"is of a runner with {key} {self.about.get(key)!r}, not {ours!r}",
+                    f"is of a runner with {key} {reprlib.repr(self.about.get(key))}, not {ours!r}",
                     remedy="restore it in a runner made with the same options",
                 )
 
@@ -153,7 +155,13 @@ class Snapshot:
         return replace(self, params=self.params.for_envs(envs), states=self.states.for_envs(envs))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an .npz file, as a whole or not at all: an older file stays until this one is complete."""
+        """Write an .npz file, as a whole or not at all: an older file stays until this one is complete.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
         leaves = {name: leaf for name, leaf in self.params._asdict().items() if leaf is not None}
         choices = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
         arrays = {name: leaf for name, leaf in leaves.items() if name not in choices}
@@ -166,34 +174,51 @@ class Snapshot:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Snapshot:
-        """Read a file of :meth:`save`. Nothing in it is executed.
+        """Read a file of :meth:`save`. Nothing in it is executed, and it takes memory in proportion to its size.
 
         Raises
         ------
         InvalidArgumentError
-            The file is missing, or no snapshot of this version.
+            The file is missing, damaged, or no snapshot of this version.
         """
         path = file_path("path", path)
         try:
-            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                tables = {name: file[name] for name in file.files}
-            head = json.loads(str(tables.pop("head")))
-            if head["format"] != _FORMAT:
-                raise ValueError(f"format {head['format']}, not {_FORMAT}")
-            about, steps, choices = head["about"], head["steps"], head["markers"]
-            if not isinstance(about, dict) or not isinstance(steps, int) or not 0 <= steps < 2**62:
-                raise ValueError("its options or steps are missing")
-            known = {kind.__name__: kind for kind in CHOICE_TYPES}
-            groups = _nest(tables)
-            params = bp.PIDParams(**groups.pop("params"), **{name: known[kind]() for name, kind in choices.items()})
-            return cls(about, steps, params, EnvStates(**groups))
-        except _UNREADABLE as error:
+            if not path.is_file():
+                raise ValueError("there is no such file")
+            return cls._read(read_npz(path, max_bytes=path.stat().st_size))
+        except Exception as error:  # a damaged file can make the libraries raise anything
             raise InvalidArgumentError(
                 "path",
-                f"cannot be read as a snapshot: {error}",
+                f"cannot be read as a snapshot: {error or type(error).__name__}",
                 value=str(path),
                 remedy="pass a file that Snapshot.save wrote",
             ) from error
+
+    @classmethod
+    def _read(cls, tables: dict[str, NDArray[Any]]) -> Snapshot:
+        """Return the snapshot in the arrays of a file, if they agree with each other."""
+        head = json.loads(str(tables.pop("head")))
+        if head["format"] != _FORMAT:
+            raise ValueError(f"format {head['format']}, not {_FORMAT}")
+        about, steps, choices = head["about"], head["steps"], head["markers"]
+        num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
+        dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
+        groups = _nest(tables)
+        kinds = {name: {type(one).__name__: one for one in _CHOICES[name]} for name in choices}
+        chosen = {name: kinds[name][kind] for name, kind in choices.items()}
+        params, states = bp.PIDParams(**groups.pop("params"), **chosen), EnvStates(**groups)
+        params.options()  # raises for a choice that is none
+        params.check(num_envs)
+        # The rows first: what the next check allocates is of the size of the file then.
+        if states.qpos.shape != (num_envs, dof) or params.num_joints != dof or params.dtype.kind != "f":
+            raise ValueError(f"its qpos {states.qpos.shape} or params do not fit {num_envs} envs of {dof} joints")
+        controller = states.controller
+        if about["control"] in ("pid", "drive", "effort"):
+            controller = bp.init(params, np.zeros((num_envs, dof), np.float32)).leaves()
+        if any(leaf.shape[:1] != (num_envs,) for leaf in controller.values()):
+            raise ValueError(f"the state of its controller is not of {num_envs} envs")
+        states.check(num_envs, dof, controller, bool(states.friction), ())
+        return cls(about, steps, params, states)
 
     def __repr__(self) -> str:
         about = self.about

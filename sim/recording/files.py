@@ -69,7 +69,7 @@ def write_recording(
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
     path = check_path(path, (".npz", *HDF5), overwrite=overwrite)
     info = rollout.info if seed is None else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
-    h5py = None if path.suffix == ".npz" else load_h5py()
+    h5py = None if path.suffix.lower() == ".npz" else load_h5py()
 
     def write(file: Any) -> None:
         if h5py is None:
@@ -85,7 +85,7 @@ def write_recording(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, write)
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error}") from error
+        raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,11 @@ from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, arrange_robots
 from sim.view.playback import rows_at
 
 FORMATS = (".mp4", ".gif")
+_ENCODERS = {
+    ".mp4": ("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"),  # which halves both sides for colours
+    ".gif": ("-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse", "-loop", "0"),
+}
+"""ffmpeg's options for each format."""
 _CLOSER = 0.72
 """Distance of the camera as a share of that in the browser, where panels cover the sides of the picture."""
 
@@ -48,7 +55,7 @@ _REMEDY = (
 
 
 class RenderError(BatchPIDError, RuntimeError):
-    """SAPIEN cannot render on this machine; the message gives the cause and the remedy."""
+    """SAPIEN cannot render on this machine, or a film cannot be written; the message gives the cause."""
 
 
 @cache
@@ -101,34 +108,84 @@ def write_film(
     InvalidArgumentError, RobotNotFoundError
         An argument is out of range, or the robot of the run is not bundled.
     MissingDependencyError
-        The packages imageio and imageio-ffmpeg are missing.
+        The package imageio-ffmpeg is missing.
     RenderError
-        SAPIEN cannot render on this machine.
+        SAPIEN cannot render on this machine, or the film cannot be written.
     """
     path = file_path("out", out, FORMATS)
     rate = number("fps", fps, 1.0, 120.0, "frames per second")
     size = integer("width", width, 16, 8192), integer("height", height, 16, 8192)
     integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401 - imageio finds it for mp4
-    except ImportError:
-        raise MissingDependencyError("imageio-ffmpeg", "a film", "render") from None
+    ffmpeg = _ffmpeg()
     check_renderer()
     scene = _RenderScene(rollout, robot)
     camera = scene.scene.add_camera("film", *size, FIELD_OF_VIEW, 0.05, 100.0)
     camera.entity.set_pose(scene.camera_pose)
     rows = film_rows(rollout, rate).tolist()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    options: dict[str, Any] = {"macro_block_size": 2} if path.suffix.lower() == ".mp4" else {"loop": 0}
-    writer: Any
-    with replacing(path) as temporary, imageio.get_writer(temporary, fps=rate, **options) as writer:
+
+    def pictures() -> Iterable[NDArray[np.uint8]]:
         for row in rows if progress is None else progress(rows):
             scene.place(rollout.qpos[row])
             camera.take_picture()
             picture = camera.get_picture("Color")[..., :3]
-            writer.append_data((255 * np.clip(picture, 0.0, 1.0)).astype(np.uint8))
+            yield (255 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            encode(pictures(), temporary, ffmpeg, size, rate)
+    except OSError as error:
+        raise RenderError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path
+
+
+def encode(pictures: Iterable[NDArray[np.uint8]], path: Path, ffmpeg: str, size: tuple[int, int], fps: float) -> None:
+    """Write RGB ``pictures`` (height, width, 3) of ``size`` (width, height) to a film, by the program ``ffmpeg``.
+
+    Raises
+    ------
+    OSError
+        ffmpeg failed; the error has its first message.
+    """
+    source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", f"{fps}", "-i", "-")
+    command = [ffmpeg, "-v", "error", *source, *_ENCODERS[path.suffix.lower()], "-y", f"file:{path}"]
+    with (
+        open(os.memfd_create("batchpid-ffmpeg"), "w+b") as messages,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages) as process,
+    ):
+        assert process.stdin is not None
+        try:
+            for picture in pictures:
+                try:
+                    process.stdin.write(np.ascontiguousarray(picture).data)
+                except BrokenPipeError:  # ffmpeg has ended, with a message
+                    break
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+            process.wait()
+        except BaseException:
+            process.kill()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+            raise
+        if process.returncode:
+            messages.seek(0)
+            first = messages.readline().decode(errors="replace").strip()
+            raise OSError(first.partition("] ")[2] or first or f"ffmpeg ended with status {process.returncode}")
+
+
+def _ffmpeg() -> str:
+    """Return the path of the program ffmpeg."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise MissingDependencyError("imageio-ffmpeg", "a film", "render") from None
+    try:
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise RenderError(
+            f"there is no program ffmpeg for a film ({error}); install it, or set IMAGEIO_FFMPEG_EXE"
+        ) from None
 
 
 def film_rows(rollout: Rollout, fps: float) -> NDArray[np.int64]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice
+from batchpid.validate import at_least, broadcast, choice, integer
 from sim.options import ControlMode, RunnerOptions, default_params
 from sim.robot.robot import Robot
 
@@ -51,9 +51,10 @@ class GroupGains:
         """Use the params of a named set on every joint."""
         self.params = self.sets[choice("name", name, self.sets)]
 
-    def set(self, gain: str, joint: int, value: float) -> None:
-        """Set one of :data:`GAINS` of a joint."""
-        values = self.values
+    def set(self, gain: str, joint: int, value: ArrayLike) -> None:
+        """Set one of :data:`GAINS` of a joint, a number >= 0."""
+        values, joint = self.values, integer("joint", joint, 0, self._robot.dof - 1)
+        value = at_least(gain, broadcast(gain, value, (), "give one number"), 0.0, infinite=True)
         if choice("gain", gain, GAINS) == "effort_limit":
             values["effort_min"][joint], values["effort_max"][joint] = -value, value
         else:

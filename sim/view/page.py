@@ -7,7 +7,8 @@ import threading
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, redirect_stdout
+from contextlib import AbstractContextManager, redirect_stdout, suppress
+from functools import partial
 from typing import Any
 
 from batchpid.errors import MissingDependencyError
@@ -21,13 +22,19 @@ CHARTS_EVERY = 5
 """Frames between two updates of the charts."""
 STATUS_EVERY = 15
 """Frames between two updates of the status."""
+NOTICE_SECONDS = 1.0
+"""Shortest time between two notices of what was refused [s]."""
 
 
 class View(AbstractContextManager["View"]):
     """Page that shows ``data``, served at ``host`` and ``port``, or at the next free port, until :meth:`close`.
 
+    Only who knows :attr:`url` can open it. What a page sends is checked; what is refused is shown on the pages.
+
     Raises
     ------
+    InvalidArgumentError
+        The host is no address of this machine, or no port is free.
     MissingDependencyError
         The package ``viser`` is missing.
     """
@@ -35,19 +42,26 @@ class View(AbstractContextManager["View"]):
     def __init__(self, data: ViewData, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         try:
             import viser
+
+            from sim.view.gate import Gate  # needs what viser needs
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
+        self._problems: deque[str] = deque(maxlen=1)
+        self._gate = gate = Gate(host, port, self._problems.append)
         with redirect_stdout(io.StringIO()):  # viser's banner
-            self._server: Any = viser.ViserServer(host=host, port=port, verbose=False, label="batchpid")
-        self.url = f"http://{'127.0.0.1' if host in ('0.0.0.0', '') else host}:{self._server.get_port()}"
-        """Address of the page."""
+            make = partial(viser.ViserServer, host=host, port=gate.port, verbose=False, label="batchpid")
+            self._server: Any = gate.start(make)
+        self.url = gate.url
+        """Address of the page, with the token that opens it."""
+        self.port = gate.port
+        """Port of the page."""
         self.rate, self.factor = 0.0, 0.0
         """Frames per second of wall time, and real-time factor."""
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
         self._scene = RobotScene(self._server, data.robot, data.groups, data.per_group)
-        self.panel = Panel(self._server, data)
+        self.panel = Panel(self._server, data, self._problems.append)
         self._scene.on_click(self.panel.select)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
@@ -57,6 +71,7 @@ class View(AbstractContextManager["View"]):
         charts.dock_left()
         charts.set_width(380)
         self._stopped = self._settled = False
+        self._noticed = 0.0
         self._shown: tuple[Any, ...] = ()
 
     def run(self, seconds: float | None = None) -> None:
@@ -72,8 +87,9 @@ class View(AbstractContextManager["View"]):
                 # The workers compute the next frame while this one is sent.
                 job = executor.submit(data.advance) if panel.frames_left > 0 else None
                 panel.frames_left = max(0, panel.frames_left - 1)
-                if self._server.get_clients():
+                if clients := self._server.get_clients():
                     self._show(frame, count)
+                    self._notify(list(clients.values()))
                 if job is not None:
                     job.result()
                 now = time.monotonic()
@@ -95,6 +111,7 @@ class View(AbstractContextManager["View"]):
         """Close the page and its data."""
         self.stop()
         self.data.close()
+        self._gate.close()
         # After a browser has connected, viser takes about 5 s to end its threads. They are daemons: do not wait.
         thread = threading.Thread(target=self._server.stop, daemon=True)
         with redirect_stdout(io.StringIO()):
@@ -103,6 +120,14 @@ class View(AbstractContextManager["View"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _notify(self, clients: list[Any]) -> None:
+        """Show the last problem on every page, at intervals: strangers must not flood them."""
+        if self._problems and time.monotonic() - self._noticed > NOTICE_SECONDS:
+            self._noticed, problem = time.monotonic(), self._problems.pop()[:300]
+            for client in clients:
+                with suppress(UserWarning):  # the page is closed by now, and warnings are errors
+                    client.add_notification("Not accepted", problem, auto_close_seconds=8.0, color="red")
 
     def _show(self, frame: Rollout, count: int) -> None:
         """Send what has changed: charts and status at intervals, and once more when the robots come to rest."""

@@ -1,20 +1,19 @@
-"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances.
-
-The page calls back from other threads; its requests are queued and carried out between two frames.
-"""
+"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances."""
 
 from __future__ import annotations
 
 import math
-import queue
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import integer
 from sim.observation import Rollout
 from sim.robot.robot import Robot
+from sim.view.controls import Control, Requests
 from sim.view.data import ViewData
 from sim.view.gains import GAINS
 from sim.view.playback import Playback
@@ -26,29 +25,31 @@ _MILLISECONDS = {"derivative_filter_time": 1e3}
 
 
 class Panel:
-    """Controls of ``data`` on a viser ``server``."""
+    """Controls of ``data`` on a viser ``server``. ``refuse`` is called with the reason for every request that fails."""
 
-    def __init__(self, server: Any, data: ViewData) -> None:
+    def __init__(self, server: Any, data: ViewData, refuse: Callable[[str], object]) -> None:
         self._gui, self._data = server.gui, data
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests = Requests(refuse)
         self.frames_left = math.inf
         """Frames to run before the next pause."""
         self._names = short_names(data.robot)
         gui = self._gui
         self._status = gui.add_markdown("starting ...")
-        self._on(gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset")), self._control_motion)
-        self._speed = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
+        motion = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
+        self._control(motion).on_change(self._control_motion)
+        self._speed = self._control(gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0))
         if isinstance(data, Playback):
-            self._time = gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0)
-            self._on(self._time, data.seek)
+            time = gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0)
+            self._time = self._control(time).on_change(data.seek)
         with gui.add_folder("Watch"):
-            self._robot = gui.add_slider("Robot", min=0, max=max(1, data.per_group - 1), step=1, initial_value=0)
-            self._robot.disabled = data.per_group == 1
+            robot = gui.add_slider("Robot", min=0, max=max(1, data.per_group - 1), step=1, initial_value=0)
+            robot.disabled = data.per_group == 1
+            self._robot = self._control(robot)
             # At first the joint that moves farthest to the target.
             settings = data.robot.settings
             first = 0 if settings is None else int(np.argmax(np.abs(settings.target - data.robot.start)))
-            self._joint = gui.add_dropdown("Joint", self._names, initial_value=self._names[first])
-            self._show_setpoint = gui.add_checkbox("Show its setpoint", True)
+            self._joint = self._control(gui.add_dropdown("Joint", self._names, initial_value=self._names[first]))
+            self._show_setpoint = self._control(gui.add_checkbox("Show its setpoint", True))
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
             adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
@@ -76,14 +77,18 @@ class Panel:
         """Requested real-time factor."""
         return float(self._speed.value)
 
-    def select(self, robot: int) -> None:
-        """Watch a robot."""
-        self._robot.value = robot % self._data.per_group
+    def select(self, robot: Any) -> None:
+        """Request to watch a robot, by its number over all groups. Safe to call from any thread."""
+        try:
+            robot = integer("robot", robot, 0, len(self._data.groups) * self._data.per_group - 1)
+        except InvalidArgumentError as error:
+            self._requests.refuse(str(error))
+        else:
+            self._requests.put(partial(self._robot.change, robot % self._data.per_group))
 
     def run_requests(self) -> None:
         """Carry out the requests of the page since the last call."""
-        while not self._requests.empty():
-            self._requests.get()()
+        self._requests.run()
 
     def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
         """Show time, real-time factor, frame rate, and the robots that diverged or saturate."""
@@ -101,14 +106,8 @@ class Panel:
         if isinstance(data, Playback):
             self._time.value = time
 
-    def _on(self, handle: Any, action: Callable[[Any], None]) -> None:
-        """Queue ``action(value)`` whenever a user, and not this program, changes a control."""
-
-        def changed(event: Any) -> None:
-            if event.client is not None:
-                self._requests.put(partial(action, handle.value))
-
-        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(changed)
+    def _control(self, handle: Any) -> Control:
+        return Control(handle, self._requests)
 
     def _control_motion(self, button: str) -> None:
         if button == "Reset":
@@ -121,13 +120,14 @@ class Panel:
     def _add_setpoints(self, live: LiveSimulation) -> None:
         gui, robot = self._gui, live.robot
         poses = {"start": robot.start} | ({} if robot.settings is None else {"target": robot.settings.target})
-        buttons = gui.add_button_group("Go to", (*poses, "random"))
-        watched_only = gui.add_checkbox("Watched robot only", False)
-        sliders: dict[int, Any] = {}
+        buttons = self._control(gui.add_button_group("Go to", (*poses, "random")))
+        watched_only = self._control(gui.add_checkbox("Watched robot only", False))
+        sliders: dict[int, Control] = {}
 
-        def update() -> None:
+        def update(*_: object) -> None:
             for index, slider in sliders.items():
-                slider.value = float(np.clip(live.setpoint[self.env, index], slider.min, slider.max))
+                value = live.setpoint[self.env, index]
+                slider.value = float(np.clip(value, slider.handle.min, slider.handle.max))
 
         def go_to(pose: str) -> None:
             if pose == "random":
@@ -139,35 +139,33 @@ class Panel:
         def move(joint: int, position: float) -> None:
             live.set_setpoint(position, joint=joint, env=self.env if watched_only.value else None)
 
-        self._on(buttons, go_to)
+        buttons.on_change(go_to)
         for index in np.flatnonzero(robot.independent).tolist():  # followers move with their leaders
             name, joint = self._names[index], robot.joints[index]
             low, high = max(joint.lower, -2 * math.pi), min(joint.upper, 2 * math.pi)
             low, high = math.ceil(1e3 * low) / 1e3, math.floor(1e3 * high) / 1e3  # fewer digits to read
             value = float(np.clip(live.setpoint[0, index], low, high))
             slider = gui.add_slider(f"{name} [{joint.unit}]", low, high, min(_slider_step(high - low), 0.01), value)
-            self._on(slider, partial(move, index))
-            sliders[index] = slider
-        self._robot.on_update(lambda _: self._requests.put(update))
+            sliders[index] = self._control(slider).on_change(partial(move, index))
+        self._robot.on_change(update)
 
     def _add_gains(self, live: LiveSimulation) -> None:
         gui = self._gui
-        group = gui.add_dropdown("Of", live.groups)
-        group.visible = len(live.groups) > 1
+        group = self._control(gui.add_dropdown("Of", live.groups))
+        group.handle.visible = len(live.groups) > 1
         description = gui.add_markdown("")
-        sliders: dict[str, Any] = {}
+        sliders: dict[str, Control] = {}
 
         def change(gain: str, number: float) -> None:
             live.gains[group.value].set(gain, self.joint, number / _MILLISECONDS.get(gain, 1.0))
 
         for gain in GAINS:
             label = "filter [ms]" if gain in _MILLISECONDS else gain.replace("_", " ")
-            sliders[gain] = gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)
-            self._on(sliders[gain], partial(change, gain))
+            sliders[gain] = self._control(gui.add_slider(label, 0.0, 1.0, 0.01, 0.0)).on_change(partial(change, gain))
         names = dict.fromkeys(name for gains in live.gains.values() for name in gains.sets)
-        buttons = gui.add_button_group("All joints to", tuple(names))
+        buttons = self._control(gui.add_button_group("All joints to", tuple(names)))
 
-        def update() -> None:
+        def update(*_: object) -> None:
             joint, gains = live.robot.joints[self.joint], live.gains[group.value]
             effort, position = joint.effort_unit, joint.unit
             units = f"kp in {effort}/{position}, ki in {effort}/({position} s), kd in {effort} s/{position}."
@@ -179,26 +177,27 @@ class Panel:
                 value, high = (
                     float(f"{_MILLISECONDS.get(gain, 1.0) * n:.4g}") for n in gains.slider_range(gain, self.joint)
                 )
-                slider.max, slider.step, slider.value = max(value, high), _slider_step(high), value
+                slider.handle.max, slider.handle.step, slider.value = max(value, high), _slider_step(high), value
 
         def apply(name: str) -> None:
             if name in live.gains[group.value].sets:
                 live.gains[group.value].apply_set(name)
                 update()
 
-        self._on(buttons, apply)
+        buttons.on_change(apply)
         for chooser in (self._joint, group):
-            chooser.on_update(lambda _: self._requests.put(update))
+            chooser.on_change(update)
         update()
 
     def _add_disturbances(self, live: LiveSimulation) -> None:
         gui, links = self._gui, live.kinematics.links
-        link = gui.add_dropdown("On link", links, initial_value=links[live.load_link])
-        self._on(link, lambda name: setattr(live, "load_link", live.kinematics.index(name)))
-        self._on(gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0), partial(setattr, live, "payload"))
-        force = gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0)
-        push = gui.add_button_group("Push along", tuple(_DIRECTIONS))
-        self._on(push, lambda name: live.push(force.value * _DIRECTIONS[name]))
+        link = self._control(gui.add_dropdown("On link", links, initial_value=links[live.load_link]))
+        link.on_change(lambda name: setattr(live, "load_link", live.kinematics.index(name)))
+        payload = self._control(gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0))
+        payload.on_change(partial(setattr, live, "payload"))
+        force = self._control(gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0))
+        push = self._control(gui.add_button_group("Push along", tuple(_DIRECTIONS)))
+        push.on_change(lambda name: live.push(force.value * _DIRECTIONS[name]))
 
 
 def short_names(robot: Robot) -> tuple[str, ...]:

@@ -73,10 +73,14 @@ class RobotScene:
                 if show_setpoint:
                     self._place(self._setpoints, self._kinematics.poses(setpoint[None]), positions[selected][None])
 
-    def on_click(self, select: Callable[[int], None]) -> None:
-        """Call ``select(robot)`` when a robot is clicked."""
+    def on_click(self, select: Callable[[Any], None]) -> None:
+        """Call ``select(robot)`` when a robot is clicked, with the number that the page sent."""
+
+        async def clicked(event: Any) -> None:
+            select(event.instance_index)
+
         for node in self._robots:
-            node.on_click(lambda event: select(int(event.instance_index)))
+            node.on_click(clicked)
 
     def _add_surface(self, path: str, surface: Surface, copies: int, **options: Any) -> Any:
         return self._server.scene.add_batched_meshes_simple(

@@ -39,7 +39,7 @@ class Channel:
         rest = memoryview(_HEAD.pack(len(message)) + message)
         while rest:
             try:
-                rest = rest[self._socket.send(rest) :]
+                rest = rest[self._socket.send(rest, socket.MSG_NOSIGNAL) :]
             except BlockingIOError:
                 self._wait(select.POLLOUT)
 

@@ -2,26 +2,27 @@
 
 Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A new worker gets the
 last checkpoint and the requests since. A checkpoint is a barrier for the other workers too (:mod:`sim.loop.snapshot`),
-so that the replayed envs are bit-identical. Each worker has a queue of requests: one can catch up while the others
-continue, and an interrupted wait (Ctrl-C) can be resumed.
+so that the replayed envs are bit-identical. Each worker has a queue of requests, so that one can catch up while the
+others continue.
+
+An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool says at every moment how
+far each worker is, and a worker with which a message was under way is replaced, so that the call can be repeated.
 """
 
 from __future__ import annotations
 
 import os
 import select
-import threading
 import time
-import warnings
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError, ClosedError, InUseError, WorkerError
+from batchpid.errors import BatchPIDError, ClosedError, WorkerError
 from sim.loop.arrays import Arrays
 from sim.options import RunnerOptions
+from sim.workers.memory import check_memory
 from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
 from sim.workers.shared_memory import SharedArrays
@@ -44,10 +45,11 @@ class _Slot:
 
     start: Start
     worker: Worker
-    queue: deque[Request] = field(default_factory=deque)
-    phase: Literal["idle", "transfer", "waiting"] = "waiting"
-    """Phase of the first request. An interrupt during the transfer of a message leaves the worker unusable."""
+    queue: list[Request] = field(default_factory=list)
+    phase: Literal["idle", "transfer", "waiting"] = "transfer"
+    """Phase of the first request. An interrupt during a transfer leaves the worker unusable."""
     result: Any = None
+    error: Exception | None = None
     losses: int = 0
     cause: str = ""
     lost_at: float = 0.0
@@ -56,25 +58,31 @@ class _Slot:
 class WorkerPool:
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    ``params`` are those that the loops start with.
+    ``params`` are those that the loops start with. The workers start with :meth:`open`.
     """
 
     def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
-        self._options = options
+        self._options, self._params = options, params
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
-        self._is_local, self._make_worker = not count, ProcessWorker if count else LocalWorker
-        slices = split_envs(options.num_envs, count, options.scenes_per_system)
-        self._cores = pinned_cores(len(slices))
+        self.is_local, self._make_worker = not count, ProcessWorker if count else LocalWorker
+        """True if the loop runs in this process."""
+        self._slices = split_envs(options.num_envs, count, options.scenes_per_system)
+        self._cores = pinned_cores(len(self._slices))
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
         self._poller = select.poll()
         self._request: Request | None = None
-        self._warning: str | None = None
-        self._closing = False
-        self._owner, self._user = os.getpid(), 0  # the process, and the thread in a call
+        self.closed = False
+        """True if the running call is to end, and no other to begin."""
+        self.error: Exception | None = None
+        """Error that a loop raised in the last request; of several, one that left its state undefined."""
+        self.recovery: str | None = None
+        """Message about the last worker that was replaced, for a warning."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
-        ticks = max(1, _MAX_STEPS // (options.substeps * max(envs.stop - envs.start for envs in slices)))
+        check_memory(options, len(self._slices), self.is_local)
+        widest = max(envs.stop - envs.start for envs in self._slices)
+        ticks = max(1, _MAX_STEPS // (options.substeps * widest))
         self._shared = SharedArrays(Arrays.layout(ticks, options.num_envs, options.robot.dof))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
@@ -82,20 +90,16 @@ class WorkerPool:
         """Input and output of each tick."""
         self.present = self.ticks[0]
         """The tick that holds the present observation."""
-        try:
-            for index, envs in enumerate(slices):
-                start = Start(index, envs, options, params.for_envs(envs))
-                self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
-                self._await_start(self._slots[-1])
-            self._finish()
-        except BaseException:
-            self.close()
-            raise
 
-    @property
-    def closed(self) -> bool:
-        """True after :meth:`close`, or after a worker was lost for good."""
-        return self._closing or not self._slots
+    def open(self) -> None:
+        """Start the workers and wait until all are ready."""
+        for index, envs in enumerate(self._slices):
+            start = Start(index, envs, self._options, self._params.for_envs(envs))
+            self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
+            self._start(self._slots[-1])
+        self._serve()
+        if self.error is not None:
+            raise self.error
 
     @property
     def workers(self) -> list[Worker]:
@@ -103,54 +107,28 @@ class WorkerPool:
         return [slot.worker for slot in self._slots]
 
     def run(self, request: Request) -> list[Any]:
-        """Let every worker execute its part of ``request``; return their results.
+        """Let every worker execute its part of ``request``; return their results, if there is no :attr:`error`.
+
+        After an interrupt, a call with the same request continues it.
 
         Raises
         ------
-        BatchPIDError
-            Raised by a loop before it changed anything.
         WorkerError
-            A loop raised another error, or a worker was lost for good; the pool is closed.
-        InUseError
-            Another call is in progress, or the pool belongs to another process.
+            A worker was lost for good.
         ClosedError
             The pool was closed meanwhile.
         """
-        return self._exclusive(lambda: self._run(request))
-
-    def _run(self, request: Request) -> list[Any]:
-        self._settle()
-        self._request = request
-        for slot in self._slots:
-            slot.queue.append(request)
-        replayed = request.is_replayed and self._options.recover
-        if replayed:
-            self._replay.append(request.copy())
-        try:
-            self._finish()
-        except Exception as error:
-            if not _left_unchanged(error):
-                self.close()
-            elif replayed:
-                self._replay.pop()
-            raise
-        if self._warning is not None:
-            message, self._warning = self._warning, None
-            warnings.warn(message, RecoveryWarning, stacklevel=4)
+        if self._request is not request:
+            for slot in self._slots:
+                slot.queue, slot.error = [request], None
+            self._request = request  # nothing is sent before
+        self._serve()
+        if self.error is None:
+            if request.is_replayed and self._options.recover and not self._replays(request):
+                self._replay.append(request)
+            if request.observed_tick is not None:
+                self.present = self.ticks[request.observed_tick]
         return [slot.result for slot in self._slots]
-
-    def settle(self) -> None:
-        """Finish a request whose wait was interrupted; raises as :meth:`run` does."""
-        if self._user or os.getpid() != self._owner or any(slot.queue for slot in self._slots):
-            self._exclusive(self._settle)
-
-    def _settle(self) -> None:
-        if any(slot.queue for slot in self._slots):
-            try:
-                self._finish()
-            except Exception:
-                self.close()
-                raise
 
     def start_replay_from(self, request: Request) -> None:
         """Drop the requests kept so far: ``request`` brings a new worker to the present state."""
@@ -158,76 +136,61 @@ class WorkerPool:
             self._replay = [request.copy()]
 
     def close(self) -> None:
-        """End all workers: processes at once if they have a request, a loop in this process after the running call."""
-        self._closing = True
-        if self._user and self._is_local:
-            return  # its scenes are still in use by the running call
-        slots, self._slots = self._slots, []
-        for slot in slots:
-            slot.worker.close(0.0 if slot.queue else 5.0)
+        """End all workers, those that have a request at once. May be called again after an interrupt."""
+        self.closed = True
+        try:
+            self._end_workers(patience=5.0)
+        except BaseException:  # Ctrl-C
+            self._end_workers(patience=0.0)
+            raise
+
+    def _end_workers(self, patience: float) -> None:
+        for slot in list(self._slots):
+            slot.worker.close(0.0 if slot.queue else patience)
+        self._slots = []
         self._shared.close()
 
-    def _exclusive(self, call: Callable[[], Any]) -> Any:
-        """Return ``call()``; raise InUseError if another call is in progress."""
-        me, mine = threading.get_ident(), False
-        try:
-            if os.getpid() != self._owner:
-                raise InUseError(
-                    f"this Runner belongs to process {self._owner}, from which this one was forked; use it there, or "
-                    "make one here"
-                )
-            if self._user:
-                raise InUseError(
-                    "this Runner is in a call that this one interrupted; let a signal handler set a flag, or close it"
-                    if self._user == me
-                    else "this Runner is in a call from another thread; take turns, or make one for each thread"
-                )
-            # There is no call between the check and here, so that neither a thread nor a signal can come in between.
-            self._user, mine = me, True
-            return call()
-        finally:
-            if mine:
-                self._user = 0
-                if self._closing:
-                    self.close()
+    def __del__(self) -> None:
+        if hasattr(self, "_shared"):
+            self.close()
 
     # -- one request, until every worker has executed it -----------------------------------------------------------
 
-    def _finish(self) -> None:
-        """Serve the queues until all are empty; raise what the loops raised only then."""
-        errors: list[Exception] = []
+    def _serve(self) -> None:
+        """Serve the queues until all are empty."""
         next_check = time.monotonic() + _POLL_INTERVAL
-        while busy := [slot for slot in self._slots if slot.queue]:
+        while not self.closed and (busy := [slot for slot in self._slots if slot.queue]):
             for slot in busy:
                 if slot.phase == "transfer":
-                    self._replace(slot, WorkerLost(""))  # Ctrl-C: nothing to warn of
+                    self._replace(slot, None)
                 if slot.phase == "idle":
-                    self._attempt(slot, self._send, errors)
+                    self._attempt(slot, self._send)
             answered = self._wait(busy)
             for slot in answered:
-                self._attempt(slot, self._receive, errors)
+                self._attempt(slot, self._receive)
             if time.monotonic() > next_check:
                 for slot in busy:
                     if slot.phase == "waiting" and slot not in answered:
-                        self._attempt(slot, self._check_alive, errors)
+                        self._attempt(slot, self._check_alive)
                 next_check = time.monotonic() + _POLL_INTERVAL
         if self.closed:
             raise ClosedError("this Runner was closed during a call")
-        if errors:
-            raise next((error for error in errors if not _left_unchanged(error)), errors[0])
-        tick = None if self._request is None else self._request.observed_tick
-        if tick is not None:
-            self.present = self.ticks[tick]
+        errors = [slot.error for slot in self._slots if slot.error is not None]
+        self.error = next((error for error in errors if not is_refusal(error)), errors[0]) if errors else None
 
-    def _attempt(self, slot: _Slot, act: Callable[[_Slot], None], errors: list[Exception]) -> None:
+    def _attempt(self, slot: _Slot, act: Callable[[_Slot], None]) -> None:
         try:
             act(slot)
         except WorkerLost as error:
             self._replace(slot, error)
         except Exception as error:
+            if self.closed:
+                raise ClosedError("this Runner was closed during a call") from error
+            if not self.is_local and not isinstance(error, BatchPIDError):
+                raise  # a signal handler raised it
+            slot.error = error
+            slot.queue.pop(0)
             slot.phase = "idle"
-            slot.queue.popleft()
-            errors.append(error)
 
     def _send(self, slot: _Slot) -> None:
         slot.phase = "transfer"
@@ -237,13 +200,13 @@ class WorkerPool:
     def _receive(self, slot: _Slot) -> None:
         slot.phase = "transfer"
         slot.result = slot.worker.receive()
-        slot.phase = "idle"
-        slot.queue.popleft()
+        slot.queue.pop(0)
         if not slot.queue and slot.losses:
             self.recoveries += 1
             if slot.cause:
-                self._warning = f"{slot.cause}; replaced and replayed in {time.monotonic() - slot.lost_at:.1f} s"
+                self.recovery = f"{slot.cause}; replaced and replayed in {time.monotonic() - slot.lost_at:.1f} s"
             slot.losses = 0
+        slot.phase = "idle"
 
     def _check_alive(self, slot: _Slot) -> None:
         request, envs = slot.queue[0], slot.start.envs
@@ -252,47 +215,57 @@ class WorkerPool:
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
         """Wait briefly; return the busy slots whose worker has answered or died."""
         waiting = [slot for slot in busy if slot.phase == "waiting"]
-        if self._is_local:
+        if self.is_local:
             return waiting
         readable = {descriptor for descriptor, _ in self._poller.poll(1e3 * _POLL_INTERVAL)}
         return [slot for slot in waiting if slot.worker.fileno() in readable]
 
     # -- lost workers ----------------------------------------------------------------------------------------------
 
-    def _replace(self, slot: _Slot, error: WorkerLost) -> None:
-        """Replace a lost worker, and queue the requests to replay."""
+    def _replace(self, slot: _Slot, error: WorkerLost | None) -> None:
+        """Replace a lost worker, or without ``error`` an interrupted one, and queue the requests to replay."""
         if self.closed:
             raise ClosedError("this Runner was closed during a call") from error
         if not self._options.recover:
             raise WorkerLost(
-                f"{str(error) or f'worker {slot.start.index} was interrupted'}; its envs are lost, because recovery is "
-                "off: pass recover=True"
+                f"{error or f'worker {slot.start.index} was interrupted'}; its envs are lost, because recovery is off: "
+                "pass recover=True"
             ) from error
-        slot.losses += 1
-        if slot.losses >= MAX_LOSSES:
-            raise WorkerLost(
-                f"{error}; lost {MAX_LOSSES} times during the same request: run these envs with workers=0 to see why"
-            ) from error
-        if slot.losses == 1:
-            slot.cause, slot.lost_at = str(error), time.monotonic()
+        if error is not None:
+            slot.losses += 1
+            if slot.losses >= MAX_LOSSES:
+                raise WorkerLost(
+                    f"{error}; lost {MAX_LOSSES} times during the same request: run these envs with workers=0 to see "
+                    "why"
+                ) from error
+            if slot.losses == 1:
+                slot.cause, slot.lost_at = str(error), time.monotonic()
+        slot.phase = "transfer"
         slot.worker.close(0.0)
         slot.worker = self._make_worker(slot.start, self._shared)
-        self._await_start(slot)
-        slot.queue.extend(self._replay)
-        if self._request is not None and not self._request.is_replayed:
-            slot.queue.append(self._request)
+        self._start(slot)
 
-    def _await_start(self, slot: _Slot) -> None:
-        """Wait for the loop of a new worker first."""
-        slot.phase, slot.queue = "waiting", deque([slot.start])
+    def _start(self, slot: _Slot) -> None:
+        """Start the worker of ``slot``, and queue what brings it to the present state."""
+        slot.worker.open()
         if self._cores:
             slot.worker.pin(self._cores[slot.start.index])
-        self._poller = select.poll()
+        poller = select.poll()
         for descriptor in (worker.fileno() for worker in self.workers):
             if descriptor is not None:
-                self._poller.register(descriptor, select.POLLIN)
+                poller.register(descriptor, select.POLLIN)
+        self._poller = poller
+        request = self._request
+        again = [] if request is None or self._replays(request) else [request]
+        slot.queue = [slot.start, *self._replay, *again]
+        slot.error = None
+        slot.phase = "waiting"
+
+    def _replays(self, request: Request) -> bool:
+        """Return whether ``request``, the last one, is among those to replay."""
+        return bool(self._replay) and self._replay[-1] is request
 
 
-def _left_unchanged(error: Exception) -> bool:
+def is_refusal(error: Exception) -> bool:
     """Return True if a loop raised this before it changed anything."""
     return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)

@@ -12,7 +12,6 @@ import signal
 import socket
 import struct
 import sys
-import threading
 import time
 import traceback
 from typing import Any
@@ -29,28 +28,14 @@ _SPIN_SECONDS = 2e-4
 
 
 def main() -> None:
-    """Serve; ``argv`` holds the import path, the parent's pid and three descriptors: socket, memory, last stack."""
-    parent, channel, memory, trace = map(int, sys.argv[2:])
+    """Serve; ``argv`` ends with three descriptors: socket, memory, last stack."""
+    channel, memory, trace = map(int, sys.argv[-3:])
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
-    threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
     connection = Channel(socket.socket(fileno=channel))
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the parent closed the socket, or died
         _serve(connection, memory)
     os._exit(0)  # nothing to save, and the engine's own cleanup can take long
-
-
-def _exit_with(parent: int) -> None:
-    """Exit when ``parent`` has ended, even in the middle of a long tick."""
-    try:
-        watched = os.pidfd_open(parent)
-    except OSError:  # it has ended already, or the kernel is older than 5.3
-        while os.getppid() == parent:
-            time.sleep(0.2)
-    else:
-        if os.getppid() == parent:
-            select.select([watched], [], [])
-    os._exit(1)
 
 
 def _serve(connection: Channel, memory: int) -> None:

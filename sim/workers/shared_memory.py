@@ -6,6 +6,8 @@ however that one ends.
 
 from __future__ import annotations
 
+import fcntl
+import io
 import mmap
 import os
 from typing import Any
@@ -29,8 +31,11 @@ class SharedArrays:
             nbytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
             size += -(-nbytes // _ALIGN) * _ALIGN
         if fd is None:
-            fd = os.memfd_create("batchpid", os.MFD_CLOEXEC)
+            self._file: io.FileIO | None = memory_file("batchpid")
+            fd = self._file.fileno()
             os.ftruncate(fd, max(size, 1))
+        else:
+            self._file = None
         self.fd = fd
         memory = mmap.mmap(fd, max(size, 1))
         self.arrays: dict[str, NDArray[Any]] = {
@@ -40,7 +45,24 @@ class SharedArrays:
 
     def close(self) -> None:
         """Close the descriptor. The memory is freed when no array refers to it."""
-        if self.fd >= 0:
-            os.close(self.fd)
-            self.fd = -1
+        if self._file is not None:
+            self._file.close()
         self.arrays = {}
+
+
+def memory_file(name: str) -> io.FileIO:
+    """Return a new anonymous file in memory."""
+    return io.FileIO(above_standard_streams(os.memfd_create(name, os.MFD_CLOEXEC)), "r+")
+
+
+def above_standard_streams(descriptor: int) -> int:
+    """Return ``descriptor``, or in its place one that is no standard stream: a program can have closed those.
+
+    A child process would get something else under that number, and what the program prints would go there.
+    """
+    if descriptor > 2:
+        return descriptor
+    try:
+        return fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 3)
+    finally:
+        os.close(descriptor)

@@ -2,8 +2,8 @@
 
 A worker process is started fresh (no fork, no re-import of the caller's ``__main__``), so that it works from notebooks
 and from scripts without a main guard. It shares with its parent one socket and one block of memory, both by file
-descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the worker exits at once
-(:mod:`sim.workers.serve`).
+descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the kernel kills the worker.
+For the kernel the parent is the thread that started the worker; so that is one that lives as long as the process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +26,19 @@ import cloudpickle
 from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
 from sim.engine import native
 from sim.loop.arrays import Arrays
+from sim.loop.loop import Loop
+from sim.workers.background import BACKGROUND, Job
 from sim.workers.channel import Channel
 from sim.workers.liveness import Liveness
 from sim.workers.requests import Request, Start
 from sim.workers.serve import DONE
-from sim.workers.shared_memory import SharedArrays
+from sim.workers.shared_memory import SharedArrays, above_standard_streams, memory_file
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment of a process whose BLAS uses one thread."""
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
+_PR_SET_PDEATHSIG = 1  # of prctl(2): the signal that a process gets when its parent ends, even when it is stopped
 _STOP_LIMIT = 0.7  # seconds: Ctrl-Z and fg stop and continue parent and workers together
 
 
@@ -52,6 +54,10 @@ class Worker(ABC):
 
     pid: int | None = None
     """Process id; None: this process."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Start the process, or build the loop here. After an interrupt the worker can only be closed."""
 
     @abstractmethod
     def send(self, request: Request) -> None:
@@ -71,7 +77,10 @@ class Worker(ABC):
 
     @abstractmethod
     def close(self, patience: float) -> None:
-        """Free the scenes, and end the process; one that has not ended after ``patience`` seconds is killed."""
+        """Free the scenes, and end the process; one that has not ended after ``patience`` seconds is killed.
+
+        May be called again, after an interrupt too.
+        """
 
     def fileno(self) -> int | None:
         """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""
@@ -95,10 +104,15 @@ class LocalWorker(Worker):
     """Loop in this process."""
 
     def __init__(self, start: Start, shared: SharedArrays) -> None:
-        self._loop = start.build(Arrays.from_fields(shared.arrays))
+        self._start, self._arrays = start, Arrays.from_fields(shared.arrays)
+        self._loop: Loop | None = None
         self._result: Any = None
 
+    def open(self) -> None:
+        self._loop = self._start.build(self._arrays)
+
     def send(self, request: Request) -> None:
+        assert self._loop is not None
         request.write(self._loop.arrays)
         self._result = request.apply(self._loop)
 
@@ -106,49 +120,54 @@ class LocalWorker(Worker):
         return self._result
 
     def close(self, patience: float) -> None:
-        self._loop.close()
+        if self._loop is not None:
+            self._loop.close()
 
 
 class ProcessWorker(Worker):
     """Parent's end of a worker process."""
 
-    pid: int
+    pid: int | None = None
 
     def __init__(self, start: Start, shared: SharedArrays) -> None:
         try:
-            message = cloudpickle.dumps((start, shared.layout))  # it includes a ``build`` that cannot be imported
+            self._message = cloudpickle.dumps((start, shared.layout))  # it includes a ``build`` that cannot be imported
         except Exception as error:
             raise InvalidArgumentError(
                 "build",
                 f"cannot be sent to a worker process: {error}",
                 remedy="let the function use nothing that cannot be pickled, or pass workers=0",
             ) from error
-        envs = f"envs {start.envs.start} to {start.envs.stop - 1}"
-        self._owner = os.getpid()
+        self._name = f"worker {start.index} (envs {start.envs.start} to {start.envs.stop - 1})"
+        self._owner, self._memory = os.getpid(), shared.fd
         self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), start.envs))
-        self._trace = os.memfd_create("batchpid-trace", os.MFD_CLOEXEC)
+        self._opening: Job[None] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def open(self) -> None:
+        self._opening = Job(self._open)
+        BACKGROUND.put(self._opening)
         try:
-            with contextlib.ExitStack() as undo:
-                undo.callback(os.close, self._trace)
-                ours, theirs = socket.socketpair()
-                undo.enter_context(ours)
-                with theirs:
-                    self._process = _spawn(theirs.fileno(), shared.fd, self._trace)
-                undo.pop_all()
+            self._opening.result()
         except OSError as error:
             raise WorkerError(
-                f"worker {start.index} ({envs}) cannot be started: {error}; pass a smaller workers=, 0 for none"
+                f"{self._name} cannot be started: {error}; pass a smaller workers=, 0 for none"
             ) from error
-        self.pid = self._process.pid
-        self._name = f"worker {start.index} (pid {self.pid}, {envs})"
-        self._liveness = Liveness(Path(f"/proc/{self.pid}/stat"))
+        with contextlib.suppress(OSError):  # it died: the first receive reports that
+            self._channel.send(self._message)
+
+    def _open(self) -> None:
+        with contextlib.ExitStack() as undo:
+            self._trace = undo.enter_context(memory_file("batchpid-trace"))
+            ours, theirs = map(_above_standard_streams, socket.socketpair())
+            undo.enter_context(ours)
+            with theirs:
+                process = _spawn(theirs.fileno(), self._memory, self._trace.fileno())
+            undo.pop_all()
+        self._name = self._name.replace("(", f"(pid {process.pid}, ")
+        self._liveness = Liveness(Path(f"/proc/{process.pid}/stat"))
         self._channel = Channel(ours, lambda: self.check_alive(*_TRANSFER_LIMITS))
-        try:
-            with contextlib.suppress(OSError):  # it died: the first receive reports that
-                self._channel.send(message)
-        except BaseException:
-            self.close(0.0)
-            raise
+        self._process, self.pid = process, process.pid
 
     def fileno(self) -> int:
         return self._channel.fileno()
@@ -185,6 +204,10 @@ class ProcessWorker(Worker):
             raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 
     def close(self, patience: float) -> None:
+        if self._opening is not None and not self._opening.done and not sys.is_finalizing():
+            BACKGROUND.drain()  # the call that opened it was interrupted
+        if self._process is None:
+            return
         self._channel.close()
         if os.getpid() == self._owner:  # a fork of the parent must not end the parent's workers
             try:
@@ -192,15 +215,14 @@ class ProcessWorker(Worker):
             except subprocess.TimeoutExpired:
                 self._process.kill()
             self._process.wait()
-        if self._trace >= 0:
-            os.close(self._trace)
-            self._trace = -1
+        self._trace.close()
 
     def pin(self, core: int) -> None:
         with contextlib.suppress(OSError):  # it died, or the core is no longer ours
-            os.sched_setaffinity(self.pid, {core})
+            os.sched_setaffinity(self.pid or 0, {core})
 
     def _death(self) -> WorkerLost:
+        assert self._process is not None
         try:
             code = self._process.wait(5.0)
         except subprocess.TimeoutExpired:
@@ -208,10 +230,12 @@ class ProcessWorker(Worker):
         return self._lost(f"died ({_signal_name(-code)})" if code < 0 else f"died (exit code {code})")
 
     def _lost(self, cause: str) -> WorkerLost:
+        assert self._process is not None
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGUSR1)  # it writes its stack, unless it is stopped
             time.sleep(0.05)
-        trace = os.pread(self._trace, 4000, 0).decode(errors="replace").strip()
+        text = os.pread(self._trace.fileno(), 4000, 0).decode(errors="replace")
+        trace = text.partition("\nExtension modules:")[0].strip()  # a long list, of no use here
         return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
 
 
@@ -221,25 +245,33 @@ def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
         raise OSError("sys.executable does not say which Python to run")
     paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
     paths.append(str(Path(__file__).parents[2]))  # where "" led to, before the caller changed the folder
-    program = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.serve import main; main()"
-    with _interrupts_blocked():
-        return subprocess.Popen(
-            # -P: without it the working folder comes first, and a json.py in it would run in every worker.
-            [sys.executable, "-P", "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
-            pass_fds=descriptors,
-            stdin=subprocess.DEVNULL,
-            env=os.environ | ONE_THREAD | native.environment(),
-        )
+    program = (
+        f"import ctypes, os, sys; ctypes.CDLL(None).prctl({_PR_SET_PDEATHSIG}, {signal.SIGKILL:d}); "
+        "os.getppid() == int(sys.argv[2]) or os._exit(1); "
+        "import json; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.serve import main; main()"
+    )
+    closed = [stream for stream in (1, 2) if not _is_open(stream)]
+    return subprocess.Popen(
+        # -P: without it the working folder comes first, and a json.py in it would run in every worker.
+        [sys.executable, "-P", "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
+        pass_fds=descriptors,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL if 1 in closed else None,
+        stderr=subprocess.DEVNULL if 2 in closed else None,
+        env=os.environ | ONE_THREAD | native.environment(),
+    )
 
 
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT: a process inherits that, so that Ctrl-C reaches the parent alone."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+def _is_open(descriptor: int) -> bool:
     try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
+
+
+def _above_standard_streams(end: socket.socket) -> socket.socket:
+    return socket.socket(fileno=above_standard_streams(end.detach()))
 
 
 def _signal_name(number: int) -> str:

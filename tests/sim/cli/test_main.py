@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib.metadata
+import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 
+import batchpid
+from batchpid import startup
 from batchpid.errors import InvalidArgumentError
 from sim import cli
 
@@ -21,6 +26,7 @@ class Stub:
     number: int = 0
     """Exit status."""
 
+    imports = ()
     failure = None
 
     def run(self) -> int:
@@ -149,14 +155,64 @@ def test_help_loads_nothing_heavy(arguments):
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
+HIDING = ["json", "numpy", "sim", "assets", "tyro", "signal"]
+
+
+@pytest.mark.parametrize("command", ["script", "-m"])
+def test_modules_in_the_working_folder_are_not_imported_by_the_command(command, tmp_path):
+    for name in HIDING:
+        (tmp_path / f"{name}.py").write_text("raise SystemExit(f'{__name__} of the user')")
+    script = "import sys; sys.argv[0] = '/usr/bin/batchpid'; from batchpid.__main__ import main; sys.exit(main())"
+    program = [sys.executable, "-P", "-c", script] if command == "script" else [sys.executable, "-m", "batchpid"]
+    ran = subprocess.run([*program, "inspect", "panda"], cwd=tmp_path, capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert "panda_joint7" in ran.stdout
+
+
 @pytest.mark.parametrize("name", ["sim", "assets"])
-def test_a_file_of_the_user_that_hides_a_package_is_named_and_not_run(name, tmp_path):
+def test_a_module_on_the_path_that_hides_a_package_is_named_and_not_run(name, tmp_path):
     hiding = tmp_path / f"{name}.py"
     hiding.write_text("print('the program of the user')")
-    ran = subprocess.run([sys.executable, "-m", "batchpid", "--help"], cwd=tmp_path, capture_output=True, text=True)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    ran = subprocess.run(
+        [sys.executable, "-m", "batchpid", "--help"], capture_output=True, text=True, env=environment, cwd="/"
+    )
     assert (ran.returncode, ran.stdout) == (2, "")
     assert ran.stderr.startswith(f"batchpid: {hiding} hides the package {name!r}")
     assert ran.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["json", "numpy", "secrets"])
+def test_a_program_beside_a_file_that_hides_a_module_is_told_so(name, tmp_path):
+    hiding = tmp_path / f"{name}.py"
+    hiding.write_text("print('the program of the user')")
+    for program in (["-c", "from sim import Robot"], [tmp_path / "program.py"]):
+        (tmp_path / "program.py").write_text("from sim import Robot")
+        ran = subprocess.run([sys.executable, *program], cwd=tmp_path, capture_output=True, text=True)
+        line = (
+            f"ImportError: {hiding} hides the module {name!r} that batchpid needs; rename it or run in another folder"
+        )
+        assert ran.stderr.splitlines()[-1] == line
+        assert ran.stdout == ""
+
+
+def test_harmless_names_beside_a_program_are_accepted(tmp_path):
+    for name in ("os", "test", "calendar", "robots"):
+        (tmp_path / f"{name}.py").touch()
+    subprocess.run([sys.executable, "-c", "from sim import Robot"], cwd=tmp_path, check=True)
+
+
+def test_every_imported_package_is_checked():
+    root = Path(batchpid.__file__).parents[1]
+    imported = set()
+    for path in (*root.glob("batchpid/**/*.py"), *root.glob("sim/**/*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(node.module.partition(".")[0])
+    packages = imported - sys.stdlib_module_names - {"batchpid", "sim", "assets"}
+    assert packages <= set(startup.IMPORTED)
 
 
 @pytest.mark.parametrize("name", ["batchpid", "assets"])

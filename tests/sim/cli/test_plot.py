@@ -21,7 +21,7 @@ def recording(panda, tmp_path_factory):
 def test_odd_paths_are_refused_in_one_line(path, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     status, out, err = batchpid("plot", path)
-    assert (status, out, err.count("\n")) == (2, "", 1 + path.count("\n") * 2)
+    assert (status, out, err.count("\n")) == (2, "", 1)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,6 +8,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from sim import Observation, Rollout, write_recording
+from sim.view.address import listen
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -56,12 +57,23 @@ def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
         (("--fps", 0), "fps: out of range"),
         (("--play", "nothing.npz"), "nothing.npz: there is no such file"),
         (("--num-envs", 65), "num_envs: out of range"),
+        (("--control",), "controls: out of range (got 0)"),
+        (("--host", "nothing.invalid"), "host: cannot be resolved"),
+        (("--host", "203.0.113.1", *SHORT), "host: cannot be listened on"),
     ],
 )
 def test_bad_flags_are_named(flags, message, batchpid):
     status, said, err = batchpid("view", *flags)
     assert (status, said) == (2, "")
     assert err.startswith(f"batchpid: {message}")
+
+
+def test_a_port_in_use_is_named_with_the_next(batchpid):
+    with listen("127.0.0.1", 18310) as taken:
+        port = taken.getsockname()[1]
+        status, said, err = batchpid("view", *SHORT[:-1], port, "--time-limit", 0.1)
+    assert (status, err) == (0, "")
+    assert f"port {port} is in use; the page is at " in said
 
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):

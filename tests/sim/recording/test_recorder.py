@@ -23,7 +23,7 @@ h5py = pytest.importorskip("h5py")
 from batchpid.errors import ClosedError, InvalidArgumentError  # noqa: E402
 from sim import FaultWarning, Recorder, RecordingError, Runner, read_recording, write_recording  # noqa: E402
 from sim.cli import main  # noqa: E402
-from sim.recording import files  # noqa: E402
+from sim.recording import files, partial_file  # noqa: E402
 from sim.recording import recorder as recorder_module  # noqa: E402
 
 ROBOT = load_bundled("panda")
@@ -250,7 +250,7 @@ def limited_disk(folder, kind, size):
 @pytest.mark.parametrize("kind", ["disk", "file size"])
 def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(files, "CHUNK_BYTES", 2048)
-    monkeypatch.setattr(recorder_module, "METADATA_BYTES", 1 << 15)
+    monkeypatch.setattr(partial_file, "METADATA_BYTES", 1 << 15)
     ticks, outcomes = 40, set()
     for size in range(4096, 260_000, 12_288):
         folder = tmp_path / str(size)

@@ -1,6 +1,7 @@
 """SAPIEN's renderer: films where it works, and an error with a remedy where it does not."""
 
 import os
+import subprocess
 
 import numpy as np
 import pytest
@@ -46,21 +47,84 @@ def test_bad_arguments_are_named(rollout, tmp_path):
             film.write_film(rollout, **({"out": tmp_path / "film.mp4"} | options))
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves pipes to ffmpeg open
+def read_film(path, width, height):
+    """Return the pictures of a film, (frames, height, width, 3)."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    command = [ffmpeg, "-v", "error", "-i", f"file:{path}", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    data = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3)
+
+
 def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
-    imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     if film.render_problem() is not None:
         pytest.skip("needs a Vulkan device")
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
     assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
-    with imageio.get_reader("film.mp4") as reader:
-        frames = np.array(list(reader.iter_data()))
+    frames = read_film("film.mp4", 320, 180)
     assert frames.shape[1:] == (180, 320, 3)
     assert 8 <= len(frames) <= 10
     assert frames[0].std() > 5  # not empty
     assert np.abs(frames[-1].astype(int) - frames[0]).max() > 40  # the robots move
+
+
+class Slides:
+    """Stand-in for the scene of a film on machines that cannot render: the picture changes with the pose."""
+
+    camera_pose = None
+
+    def __init__(self, *_):
+        self.scene = self.entity = self
+        self._level = 0.0
+
+    def add_camera(self, name, width, height, *_):
+        self._noise = np.random.default_rng(0).random((height, width, 4))
+        return self
+
+    def set_pose(self, pose):
+        pass
+
+    def take_picture(self):
+        pass
+
+    def place(self, qpos):
+        self._level += 0.04
+
+    def get_picture(self, kind):
+        return np.clip(self._noise * self._level, 0, 1)
+
+
+@pytest.fixture
+def slides(monkeypatch):
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr(film, "render_problem", lambda: None)
+    monkeypatch.setattr(film, "_RenderScene", Slides)
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "-film.mp4", "film.GIF"])
+def test_a_film_has_its_pictures_in_order(name, rollout, tmp_path, slides, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    film.write_film(rollout, name, width=101, height=51, fps=100)
+    frames = read_film(name, 102 if name.endswith("mp4") else 101, 52 if name.endswith("mp4") else 51)
+    assert len(frames) == len(film.film_rows(rollout, 100)) == 20
+    brightness = frames.mean(axis=(1, 2, 3))
+    assert (np.diff(brightness) > 0).all()
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_a_film_that_is_interrupted_leaves_the_older_one(rollout, tmp_path, slides):
+    path = tmp_path / "film.mp4"
+    path.write_text("older")
+
+    def interrupted(rows):
+        yield from rows[:5]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        film.write_film(rollout, path, progress=interrupted)
+    assert path.read_text() == "older"
+    assert os.listdir(tmp_path) == ["film.mp4"]
 
 
 def test_the_window_plays_for_the_given_time(rollout):

@@ -41,6 +41,9 @@ def test_a_gain_is_set_on_one_joint(panda):
     assert gains.params.effort_max[0, :2].tolist() == [87.0, 5.0]
     with pytest.raises(InvalidArgumentError, match="gain"):
         gains.set("deadband", 0, 0.1)
+    for gain, joint, value in (("kp", 0, -1.0), ("kp", 0, np.nan), ("kp", 9, 1.0), ("ki", 0, "1"), ("ki", 0, [1, 2])):
+        with pytest.raises(InvalidArgumentError):
+            gains.set(gain, joint, value)
     gains.apply_set("tutorial")
     np.testing.assert_array_equal(gains.params.kp[0], panda.settings.kp)
 

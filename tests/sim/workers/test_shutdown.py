@@ -61,6 +61,34 @@ def test_workers_end_with_a_parent_that_gets_a_signal(number, body):
         assert error.rstrip().endswith("KeyboardInterrupt")
 
 
+def test_stopped_workers_end_with_a_parent_that_is_killed():
+    process, pids = start(SHORT)
+    with process:
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        process.kill()
+        process.communicate(timeout=20)
+    assert have_ended(pids)
+
+
+def test_workers_outlive_the_thread_that_made_them():
+    body = """
+    import threading
+    made = []
+    thread = threading.Thread(target=lambda: made.append(Runner(robot, 8, params=robot.params(), workers=1)))
+    thread.start()
+    thread.join()
+    pids = made[0].pids
+    made[0].step(robot.start)
+    print(pids == made[0].pids, made[0].recoveries)
+    """
+    process, pids = start(body)
+    with process:
+        output, error = process.communicate(timeout=30)
+    assert output.strip() == "True 0", error
+    assert have_ended(pids)
+
+
 @pytest.mark.parametrize(
     ("body", "status"),
     [

@@ -1,0 +1,96 @@
+"""Functions that run in a background thread, where no signal interrupts them.
+
+Python runs signal handlers in the main thread, between any two operations. An exception that a handler raises, such as
+KeyboardInterrupt, can therefore come after a file was opened or a process started, and before anyone has noted that.
+In another thread this cannot happen. The thread that waits for the result can be interrupted, and wait again.
+"""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import os
+import signal
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Job(Generic[T]):
+    """Function that is called once, by :meth:`run`, and whose result others wait for."""
+
+    def __init__(self, function: Callable[[], T]) -> None:
+        self._function = function
+        self._outcome: tuple[T | None, BaseException | None] | None = None
+        self._wake: SimpleQueue[None] = SimpleQueue()
+
+    @property
+    def done(self) -> bool:
+        """True when the function has returned or raised."""
+        return self._outcome is not None
+
+    def run(self) -> None:
+        """Call the function."""
+        try:
+            self._outcome = self._function(), None
+        except BaseException as error:
+            self._outcome = None, error
+        self._wake.put(None)
+
+    def result(self) -> T:
+        """Wait for the end of the function; return its result, or raise its error. May be called again."""
+        while self._outcome is None:
+            with contextlib.suppress(Empty):  # an interrupted wait can have taken the item
+                self._wake.get(timeout=1.0)
+        result, error = self._outcome
+        if error is not None:
+            raise error
+        return result  # type: ignore[return-value]
+
+
+def start_thread(*functions: Callable[[], None]) -> None:
+    """Call ``functions`` one after another in a new thread, which does not keep the program from ending.
+
+    The constructor of :class:`threading.Thread` can be interrupted while it holds a lock that the new thread needs.
+    """
+
+    def run() -> None:
+        for function in functions:
+            function()
+
+    _thread.start_new_thread(run, ())
+
+
+class BackgroundThread:
+    """Thread that runs jobs one after another, and lives as long as the process."""
+
+    def __init__(self) -> None:
+        self._jobs: SimpleQueue[Job[Any]] = SimpleQueue()
+        self._owner = 0
+
+    def put(self, job: Job[Any]) -> None:
+        """Run ``job`` after those before it."""
+        if self._owner != os.getpid():  # a fork has no threads but the one that forked
+            jobs: SimpleQueue[Job[Any]] = SimpleQueue()
+            start_thread(lambda: _run_all(jobs))
+            self._jobs, self._owner = jobs, os.getpid()
+        self._jobs.put(job)
+
+    def drain(self) -> None:
+        """Wait for the end of all jobs so far."""
+        job = Job(lambda: None)
+        self.put(job)
+        job.result()
+
+
+def _run_all(jobs: SimpleQueue[Job[Any]]) -> None:
+    # A process started here inherits that, so that Ctrl-C reaches the caller alone.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    while True:
+        jobs.get().run()
+
+
+BACKGROUND = BackgroundThread()
+"""Thread that opens the resources of workers."""

@@ -1,0 +1,144 @@
+"""Books of the calling process, changed by whole commands only.
+
+A command is a transaction. It begins when its request is noted as pending; from then on it is completed, by this call
+or, after an interrupt (Ctrl-C, or another exception of a signal handler), by the next one. Its changes in this process
+are a new value of the books, which a function makes from the value before and from the workers' results. That function
+may be interrupted and called again, and a single assignment makes its value valid.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from batchpid.errors import BatchPIDError, InUseError, WorkerError
+from sim.workers.pool import WorkerPool, is_refusal
+from sim.workers.requests import Request
+
+Books = TypeVar("Books")
+Commit = Callable[[Books, list[Any]], tuple[Books, Any]]
+"""Function of the books before and of the workers' results; returns the books after and the result of the command."""
+
+
+class _Command(NamedTuple):
+    request: Request
+    commit: Callable[[list[Any]], tuple[Any, Any]]
+
+
+class Ledger(Generic[Books]):
+    """Books of a pool's caller, and the command that is being executed.
+
+    Parameters
+    ----------
+    pool
+        Executes the requests.
+    books
+        First value.
+    """
+
+    def __init__(self, pool: WorkerPool, books: Books) -> None:
+        self._pool = pool
+        self.books = books
+        """Immutable value; replaced when a command is complete."""
+        self._pending: _Command | None = None
+        self._owner, self._user = os.getpid(), 0  # the process, and the thread in a call
+
+    @property
+    def in_use(self) -> bool:
+        """True during a call, and in a forked child."""
+        return self._user != 0 or os.getpid() != self._owner
+
+    @property
+    def is_settled(self) -> bool:
+        """True if no command is being executed, or was interrupted, and this is not a forked child."""
+        return self._pending is None and not self._user and os.getpid() == self._owner
+
+    def execute(self, request: Request, commit: Commit[Books], publish: Callable[[], None]) -> Any:
+        """Let every worker execute its part of ``request``, then ``commit``; return the result of the command.
+
+        ``publish`` passes on what is new in the books, before the command and after it. It may be interrupted.
+
+        Raises
+        ------
+        BatchPIDError
+            Raised by a loop before it changed anything.
+        WorkerError
+            A loop raised another error, or a worker was lost for good; the pool is closed.
+        InUseError
+            Another call is in progress, or the pool belongs to another process.
+        ClosedError
+            The pool was closed meanwhile.
+        """
+        return self._exclusive(lambda: self._execute(request, commit, publish))
+
+    def settle(self, publish: Callable[[], None]) -> None:
+        """Complete a command whose call was interrupted; raises as :meth:`execute` does."""
+        self._exclusive(lambda: self._settle(publish))
+
+    def close(self) -> None:
+        """End all workers; a loop in this process ends after the running call. May be called again."""
+        self._pool.closed = True
+        if not (self._user and self._pool.is_local):  # its scenes are still in use
+            self._pool.close()
+
+    def _execute(self, request: Request, commit: Commit[Books], publish: Callable[[], None]) -> Any:
+        if self._pending is not None:
+            self._settle(publish)
+        before = self.books
+        command = _Command(request.copy(), lambda results: commit(before, results))
+        self._pending = command
+        result = self._complete(command)
+        publish()
+        return result
+
+    def _settle(self, publish: Callable[[], None]) -> None:
+        if self._pending is not None and not self._pool.closed:
+            try:
+                self._complete(self._pending)
+            except BatchPIDError:
+                if self._pending is not None:
+                    raise  # otherwise the command was refused and has changed nothing
+        publish()
+
+    def _complete(self, command: _Command) -> Any:
+        try:
+            results = self._pool.run(command.request)
+        except WorkerError:
+            self.close()
+            raise
+        error = self._pool.error
+        if error is not None:
+            if is_refusal(error):
+                self._pending = None
+            else:
+                self.close()
+            raise error
+        self.books, result = command.commit(results)
+        self._pending = None
+        return result
+
+    def _exclusive(self, call: Callable[[], Any]) -> Any:
+        """Return ``call()``; raise InUseError if another call is in progress."""
+        me, mine = threading.get_ident(), False
+        try:
+            if os.getpid() != self._owner:
+                raise InUseError(
+                    f"this Runner belongs to process {self._owner}, from which this one was forked; use it there, or "
+                    "make one here"
+                )
+            if self._user:
+                raise InUseError(
+                    "this Runner is in a call that this one interrupted; let a signal handler set a flag, or close it"
+                    if self._user == me
+                    else "this Runner is in a call from another thread; take turns, or make one for each thread"
+                )
+            # There is no call between the check and here, so that neither a thread nor a signal can come in between.
+            self._user, mine = me, True
+            return call()
+        finally:
+            if mine:
+                self._user = 0
+                if self._pool.closed:
+                    self.close()

@@ -1,0 +1,123 @@
+"""Standard streams that are closed, full or piped to a reader that ends; Ctrl-C at any moment."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from sim.cli import COMMANDS
+
+BATCHPID = f"{sys.executable} -m batchpid"
+SHORT = "--num-envs 2 --workers 1 --seconds 0.3"
+RUNS = {
+    "demo": f"demo {SHORT} --picture out/a.png",
+    "rollout": f"rollout {SHORT} --out out/a.npz --picture out/b.png",
+    "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --out out/a.json",
+    "tune": "tune --generations 1 --population 2 --search-seconds 0.05 --workers 1 --out out/a.yaml",
+    "compare": "compare --moves 1 --workers 1 --seconds 0.3 --picture out/a.png",
+    "inspect": "inspect panda --all",
+    "plot": "plot run.npz",
+    "view": "view --num-envs 1 --workers 1 --port 18700 --time-limit 1",
+    "render": "render run.npz --out out/a.mp4",
+}
+"""A short run of each command."""
+
+
+def shell(line: str, folder: Path, status: str = "$?") -> tuple[int, str, str]:
+    """Run a command line, and return the ``status`` of bash, stdout and stderr."""
+    ran = subprocess.run(["bash", "-c", f"{line}; exit {status}"], capture_output=True, text=True, cwd=folder)
+    return ran.returncode, ran.stdout, ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "lines"),
+    [
+        ("--help >&-", 0, 0),
+        ("--help >/dev/full", 2, 1),
+        ("--version <&- >&- 2>&-", 0, 0),
+        ("inspect panda >&-", 0, 0),
+        ("inspect nobody 2>/dev/full", 2, 0),
+        ("inspect nobody 2>&-", 2, 0),
+    ],
+)
+def test_streams_that_are_closed_or_full(line, status, lines, tmp_path):
+    got, out, err = shell(f"{BATCHPID} {line}", tmp_path)
+    assert (got, out, err.count("\n")) == (status, "", lines)
+    assert not os.listdir(tmp_path)
+
+
+def test_any_name_can_be_printed_to_any_stdout(tmp_path):
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    ran = subprocess.run([*BATCHPID.split(), "--help"], env=environment, cwd=tmp_path, capture_output=True)
+    assert (ran.returncode, ran.stderr) == (0, b"")
+
+
+def test_ctrl_c_while_packages_are_imported_ends_in_one_line(tmp_path):
+    program = "import sys; sys.argv[0] = 'batchpid'; import batchpid, os, signal; os.kill(os.getpid(), signal.SIGINT)"
+    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (130, "", "batchpid: interrupted\n")
+    program = program.replace("'batchpid'", "'mine'").replace("os.kill", "signal.raise_signal; os.kill")
+    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert "KeyboardInterrupt" in ran.stderr  # of another program nothing is changed
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a recording, for long tests of every command."""
+    line = f"{BATCHPID} rollout --num-envs 1 --workers 0 --seconds 0.05 --out run.npz"
+    assert shell(line, tmp_path)[0] == 0
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_with_streams_that_are_closed_or_full(name, folder):
+    status, _, err = shell(f"{BATCHPID} {RUNS[name]}", folder)
+    assert status in (0, 2)  # 2: this machine cannot render
+    expected = [(" >&- <&-", "$?", {status}), (" | head -c 1", "${PIPESTATUS[0]}", {status, 141})]
+    expected += [(" >&- 2>&- <&-", "$?", {status}), (" > /dev/full", "$?", {2}), (" 2>/dev/full", "$?", {status, 2})]
+    for streams, variable, statuses in expected:
+        got, _, err = shell(BATCHPID + " " + RUNS[name] + streams, folder, variable)
+        assert got in statuses, (streams, got, err)
+        assert "Traceback" not in err
+        assert not [line for line in err.splitlines() if line.startswith("Exception")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_at_any_moment_of_every_command(name, folder):
+    def begin() -> subprocess.Popen:
+        words = [*BATCHPID.split(), *RUNS[name].split()]
+        return subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, start_new_session=True
+        )
+
+    started = time.monotonic()
+    begin().communicate()
+    duration = time.monotonic() - started
+    for moment in np.random.default_rng(0).uniform(0.2, duration, 20):
+        process = begin()
+        time.sleep(moment)
+        if process.poll() is None:
+            family = psutil.Process(process.pid).children(recursive=True)
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            family = []
+        _, err = process.communicate(timeout=10)
+        ends = {0, 2} if not family and process.returncode in (0, 2) else {130, -signal.SIGINT, 0}
+        assert process.returncode in ends, err  # -SIGINT: after its end, in that of Python
+        if process.returncode == 130:
+            assert err.splitlines()[-1].endswith("batchpid: interrupted")
+        assert "Traceback" not in err
+        assert "Exception ignored" not in err
+        assert not psutil.wait_procs(family, timeout=5)[1]
+        left = {path.name for path in folder.rglob("*") if path.is_file()}
+        assert left <= {"run.npz", "run.png", "a.png", "b.png", "a.npz", "a.json", "a.yaml", "a.search.json"}

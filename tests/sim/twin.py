@@ -1,0 +1,260 @@
+"""A runner that is disturbed, and its model, an undisturbed one in this process, which does what the first has done."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+import psutil
+from identical import assert_identical
+from processes import have_ended
+from robots import load_bundled
+
+import sim.runner
+from sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
+from sim.workers.background import start_thread
+
+ROBOT = load_bundled("panda")
+N = 2
+SUBSTEPS = 5
+ROOT = Path(sim.runner.__file__).parent
+MODULES = tuple(str(ROOT / part) for part in ("runner.py", "workers", "recording/recorder.py"))
+
+_MOMENTS = ("call", "c_call", "c_return")
+
+Disturbance = Callable[[Callable[[], object]], None]
+"""Calls a function and disturbs it; raises nothing that the disturbance made the function raise."""
+
+
+def undisturbed(act: Callable[[], object]) -> None:
+    """Call ``act``."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecoveryWarning)
+        act()
+
+
+class Interrupt(BaseException):
+    """Exception of a signal handler."""
+
+
+class InterruptAt:
+    """Disturbance: an exception at the n-th moment at which Python can run a signal handler in the modules under test.
+
+    Such moments are calls, and returns from functions written in C.
+    """
+
+    def __init__(self, moment: int) -> None:
+        self._left = moment
+        self.happened = False
+        self.where = ""
+
+    def __call__(self, act: Callable[[], object]) -> None:
+        try:
+            sys.setprofile(self._on_event)
+            undisturbed(act)
+        except Interrupt:
+            self.happened = True
+        finally:
+            sys.setprofile(None)
+
+    def _on_event(self, frame: Any, event: str, argument: Any) -> None:
+        code = frame.f_code  # an exception in a generator that is being freed is lost
+        if event in _MOMENTS and code.co_filename.startswith(MODULES) and code.co_name != "<genexpr>":
+            self._left -= 1
+            if self._left == 0:
+                sys.setprofile(None)
+                self.where = f"{event} {argument} in {code.co_qualname}, line {frame.f_lineno}"
+                raise Interrupt
+
+
+class CtrlC:
+    """Disturbance: SIGINT after some seconds."""
+
+    def __init__(self) -> None:
+        self._delays: SimpleQueue[float] = SimpleQueue()
+        self._armed = False
+        self.happened = 0
+        start_thread(self._send)
+
+    def after(self, seconds: float) -> Disturbance:
+        def disturb(act: Callable[[], object]) -> None:
+            self._armed = True
+            with contextlib.suppress(KeyboardInterrupt):
+                self._delays.put(seconds)
+                undisturbed(act)
+                while self._armed:
+                    time.sleep(1e-3)
+                return
+            self.happened += 1
+
+        return disturb
+
+    def _send(self) -> None:
+        while True:
+            time.sleep(self._delays.get())
+            os.kill(os.getpid(), signal.SIGINT)
+            self._armed = False
+
+
+def warnings_raised(act: Callable[[], object]) -> None:
+    """Call ``act`` with every warning as an error."""
+    with warnings.catch_warnings(), contextlib.suppress(RecoveryWarning):
+        warnings.simplefilter("error")
+        act()
+
+
+class Twin:
+    """Runner that is disturbed, with its model.
+
+    Every method does the same with both: first with the runner, disturbed, then with the model, if the runner has done
+    it. It raises AssertionError where they differ.
+    """
+
+    def __init__(self, folder: Path, workers: int) -> None:
+        self._folder, self._workers, self._files = folder, workers, 0
+        self.runner, self._model = self._make(workers), self._make(0)
+        self._recorders: tuple[Recorder, Recorder] | None = None
+        self.snapshots: list[Snapshot] = []
+
+    def _make(self, workers: int) -> Runner:
+        return Runner(ROBOT, N, params=ROBOT.params(), workers=workers, substeps=SUBSTEPS, checkpoint_steps=40)
+
+    def step(self, setpoint: Any, disturb: Disturbance = undisturbed) -> None:
+        disturb(lambda: self.runner.step(setpoint))
+        if self.runner.time != self._model.time:
+            self._model.step(setpoint)
+        self.compare()
+
+    def rollout(self, setpoints: Any, disturb: Disturbance = undisturbed) -> None:
+        disturb(lambda: self.runner.rollout(setpoints))
+        done = round((self.runner.time - self._model.time) / (SUBSTEPS * self.runner.timestep))
+        if done:
+            self._model.rollout(setpoints[:done])
+        self.compare()
+
+    def set_params(self, params: Any, disturb: Disturbance = undisturbed) -> None:
+        before = self.runner.params
+        disturb(lambda: setattr(self.runner, "params", params))
+        assert self.runner.params is params or self.runner.params is before
+        self._model.params = self.runner.params
+        self.step(ROBOT.start)
+
+    def reset(self, qpos: Any, mask: Any, disturb: Disturbance = undisturbed) -> None:
+        before = self.runner.observe()
+        disturb(lambda: self.runner.reset(qpos, mask=mask))
+        after = self.runner.observe()
+        self._model.reset(qpos, mask=mask)
+        if not np.array_equal(after.qpos, before.qpos) or not np.array_equal(after.qvel, before.qvel):
+            self.compare()
+        self.runner.reset(qpos, mask=mask)  # the call may have been interrupted before it began
+        self.step(ROBOT.start)
+
+    def snapshot(self, disturb: Disturbance = undisturbed) -> None:
+        taken: list[Snapshot] = []
+        disturb(lambda: taken.append(self.runner.snapshot()))
+        self.compare()
+        if taken:
+            assert_same_snapshot(taken[0], self._model.snapshot())
+        else:  # the barrier is set or not
+            taken.append(self.runner.snapshot())
+            self._model.restore(taken[0])
+        self.snapshots += taken
+        self.step(ROBOT.start)
+
+    def restore(self, snapshot: Snapshot, disturb: Disturbance = undisturbed) -> None:
+        before = self.runner.time
+        disturb(lambda: self.runner.restore(snapshot))
+        assert self.runner.time in (before, snapshot.steps * self.runner.timestep)
+        self.runner.restore(snapshot)
+        self._model.restore(snapshot)
+        self.compare()
+        self.step(ROBOT.start)
+
+    def record(self, disturb: Disturbance = undisturbed) -> None:
+        """Begin a recording, or end the one that was begun."""
+        if self._recorders is None:
+            self._files += 1
+            ours, theirs = (self._folder / f"{name}{self._files}.h5" for name in ("ours", "theirs"))
+            disturb(lambda: Recorder(ours, self.runner))
+            if self.runner.recorder is None:
+                deadline = time.monotonic() + 5.0
+                while ours.with_name(ours.name + ".partial").exists() and time.monotonic() < deadline:
+                    time.sleep(1e-3)
+                assert not ours.exists()
+                Recorder(ours, self.runner)
+            Recorder(theirs, self._model)
+            self._recorders = self.runner.recorder, self._model.recorder
+        else:
+            recorders, self._recorders = self._recorders, None
+            disturb(recorders[0].close)
+            for recorder in recorders:
+                recorder.close()
+            ours, theirs = (read_recording(recorder.path) for recorder in recorders)
+            assert ours.info.complete
+            assert len(ours.time) == len(theirs.time)
+            assert_identical(ours, theirs)
+            assert not recorders[0].partial.exists()
+
+    def reopen(self, disturb: Disturbance = undisturbed) -> None:
+        """Close the runner, and go on with another one from a snapshot."""
+        if self._recorders is not None:
+            self.record()
+        snapshot = self.runner.snapshot()
+        pids = self.runner.pids
+        disturb(self.runner.close)
+        self.runner.close()
+        assert not self.runner.pids
+        assert have_ended(pids)
+        self._model.close()
+        self.runner, self._model = self._make(self._workers), self._make(0)
+        self.restore(snapshot)
+
+    def compare(self) -> None:
+        """Raise AssertionError unless the two agree."""
+        assert_identical(self.runner.observe(), self._model.observe())
+        assert self.runner.time == self._model.time
+        for ours, theirs in zip(self.runner.params, self._model.params, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        assert self.runner.faults == self._model.faults
+
+    def close(self) -> None:
+        """Close both; raise AssertionError if a process is left."""
+        if self._recorders is not None:
+            self.record()
+        pids = self.runner.pids
+        self.runner.close()
+        self._model.close()
+        assert have_ended(pids)
+
+
+def assert_same_snapshot(ours: Snapshot, theirs: Snapshot) -> None:
+    """Raise AssertionError unless the snapshots are bit-identical."""
+    assert ours.steps == theirs.steps
+    for name, rows in vars(theirs.states).items():
+        for key, value in rows.items() if isinstance(rows, dict) else [("", rows)]:
+            found = getattr(ours.states, name)
+            assert (found[key] if key else found).tobytes() == value.tobytes(), (name, key)
+    for mine, other in zip(ours.params, theirs.params, strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+@contextlib.contextmanager
+def nothing_left() -> Iterator[None]:
+    """Raise AssertionError if the block leaves a process, or more than two file descriptors."""
+    me = psutil.Process()
+    descriptors, shared = me.num_fds(), set(os.listdir("/dev/shm"))
+    yield
+    gc.collect()  # an mmap keeps its descriptor until the arrays on it are collected
+    assert not me.children()
+    assert me.num_fds() <= descriptors + 2
+    assert set(os.listdir("/dev/shm")) <= shared
