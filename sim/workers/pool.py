@@ -22,6 +22,7 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, WorkerError
 from sim.loop.arrays import Arrays
 from sim.options import RunnerOptions
+from sim.workers.background import BACKGROUND
 from sim.workers.memory import check_memory
 from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
@@ -83,7 +84,8 @@ class WorkerPool:
         check_memory(options, len(self._slices), self.is_local)
         widest = max(envs.stop - envs.start for envs in self._slices)
         ticks = max(1, _MAX_STEPS // (options.substeps * widest))
-        self._shared = SharedArrays(Arrays.layout(ticks, options.num_envs, options.robot.dof))
+        layout = Arrays.layout(ticks, options.num_envs, options.robot.dof)
+        self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
         self.ticks = [self.arrays.at(tick) for tick in range(ticks)]
