@@ -126,10 +126,11 @@ class WorkerPool:
             self._request = request  # nothing is sent before
         self._serve()
         if self.error is None:
-            if request.is_replayed and self._options.recover and not self._replays(request):
+            if request.is_replayed and self._options.recover and not (self._replay and self._replay[-1] is request):
                 self._replay.append(request)
-            if request.observed_tick is not None:
-                self.present = self.ticks[request.observed_tick]
+            tick = request.observed_tick
+            if tick is not None:
+                self.present = self.ticks[tick]
         return [slot.result for slot in self._slots]
 
     def start_replay_from(self, request: Request) -> None:
@@ -257,15 +258,11 @@ class WorkerPool:
             if descriptor is not None:
                 poller.register(descriptor, select.POLLIN)
         self._poller = poller
-        request = self._request
-        again = [] if request is None or self._replays(request) else [request]
-        slot.queue = [slot.start, *self._replay, *again]
+        request, replay = self._request, self._replay
+        again = [] if request is None or (replay and replay[-1] is request) else [request]
+        slot.queue = [slot.start, *replay, *again]
         slot.error = None
         slot.phase = "waiting"
-
-    def _replays(self, request: Request) -> bool:
-        """Return whether ``request``, the last one, is among those to replay."""
-        return bool(self._replay) and self._replay[-1] is request
 
 
 def is_refusal(error: Exception) -> bool:
