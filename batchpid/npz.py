@@ -39,7 +39,7 @@ def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, NDArray[
         if int.from_bytes(file.read(12)[10:], "little") != len(members):
             raise ValueError("its list of arrays is damaged")
         if (total := sum(member.file_size for member in members)) > max_bytes:
-            raise ValueError(f"its arrays have {total:,} bytes, more than {max_bytes:,}")
+            raise ValueError(f"its arrays have {total:,} bytes, more than max_bytes={max_bytes:,}")
         for member in members:
             name = member.filename.removesuffix(".npy")
             if name in tables or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):

@@ -487,15 +487,8 @@ class Runner:
                     time = (books.steps + done * substeps) * self.timestep
                     unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
             steps = ticks * substeps
-            books = _Books(
-                books.params,
-                faults,
-                books.steps + steps,
-                books.steps_since_checkpoint + steps,
-                np.array(seconds) / ticks,
-                unrecorded,
-            )
-            return books, None
+            since = books.steps_since_checkpoint + steps
+            return _Books(books.params, faults, books.steps + steps, since, np.array(seconds) / ticks, unrecorded), None
 
         self._execute(request, commit, stacklevel=4)
 

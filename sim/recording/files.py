@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields, replace
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.files import write_atomically
+from batchpid.npz import read_npz
 from batchpid.validate import file_path, instance, integer
 from sim.loop.faults import Fault
 from sim.observation import RECORDED, Observation, Rollout, RunInfo
@@ -122,7 +122,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: i
         with path.open("rb") as file:
             zipped = file.read(2) == b"PK"
         if zipped:
-            attributes = _read_npz(path, limit)
+            attributes = read_npz(path, limit)
             arrays = {name: attributes.pop(name)[::every] for name in DTYPES if name in attributes}
         else:
             load_h5py()
@@ -229,26 +229,6 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
         known["versions"] = json.dumps(dict(info.versions))
     known |= {"format": FORMAT, "num_envs": num_envs, "tick": tick}
     return known | {"checksum": attribute_checksum(known)}
-
-
-def _read_npz(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
-    """Return all arrays of an .npz file, each read to its end, where its checksum is verified."""
-    tables = {}
-    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        file.seek(-22 - len(archive.comment), os.SEEK_END)  # to the end record, whose count zipfile does not check
-        if int.from_bytes(file.read(12)[10:], "little") != len(members):
-            raise ValueError("its list of arrays is damaged")
-        if (total := sum(member.file_size for member in members)) > max_bytes:
-            raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")
-        for member in members:
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"its {member.filename} is compressed in an unknown way")
-            with archive.open(member) as array:
-                tables[member.filename.removesuffix(".npy")] = np.lib.format.read_array(array, allow_pickle=False)
-                if array.read(1):
-                    raise ValueError(f"its {member.filename} is longer than it says")
-    return tables
 
 
 def _info(attributes: Mapping[str, Any]) -> RunInfo:

@@ -78,11 +78,11 @@ class BackgroundThread:
             self._jobs, self._owner = jobs, os.getpid()
         self._jobs.put(job)
 
-    def drain(self) -> None:
-        """Wait for the end of all jobs so far."""
-        job = Job(lambda: None)
+    def call(self, function: Callable[[], T]) -> T:
+        """Return ``function()``, called in the thread after all jobs so far."""
+        job = Job(function)
         self.put(job)
-        job.result()
+        return job.result()
 
 
 def _run_all(jobs: SimpleQueue[Job[Any]]) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 from batchpid.errors import BatchPIDError, InUseError, WorkerError
 from sim.workers.pool import WorkerPool, is_refusal
@@ -20,11 +20,6 @@ from sim.workers.requests import Request
 Books = TypeVar("Books")
 Commit = Callable[[Books, list[Any]], tuple[Books, Any]]
 """Function of the books before and of the workers' results; returns the books after and the result of the command."""
-
-
-class _Command(NamedTuple):
-    request: Request
-    commit: Callable[[list[Any]], tuple[Any, Any]]
 
 
 class Ledger(Generic[Books]):
@@ -42,7 +37,7 @@ class Ledger(Generic[Books]):
         self._pool = pool
         self.books = books
         """Immutable value; replaced when a command is complete."""
-        self._pending: _Command | None = None
+        self._pending: tuple[Request, Books, Commit[Books]] | None = None  # with the books before
         self._owner, self._user = os.getpid(), 0  # the process, and the thread in a call
 
     @property
@@ -86,25 +81,23 @@ class Ledger(Generic[Books]):
     def _execute(self, request: Request, commit: Commit[Books], publish: Callable[[], None]) -> Any:
         if self._pending is not None:
             self._settle(publish)
-        before = self.books
-        command = _Command(request.copy(), lambda results: commit(before, results))
-        self._pending = command
-        result = self._complete(command)
+        self._pending = request.copy(), self.books, commit
+        result = self._complete(*self._pending)
         publish()
         return result
 
     def _settle(self, publish: Callable[[], None]) -> None:
         if self._pending is not None and not self._pool.closed:
             try:
-                self._complete(self._pending)
+                self._complete(*self._pending)
             except BatchPIDError:
                 if self._pending is not None:
                     raise  # otherwise the command was refused and has changed nothing
         publish()
 
-    def _complete(self, command: _Command) -> Any:
+    def _complete(self, request: Request, before: Books, commit: Commit[Books]) -> Any:
         try:
-            results = self._pool.run(command.request)
+            results = self._pool.run(request)
         except WorkerError:
             self.close()
             raise
@@ -115,7 +108,7 @@ class Ledger(Generic[Books]):
             else:
                 self.close()
             raise error
-        self.books, result = command.commit(results)
+        self.books, result = commit(before, results)
         self._pending = None
         return result
 

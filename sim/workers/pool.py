@@ -22,6 +22,7 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, WorkerError
 from sim.loop.arrays import Arrays
 from sim.options import RunnerOptions
+from sim.workers.background import BACKGROUND
 from sim.workers.memory import check_memory
 from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
@@ -83,7 +84,8 @@ class WorkerPool:
         check_memory(options, len(self._slices), self.is_local)
         widest = max(envs.stop - envs.start for envs in self._slices)
         ticks = max(1, _MAX_STEPS // (options.substeps * widest))
-        self._shared = SharedArrays(Arrays.layout(ticks, options.num_envs, options.robot.dof))
+        layout = Arrays.layout(ticks, options.num_envs, options.robot.dof)
+        self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
         self.ticks = [self.arrays.at(tick) for tick in range(ticks)]
@@ -124,10 +126,11 @@ class WorkerPool:
             self._request = request  # nothing is sent before
         self._serve()
         if self.error is None:
-            if request.is_replayed and self._options.recover and not self._replays(request):
+            if request.is_replayed and self._options.recover and not (self._replay and self._replay[-1] is request):
                 self._replay.append(request)
-            if request.observed_tick is not None:
-                self.present = self.ticks[request.observed_tick]
+            tick = request.observed_tick
+            if tick is not None:
+                self.present = self.ticks[tick]
         return [slot.result for slot in self._slots]
 
     def start_replay_from(self, request: Request) -> None:
@@ -255,15 +258,11 @@ class WorkerPool:
             if descriptor is not None:
                 poller.register(descriptor, select.POLLIN)
         self._poller = poller
-        request = self._request
-        again = [] if request is None or self._replays(request) else [request]
-        slot.queue = [slot.start, *self._replay, *again]
+        request, replay = self._request, self._replay
+        again = [] if request is None or (replay and replay[-1] is request) else [request]
+        slot.queue = [slot.start, *replay, *again]
         slot.error = None
         slot.phase = "waiting"
-
-    def _replays(self, request: Request) -> bool:
-        """Return whether ``request``, the last one, is among those to replay."""
-        return bool(self._replay) and self._replay[-1] is request
 
 
 def is_refusal(error: Exception) -> bool:

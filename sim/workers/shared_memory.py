@@ -31,7 +31,7 @@ class SharedArrays:
             nbytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
             size += -(-nbytes // _ALIGN) * _ALIGN
         if fd is None:
-            self._file: io.FileIO | None = memory_file("batchpid")
+            self._file: MemoryFile | None = MemoryFile("batchpid")
             fd = self._file.fileno()
             os.ftruncate(fd, max(size, 1))
         else:
@@ -50,9 +50,14 @@ class SharedArrays:
         self.arrays = {}
 
 
-def memory_file(name: str) -> io.FileIO:
-    """Return a new anonymous file in memory."""
-    return io.FileIO(above_standard_streams(os.memfd_create(name, os.MFD_CLOEXEC)), "r+")
+class MemoryFile(io.FileIO):
+    """New anonymous file in memory, closed with its last reference."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(above_standard_streams(os.memfd_create(name, os.MFD_CLOEXEC)), "r+")
+
+    def __del__(self) -> None:
+        self.close()  # without the ResourceWarning of its base
 
 
 def above_standard_streams(descriptor: int) -> int:

@@ -32,7 +32,7 @@ from sim.workers.channel import Channel
 from sim.workers.liveness import Liveness
 from sim.workers.requests import Request, Start
 from sim.workers.serve import DONE
-from sim.workers.shared_memory import SharedArrays, above_standard_streams, memory_file
+from sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment of a process whose BLAS uses one thread."""
@@ -158,7 +158,7 @@ class ProcessWorker(Worker):
 
     def _open(self) -> None:
         with contextlib.ExitStack() as undo:
-            self._trace = undo.enter_context(memory_file("batchpid-trace"))
+            self._trace = undo.enter_context(MemoryFile("batchpid-trace"))
             ours, theirs = map(_above_standard_streams, socket.socketpair())
             undo.enter_context(ours)
             with theirs:
@@ -205,7 +205,7 @@ class ProcessWorker(Worker):
 
     def close(self, patience: float) -> None:
         if self._opening is not None and not self._opening.done and not sys.is_finalizing():
-            BACKGROUND.drain()  # the call that opened it was interrupted
+            BACKGROUND.call(lambda: None)  # the call that opened it was interrupted
         if self._process is None:
             return
         self._channel.close()

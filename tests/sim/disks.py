@@ -29,7 +29,7 @@ def fill(folder: Path) -> None:
     """Fill the disk that is mounted at ``folder``."""
     with suppress(OSError), (folder / "filler").open("ab", buffering=0) as file:
         while True:
-            file.write(bytes(1 << 12))
+            file.write(bytes(1 << 16))
 
 
 def make_read_only(folder: Path) -> None:

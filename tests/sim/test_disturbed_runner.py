@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 from twin import ROBOT, CtrlC, N, Twin, nothing_left, undisturbed, warnings_raised
 
-EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "60"))
+EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "20"))
 CTRL_C = CtrlC()
 
 

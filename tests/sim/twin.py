@@ -219,6 +219,16 @@ class Twin:
         self.runner, self._model = self._make(self._workers), self._make(0)
         self.restore(snapshot)
 
+    def construct(self, disturb: Disturbance = undisturbed) -> None:
+        """Make one more runner and close it."""
+        made: list[Runner] = []
+        disturb(lambda: made.append(self._make(self._workers)))
+        for runner in made:
+            runner.close()
+        made.clear()
+        gc.collect()  # the exception and the frames that it holds refer to each other
+        assert {child.pid for child in psutil.Process().children()} == set(self.runner.pids)
+
     def compare(self) -> None:
         """Raise AssertionError unless the two agree."""
         assert_identical(self.runner.observe(), self._model.observe())

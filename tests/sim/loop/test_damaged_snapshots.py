@@ -4,11 +4,12 @@ import json
 import os
 import time
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
 
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import BatchPIDError, InvalidArgumentError
 from sim import Runner, Snapshot
 
 
@@ -78,6 +79,55 @@ def test_1000_flipped_bits_and_a_seventh_of_those_in_the_directory(good, tmp_pat
         data = bytearray(whole)
         data[bit // 8] ^= 1 << bit % 8
         check(tmp_path / "flipped.npz", data, original)
+
+
+EXTREMES = (np.nan, np.inf, -np.inf, 0.0, 1e38, -1e38, 1e-45, -1.0, 2.0**31 - 1)
+
+
+def edits(good, folder, count, seed):
+    """Restore snapshots with other numbers, dtypes and shapes under right checksums: our error, or another state."""
+    from robots import load_bundled
+
+    panda, random = load_bundled("panda"), np.random.default_rng(seed)
+    with np.load(good) as file:
+        original = dict(file)
+    names = sorted(original.keys() - {"head"})
+    options = {"params": panda.params(), "workers": 0, "on_invalid_input": "contain"}
+    restored = 0
+    with Runner(panda, 2, **options) as runner, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for _ in range(count):
+            arrays = {name: rows.copy() for name, rows in original.items()}
+            for name in random.choice(names, random.integers(1, 4)):
+                rows, kind = arrays[name], random.integers(6)
+                if kind < 3 and rows.size:
+                    value = np.array(random.choice(EXTREMES)).astype(rows.dtype)
+                    rows.flat[random.integers(rows.size)] = value
+                elif kind == 3:
+                    arrays[name] = rows.astype(random.choice(["f8", "f4", "i8", "?", "U4"]))
+                elif kind == 4:
+                    arrays[name] = rows.reshape(-1)[: random.integers(rows.size + 1)]
+                else:
+                    arrays[name] = np.repeat(rows, 2, axis=-1)
+            np.savez(folder / "edited.npz", **arrays)
+            try:
+                runner.restore(Snapshot.load(folder / "edited.npz"))
+            except BatchPIDError:
+                continue
+            runner.step(panda.settings.target)
+            restored += 1
+        assert 0 < restored < count
+        runner.restore(Snapshot.load(good))
+        assert runner.step(panda.settings.target).ok.all()
+
+
+def test_20_edits_under_right_checksums(good, tmp_path):
+    edits(good, tmp_path, 20, seed=0)
+
+
+@pytest.mark.slow
+def test_1000_edits_under_right_checksums(good, tmp_path):
+    edits(good, tmp_path, 1000, seed=1)
 
 
 def test_files_cut_short_or_with_more_at_their_end(good, tmp_path):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Collection
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -109,3 +110,28 @@ def test_a_damaged_file_loads_or_is_refused(tmp_path):
 @pytest.mark.slow
 def test_many_damaged_files_load_or_are_refused(tmp_path):
     fuzz(1000, tmp_path, {*NAMES, "srdf", "stl"})
+
+
+FORMATS = ["test.urdf", "test.srdf", *GOOD]
+
+
+def flip_bits(name: str, count: int, folder: Path, built: int) -> None:
+    """Load a robot whose file ``name`` has one flipped bit, for ``count`` places in it; simulate every ``built``-th."""
+    urdf = arm(name).encode() if name in GOOD else SOURCES["one joint"]
+    content = {"test.urdf": urdf, "test.srdf": SRDF, **GOOD}[name]
+    (folder / "test.urdf").write_bytes(urdf)
+    for case, (place, bit) in enumerate(np.random.default_rng(0).integers(0, (len(content), 8), (count, 2))):
+        flipped = bytes([content[place] ^ 1 << bit])
+        (folder / name).write_bytes(content[:place] + flipped + content[place + 1 :])
+        try_loading(folder / "test.urdf", build=case % built == 0)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_with_a_flipped_bit_loads_or_is_refused(name, tmp_path):
+    flip_bits(name, 50, tmp_path, built=25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_with_any_of_many_flipped_bits_loads_or_is_refused(name, tmp_path):
+    flip_bits(name, 1000, tmp_path, built=1)

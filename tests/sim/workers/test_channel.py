@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import threading
 
@@ -73,3 +74,13 @@ def test_a_closed_other_side_raises(ends):
         channel.send(bytes(10))
     channel.close()
     channel.close()
+
+
+def test_the_end_of_the_other_side_is_an_error_with_the_default_of_sigpipe_too(ends):
+    before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        ends[1].close()
+        with pytest.raises(BrokenPipeError):
+            Channel(ends[0]).send(b"message")
+    finally:
+        signal.signal(signal.SIGPIPE, before)

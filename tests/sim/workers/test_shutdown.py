@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
 import pytest
 from processes import have_ended
+
+from sim import Runner
 
 PROGRAM = """
 import sys, numpy as np, warnings
@@ -71,22 +74,15 @@ def test_stopped_workers_end_with_a_parent_that_is_killed():
     assert have_ended(pids)
 
 
-def test_workers_outlive_the_thread_that_made_them():
-    body = """
-    import threading
+def test_workers_outlive_the_thread_that_made_them(panda):
     made = []
-    thread = threading.Thread(target=lambda: made.append(Runner(robot, 8, params=robot.params(), workers=1)))
+    thread = threading.Thread(target=lambda: made.append(Runner(panda, 1, params=panda.params(), workers=1)))
     thread.start()
     thread.join()
-    pids = made[0].pids
-    made[0].step(robot.start)
-    print(pids == made[0].pids, made[0].recoveries)
-    """
-    process, pids = start(body)
-    with process:
-        output, error = process.communicate(timeout=30)
-    assert output.strip() == "True 0", error
-    assert have_ended(pids)
+    with made[0] as runner:
+        pids = runner.pids
+        runner.step(panda.start)
+        assert (runner.pids, runner.recoveries) == (pids, 0)
 
 
 @pytest.mark.parametrize(
