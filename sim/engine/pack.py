@@ -132,7 +132,7 @@ class Pack:
         qpos = self._calls.qpos(np.float64)
         if update:
             passive = self._calls.passive_force(True, True, np.float64)
-            constraint.update(scene_dynamics(self.spec).mass_matrix(qpos) + self._armature, passive)
+            constraint.update(scene_dynamics(self.spec).joint_mass_matrix(qpos) + self._armature, passive)
         self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
         self._calls.write_qf()
 
