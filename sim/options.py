@@ -219,7 +219,7 @@ class RunnerOptions:
 
     def about(self) -> dict[str, Any]:
         """Return the options that two runners must share to restore each other's snapshots, as plain values."""
-        robot = self.robot
+        robot, coupling = self.robot, self.robot.coupling
         return {
             "robot": robot.name,
             "urdf": hashlib.sha256(robot.urdf.encode()).hexdigest(),
@@ -234,6 +234,7 @@ class RunnerOptions:
             "ignored_pairs": hashlib.sha256(repr(robot.ignored_pairs).encode()).hexdigest(),
             "fixed_base": robot.fixed_base,
             "merge_fixed": robot.merge_fixed,
+            "coupling": None if coupling is None else [coupling.matrix.tolist(), coupling.offset.tolist()],
         }
 
 

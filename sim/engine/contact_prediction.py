@@ -8,21 +8,37 @@ PhysX's flag for enhanced determinism changes neither. Alone in a system, a robo
 
 A robot has to move to such a system before a second contact acts on it, and better before the first: rebuilding a robot
 discards what the engine remembers of a contact, such as where friction holds. The engine lists a pair of shapes from
-0.02 m apart (twice the contact offset), long before they push each other.
+LISTED_DISTANCE on, long before they push each other.
+
+A robot without listed pairs costs a look at an empty list in every step. One with such pairs, as a closed gripper has
+for good, is looked at again where it leaves a region of joint positions in which no contact can be predicted: the
+distance of two links bounds how far the joints may move until they meet, which is conservative advancement (B. Mirtich,
+Impulse-based Dynamic Simulation of Rigid Body Systems, PhD thesis, University of California, Berkeley, 1996, section
+2.3). Regions change no prediction, only how often the engine is asked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+Float64 = NDArray[np.float64]
+
 MAX_ACCELERATION = 3000.0
 """Largest acceleration [m/s^2] of one link towards another that is predicted: a light finger's under full effort."""
 LOOKAHEAD_STEPS = 3
 """Time steps looked ahead: the listed distance is one step old, and the next step acts on what closes within it."""
+
+LISTED_DISTANCE = 0.02
+"""Distance from which the engine lists a pair of shapes [m], twice the contact offset."""
+
+STEP_FACTOR = LOOKAHEAD_STEPS + 2
+"""Weight of the last sim step in :class:`SafeRegions`: one step more than is looked ahead, since some solvers move
+joints by more than their final velocity, and one as the listed distance is a step old."""
 
 WORLD = -1
 """Link number of the ground."""
@@ -71,6 +87,14 @@ class ContactPredictor:
         # A joint above both links moves them alike.
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
         self._lookahead, self._speed_gain = LOOKAHEAD_STEPS * timestep, MAX_ACCELERATION * timestep
+        self._timestep = timestep
+        # Pairs that the engine may list: it ignores those of a link and its parent.
+        solid = [*(number for number, link in enumerate(links) if link.radius > 0), WORLD]
+        parents = {(link.parent, number) for number, link in enumerate(links)}
+        pairs = [pair for pair in combinations(solid, 2) if pair not in parents and self._arm[pair].any()]
+        self._first, self._second = np.array(pairs, int).reshape(-1, 2).T
+        radii = np.array([*(link.radius for link in links), 0.0])
+        self._radii = radii[self._first] + radii[self._second]
 
     def predicts_contact(self, pairs: Iterable[NearPair], qvel: NDArray[np.floating]) -> bool:
         """Return whether contact may act within LOOKAHEAD_STEPS, at joint velocities ``qvel`` (dof,).
@@ -80,10 +104,74 @@ class ContactPredictor:
         MAX_ACCELERATION * timestep: fingers at rest a millimetre apart that spring together touch at one place first,
         and one contact has no order.
         """
-        speed, accelerated = np.abs(qvel), 0
-        for pair in pairs:
-            closing = self._arm[pair.first, pair.second] @ speed
-            if pair.distance <= self._lookahead * closing:
-                return True
-            accelerated += pair.distance <= self._lookahead * (closing + self._speed_gain)
-        return accelerated > 1
+        arm, distance = self._listed(pairs)
+        ahead = self._lookahead * (arm @ np.abs(qvel))
+        accelerated = distance <= ahead + self._lookahead * self._speed_gain
+        return bool((distance <= ahead).any()) or int(accelerated.sum()) > 1
+
+    def region_weights(
+        self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], positions: NDArray[np.float64]
+    ) -> Float64:
+        """Return the weights w (dof,) of a region around the present joint positions, of a robot without prediction.
+
+        No contact is predicted while w . (|q - q0| + STEP_FACTOR |q - q'|) < 1, with q0 the present positions, q those
+        of a later step and q' those of the step before. A pair that is d apart now, whose joints have the reach r, was
+        at least d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
+
+        Parameters
+        ----------
+        pairs, qvel
+            Pairs that the engine lists, and joint velocities (dof,): :meth:`predicts_contact` is False for them.
+        positions
+            Origins of the links (links, 3) [m]. Pairs that are not listed are LISTED_DISTANCE apart, or as far as the
+            balls around their origins.
+        """
+        speed, from_rest = np.abs(qvel), self._lookahead * self._speed_gain
+        places = np.vstack([positions, np.zeros(3)])
+        apart = np.linalg.norm(places[self._first] - places[self._second], axis=1)
+        apart = np.where(self._second == WORLD, places[self._first, 2], apart) - self._radii
+        arm, distance = self._listed(pairs)
+        arms = np.concatenate([arm, self._arm[self._first, self._second]])
+        # The nearest pair may touch first: one contact has no order.
+        nearest = np.arange(len(distance)) == np.argmin(distance) if len(distance) else np.zeros(0, bool)
+        slack = np.concatenate([distance - from_rest * ~nearest, np.maximum(apart, LISTED_DISTANCE) - from_rest])
+        slack -= self._timestep * (arms @ speed)  # distances are listed of the step before
+        return (arms / np.maximum(slack, 1e-9)[:, None]).max(0)
+
+    def _listed(self, pairs: Iterable[NearPair]) -> tuple[Float64, Float64]:
+        """Return the arms (pairs, dof) and the distances (pairs,) of listed pairs."""
+        first, second, distance = np.array([*pairs], float).reshape(-1, 3).T
+        return self._arm[first.astype(int), second.astype(int)], distance
+
+
+class SafeRegions:
+    """Regions of the joint positions of ``size`` robots, within which no contact is predicted; a robot may have none.
+
+    ``known`` is the mask (size,) of the robots with a region, ``any`` is True if there is one.
+    """
+
+    def __init__(self, size: int, dof: int) -> None:
+        self.known, self.any = np.zeros(size, bool), False
+        self._places = np.zeros((2, size, dof))  # of the step before, and at the center of the region
+        self._weights, self._moved = np.zeros_like(self._places), np.zeros_like(self._places)
+
+    def enter(self, row: int, qpos: NDArray[np.floating], weights: Float64) -> None:
+        """Give a robot the region around ``qpos`` (dof,) with these :meth:`ContactPredictor.region_weights`."""
+        self._places[:, row] = qpos
+        self._weights[:, row] = STEP_FACTOR * weights, weights
+        self.known[row] = self.any = True
+
+    def drop(self, rows: int | list[int] | NDArray[np.bool_]) -> None:
+        """Take the regions of some robots (rows or a mask) away."""
+        self.known[rows] = False
+        self._weights[:, rows] = 0.0
+        self.any = bool(self.known.any())
+
+    def left(self, qpos: Float64) -> list[int]:
+        """Return the robots that are outside of their regions, one sim step after the last call, at ``qpos``."""
+        moved = np.subtract(qpos, self._places, self._moved)
+        np.abs(moved, moved)
+        self._places[0] = qpos
+        if np.vdot(moved, self._weights) < 1:  # of all robots together, which costs least
+            return []
+        return np.flatnonzero(np.einsum("kij,kij->i", moved, self._weights) >= 1).tolist()

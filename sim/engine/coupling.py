@@ -11,7 +11,7 @@ constraints and integrals of motion in dynamical systems", Computer Methods in A
 1972): their poles are at |z| = 0.71, and stay stable up to three times these gains, when M is that much off. A force F
 on the follower alone, as of an object, displaces it by 4 F dt^2 (J M^-1 J^T).
 
-PhysX's fixed tendons, which SAPIEN takes for this, act as springs that its solver leaves unsolved: they shake a whole
+PhysX's fixed tendons, which SAPIEN takes for this, hold one follower, but several followers of one leader shake a whole
 arm, or make it diverge. See docs/robots.md.
 """
 

@@ -21,12 +21,11 @@ from sim.engine.building import (
     SceneSpec,
     build_scene,
     engine_settings,
-    link_extents,
     link_frames,
     new_system,
     set_collision_group,
 )
-from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
+from sim.engine.contact_watch import ContactWatch
 from sim.engine.coupling import ConstraintEfforts
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.native import engine_calls
@@ -78,7 +77,8 @@ class Pack:
             set_collision_group(scene, row + 1)
         self.size, self.dof = size, self.robots[0].dof
         self.isolated = np.zeros(size, bool)
-        self._predictor = ContactPredictor(link_extents(self.robots[0]), self.dof, spec.timestep)
+        self._watch = ContactWatch(spec, self.robots[0], size)
+        self._stepped_qpos: NDArray[Any] | None = None  # of the last sim step, where they were read
         self.friction = self._friction()
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
@@ -110,9 +110,9 @@ class Pack:
         self._calls = engine_calls(
             robots, list(dict.fromkeys(self.systems)), self._joint_qf[: len(robots)], self._suspended[: len(robots)]
         )
-        shared = [row for row in range(len(robots)) if self._isolates and not self.isolated[row]]
-        self._get_contacts = [s.get_contacts for s in dict.fromkeys(self.systems[row] for row in shared)]
-        self._links = {link: (row, i) for row in shared for i, link in enumerate(robots[row].links)}
+        self._stepped_qpos = None
+        watched = ~(self.isolated | self._suspended)[: len(robots)]
+        self._watch.bind(robots, self.systems, np.flatnonzero(watched).tolist() if self._isolates else [])
 
     def step(self, update: bool = True) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints.
@@ -122,32 +122,18 @@ class Pack:
         if self._constraint is not None:
             self._write_coupled_qf(self._constraint, update)
         self._calls.step()
-        for get_contacts in self._get_contacts:
-            contacts = get_contacts()
-            if contacts:
-                self.isolate(self._predicted_contacts(contacts))
+        predicted, self._stepped_qpos = self._watch.step(self._read_float64_qpos)
+        if predicted:
+            self.isolate(predicted)
 
     def _write_coupled_qf(self, constraint: ConstraintEfforts, update: bool) -> None:
         """Apply the efforts ``qf`` together with those of the coupling, which no sensor and no delay is between."""
         qpos = self._calls.qpos(np.float64)
         if update:
             passive = self._calls.passive_force(True, True, np.float64)
-            constraint.update(scene_dynamics(self.spec).mass_matrix(qpos) + self._armature, passive)
+            constraint.update(scene_dynamics(self.spec).joint_mass_matrix(qpos) + self._armature, passive)
         self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
         self._calls.write_qf()
-
-    def _predicted_contacts(self, contacts: Iterable[Any]) -> list[int]:
-        """Return the robots in shared systems for which contact is predicted."""
-        near: dict[int, list[NearPair]] = {}
-        for contact in contacts:
-            (row, first), (other, second) = (self._links.get(body, (None, WORLD)) for body in contact.bodies)
-            row = other if row is None else row
-            if row is not None and not self._suspended[row]:
-                distance = min(point.separation for point in contact.points)
-                near.setdefault(row, []).append(NearPair(first, second, distance))
-        return [
-            row for row, pairs in near.items() if self._predictor.predicts_contact(pairs, self.robots[row].get_qvel())
-        ]
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
@@ -158,12 +144,9 @@ class Pack:
 
         No contact before the placement then has any influence.
         """
-        dynamics, predicted, systems = scene_dynamics(self.spec), dict[bytes, bool](), {}
-        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
-            state = position.tobytes() + velocity.tobytes()
-            if state not in predicted:
-                predicted[state] = self._predictor.predicts_contact(dynamics.near_pairs(position), velocity)
-            if predicted[state]:
+        systems = {}
+        for row, predicted in zip(rows, self._watch.place(rows, qpos, qvel), strict=True):
+            if predicted:
                 systems[row] = new_system(self.spec)
             elif self.isolated[row]:
                 systems[row] = self._shared_systems[row]
@@ -191,7 +174,11 @@ class Pack:
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the joint positions [rad or m], a new array."""
-        return self._calls.qpos(dtype)
+        stepped, self._stepped_qpos = self._stepped_qpos, None
+        return stepped if stepped is not None and dtype is np.float64 else self._calls.qpos(dtype)
+
+    def _read_float64_qpos(self) -> NDArray[np.float64]:
+        return self._calls.qpos(np.float64)
 
     def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the joint velocities [rad/s or m/s], a new array."""
@@ -219,6 +206,7 @@ class Pack:
         ``root`` (len(rows), 13), as :meth:`read_root` returns it, is by default the origin, at rest. It is always set,
         since a robot whose state is NaN has lost its root, too. Content of these scenes is reset.
         """
+        self._stepped_qpos = None
         roots = np.tile(_ORIGIN, (len(rows), 1)) if root is None else root
         for row, position, velocity, base in zip(rows, qpos, qvel, roots, strict=True):
             robot = self.robots[row]

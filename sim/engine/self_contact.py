@@ -6,10 +6,16 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sim.engine.building import SceneSpec, link_groups
+from sim.engine.collision_groups import Pair
 from sim.engine.dynamics import Dynamics
 from sim.engine.physics import PHYSICS
+from sim.engine.trial import in_child
 from sim.robot.description import Joint, RobotDescription
 from sim.robot.self_collision import (
     PENETRATION,
@@ -20,30 +26,55 @@ from sim.robot.self_collision import (
 )
 
 
+class _Measured(NamedTuple):
+    """Distances [m] of the links near each other at each pose, and the height [m] of the moving links at the first."""
+
+    distances: list[dict[Pair, float]]
+    height: float
+
+
 def self_contact(robot: RobotDescription) -> SelfContact:
     """Return the pairs of links of ``robot`` that do not collide under its option ``self_collision`` and its .srdf.
 
-    Deterministic: the poses are seeded.
+    Deterministic: the poses are seeded. Poses at which links of a foreign robot may touch are tried in a child process.
+
+    Raises
+    ------
+    RobotError
+        SAPIEN cannot build the robot, or crashes at one of the poses.
     """
     spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, PHYSICS["fast"], ground=False, merge_fixed=robot.merge_fixed)
-    dynamics = Dynamics(spec)
     solid = [link.name for link in robot.links if link.collisions]
+    bodies = _rigid_bodies(robot.all_joints)
+    touching = robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1
+    poses = robot.sample(SAMPLES, seed=0) if touching else np.empty((0, robot.dof))
+    if touching and robot.settings is None:
+        measured = in_child(_measure, spec, robot.start, poses)
+    else:
+        measured = _measure(spec, robot.start, poses)
     computed: tuple[DisabledPair, ...] = ()
     if robot.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
-    elif robot.self_collision == "auto":
-        rest = [pair for pair, distance in dynamics.link_distances(robot.start).items() if distance < -PENETRATION]
-        poses = map(dynamics.link_distances, robot.sample(SAMPLES, seed=0))
-        samples = [[pair for pair, distance in distances.items() if distance < 0] for distances in poses]
-        computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, samples)
+    elif touching:
+        at_rest, *samples = measured.distances
+        rest = [pair for pair, distance in at_rest.items() if distance < -PENETRATION]
+        contacts = [[pair for pair, distance in sample.items() if distance < 0] for sample in samples]
+        computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, contacts)
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
     left_over = link_groups(replace(spec, ignored=tuple((pair.first, pair.second) for pair in pairs))).left_over
     return SelfContact(
         pairs=tuple(pair for pair in pairs if pair.links not in left_over),
         left_over=tuple(pair for pair in pairs if pair.links in left_over),
-        reaches_ground=robot.fixed_base and dynamics.height(robot.start) < PENETRATION,
+        reaches_ground=robot.fixed_base and measured.height < PENETRATION,
     )
+
+
+def _measure(spec: SceneSpec, rest: NDArray[np.float64], poses: NDArray[np.float64]) -> _Measured:
+    """Return the distances at ``rest`` and at ``poses``, none without poses."""
+    dynamics = Dynamics(spec)
+    distances = [dynamics.link_distances(qpos) for qpos in (rest, *poses)] if len(poses) else []
+    return _Measured(distances, dynamics.height(rest))
 
 
 def _rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:

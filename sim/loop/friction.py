@@ -26,7 +26,6 @@ BAND = {"rad": 1e-4, "m": 2e-5}
 class JointFriction:
     """Friction model of the M robots of ``pack``; it owns the model's state.
 
-
     Attributes
     ----------
     acts

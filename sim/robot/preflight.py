@@ -144,7 +144,7 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
     elif not joint.continuous and math.isinf(joint.upper - joint.lower):
         remedy = "give <limit lower= upper=>, so that setpoints can be checked"
         yield found("note", "no-limits", "it has no position limits", remedy)
-    if math.isinf(joint.effort_limit):
+    if math.isinf(joint.effort_limit) and joint.mimic is None:
         limit = f"{robot.design_effort_limit[robot.joints.index(joint)]:.3g} {joint.effort_unit}"
         text = f"it has no effort limit: designed and tuned gains stay within {limit}, from gravity and inertia"
         yield found("note", "no-effort-limit", text, "give <limit effort=>, or pass effort_limit= to robot.params()")

@@ -2,7 +2,7 @@
 
 SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
 and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
-mimic joint: SAPIEN's tendons shake a robot (:mod:`sim.engine.coupling`).
+mimic joint: the coupling is not SAPIEN's (:mod:`sim.engine.coupling`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     ordered = _breadth_first(links, joints, path, added)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
         if joint.mimic is not None:
-            element.remove(element.find("mimic"))  # SAPIEN's tendons shake the robot; see sim.engine.coupling
+            element.remove(element.find("mimic"))  # sim.engine.coupling simulates it
     if strict:
         refuse(path, repairs)
     text = etree.tostring(root, encoding="unicode")

@@ -37,7 +37,7 @@ def simulate(mass, model, efforts, velocity=0.0, load=0.0):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_joints_come_to_rest_and_stay(seed):
     """However the joints are coupled, and however heavy the damping."""
     mass, model = random_plant(seed)
@@ -135,7 +135,7 @@ def test_jax_gives_the_same():
     expected = friction.init(model, v, load, mass, DT)
     with jax.enable_x64(True):
         theirs = Friction(*map(jax.numpy.asarray, model))
-        state = friction.init(theirs, *map(jax.numpy.asarray, (v, load, mass)), DT)
+        state = jax.jit(friction.init)(theirs, *map(jax.numpy.asarray, (v, load, mass)), DT)
         advance = jax.jit(friction.advance)
         for _ in range(5):
             expected, ours = friction.advance(model, expected, effort, v)

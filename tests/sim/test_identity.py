@@ -66,7 +66,7 @@ def test_another_robot():
     assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), reference("jaco2", ticks=20))
 
 
-@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
+@pytest.mark.parametrize("control", ["pid", "drive"])
 def test_a_robot_with_friction_and_damping(control):
     expected = reference(RUBBING, control=control, ticks=20)
     assert_identical(run(RUBBING, ticks=20, workers=2, pack_size=3, control=control), expected)

@@ -12,12 +12,15 @@ from sim import Runner
 from sim.benchmark.accuracy import contact_moves
 from sim.engine.building import SceneSpec, build_scene, link_extents, new_system
 from sim.engine.contact_prediction import (
+    LISTED_DISTANCE,
     LOOKAHEAD_STEPS,
     MAX_ACCELERATION,
+    STEP_FACTOR,
     WORLD,
     ContactPredictor,
     LinkExtent,
     NearPair,
+    SafeRegions,
 )
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
@@ -84,6 +87,100 @@ def test_prediction_has_no_order_and_more_speed_predicts_no_less(pairs, qvel, ra
     if found:
         assert predicts_contact(pairs, 2 * qvel)
         assert predicts_contact(pairs, qvel, 2 * DT)
+
+
+def reach_between(predictor: ContactPredictor, first: int, second: int) -> np.ndarray:
+    """Return how fast two links close per unit of each joint's speed: a joint above both moves them alike."""
+    a, b = predictor.reach[first], predictor.reach[second]
+    return np.where((a > 0) != (b > 0), a + b, 0.0)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([(2, 3), (2, 4), (3, WORLD), (0, 4)]), st.floats(1e-4, LISTED_DISTANCE)), max_size=4
+    ),
+    *(st.lists(st.floats(-1, 1), min_size=4, max_size=4) for _ in range(3)),
+    st.floats(0, 0.999),
+)
+def test_no_contact_is_predicted_within_a_region(near, qvel, moved, step, share):
+    """Pairs close as fast as they can, those that were not listed from LISTED_DISTANCE on."""
+    predictor, qvel = ContactPredictor(LINKS, 4, DT), np.array(qvel)
+    pairs = [NearPair(*links, distance) for links, distance in near]
+    if predictor.predicts_contact(pairs, qvel):
+        return
+    touching = np.zeros((len(LINKS), 3))  # so that balls around the links say nothing
+    weights, regions = predictor.region_weights(pairs, qvel, touching), SafeRegions(1, 4)
+    regions.enter(0, np.zeros(4), weights)
+    moved, step = np.array(moved), np.array(step)
+    used = weights @ (np.abs(moved + step) + STEP_FACTOR * np.abs(step))
+    if used > 0:
+        moved, step = share / used * moved, share / used * step
+    regions.left(moved[None])
+    if regions.left((moved + step)[None]):
+        return  # the step to ``moved`` was too large to count
+    unlisted = [(2, 3), (2, 4), (3, 4), (0, 4), (1, WORLD), (2, WORLD)]
+    later = [
+        NearPair(a, b, distance - reach_between(predictor, a, b) @ (np.abs(moved) + DT * np.abs(qvel)))
+        for a, b, distance in [*pairs, *((*links, LISTED_DISTANCE) for links in unlisted)]
+    ]
+    assert not predictor.predicts_contact([pair for pair in later if pair.distance < LISTED_DISTANCE], step / DT)
+
+
+def test_a_region_ends_where_a_joint_has_moved_by_its_weight():
+    regions = SafeRegions(3, 2)
+    regions.enter(1, np.array([0.5, 0.0]), np.array([10.0, 0.0]))
+    qpos = np.array([[9.0, 9.0], [0.5, 9.0], [np.nan, 0.0]])
+    assert regions.any
+    assert regions.left(qpos) == []
+    qpos[1, 0] += 0.5 / (10 * (1 + STEP_FACTOR))
+    assert regions.left(qpos) == []
+    qpos[1, 0] += 0.11
+    assert regions.left(qpos) == [1]
+    regions.drop([1])
+    assert not regions.any
+    assert regions.left(qpos) == []
+
+
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_regions_change_no_prediction(physics, panda, monkeypatch):
+    """Limp robots that fall, looked at in every step and only where they leave their regions."""
+    spec = SceneSpec(panda.urdf, panda.srdf, panda.joints, DT, PHYSICS[physics])
+    runs, looks = [], [0]
+    predicts = ContactPredictor.predicts_contact
+
+    def count(*arguments):
+        looks[-1] += 1
+        return predicts(*arguments)
+
+    monkeypatch.setattr(ContactPredictor, "predicts_contact", count)
+    for enter in (SafeRegions.enter, lambda *_: None):
+        monkeypatch.setattr(SafeRegions, "enter", enter)
+        looks.append(0)
+        pack = Pack(spec, 4, system_size=4)
+        pack.write_state(range(4), panda.sample(4, seed=2), np.zeros((4, panda.dof)))
+        isolated = []
+        for _ in range(800):
+            pack.step()
+            isolated.append(pack.isolated.copy())
+        runs.append((np.array(isolated), pack.read_qpos()))
+    assert 0 < runs[0][0].sum() < runs[0][0].size
+    for ours, theirs in zip(*runs, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert looks[1] < looks[2]
+
+
+def test_a_closed_gripper_at_rest_needs_no_look(panda, monkeypatch):
+    spec = SceneSpec(panda.urdf, panda.srdf, panda.joints, DT, PHYSICS["fast"])
+    pack = Pack(spec, 2, system_size=2)
+    pack.write_state(range(2), np.tile(panda.start, (2, 1)), np.zeros((2, panda.dof)))
+    looks = []
+    monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *arguments: looks.append(arguments))
+    for _ in range(100):
+        pack.write_qf(pack.passive_force(True, True))
+        pack.step()
+    assert pack.systems[0].get_contacts()
+    assert not looks
+    assert not pack.isolated.any()
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])

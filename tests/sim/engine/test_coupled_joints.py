@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Robot, Runner
+from sim import RecoveryWarning, Robot, Runner
 from tests.sim.identical import assert_identical
 from tests.sim.tiny_urdf import write
 
@@ -160,32 +163,73 @@ def test_results_do_not_depend_on_packs_workers_or_snapshots(control, tmp_path):
         assert getattr(reference, name)[:, 3:5].tobytes() == getattr(few, name).tobytes()
 
 
-def test_reset_puts_followers_in_place_and_a_blocked_follower_holds_its_leader(tmp_path):
-    """The right finger closes on a post that is fixed to the world; the left one touches nothing."""
+def add_post(scene, env):
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.025, 0.01, 0.15])
+    builder.build_static()
+
+
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_reset_puts_followers_in_place_and_a_blocked_follower_holds_its_leader(physics, tmp_path):
+    """The right finger closes on a post; the left one touches nothing."""
     pad = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision>'
-    post = '<collision><geometry><box size="0.05 0.02 0.3"/></geometry></collision>'
     slide = '<limit lower="0" upper="0.08" effort="20" velocity="1"/>'
     parts = [
-        body("base", 1.0, shape=post),
+        body("base", 1.0),
         *(body(name, 0.02, "0 0 0.03", pad) for name in ("left_pad", "right_pad")),
         hinge("left", "base", "left_pad", "0 -1 0", "0 0.2 0", slide, "prismatic"),
-        hinge("lift", "base", "frame", "0 0 1", "0 0 0", FREE_LIMIT),
-        body("frame", 0.5),
-        hinge("right", "frame", "right_pad", "0 1 0", "0 -0.06 0", f'{slide}<mimic joint="left"/>', "prismatic"),
+        hinge("right", "base", "right_pad", "0 1 0", "0 -0.06 0", f'{slide}<mimic joint="left"/>', "prismatic"),
     ]
-    robot = Robot.load(write(tmp_path, f'<robot name="gripper">{"".join(parts)}</robot>'))
-    names = list(robot.joint_names)
-    left, right = names.index("left"), names.index("right")
-    for physics in ("accurate", "fast"):
-        with Runner(robot, 1, control="effort", workers=0, physics=physics, ground=False) as runner:
-            given = np.zeros(robot.dof)
-            given[left], given[right] = 0.01, 5.0
-            seen = runner.reset(given)
-            assert seen.qpos[0, right] == seen.qpos[0, left]
-            push = np.zeros(robot.dof)
-            push[left] = 10.0
-            rollout = runner.rollout(np.tile(push, (50, 1)))
-        assert rollout.ok.all()
-        # Surfaces meet at 0.045; half of 10 N goes through the coupling, whose stiffness is m / (8 dt^2).
-        np.testing.assert_allclose(rollout.qpos[-10:, 0, [left, right]], 0.045, atol=2e-3)
-        assert np.ptp(rollout.qpos[-10:, 0], axis=0).max() < 1e-4
+    gripper = Robot.load(write(tmp_path, f'<robot name="gripper">{"".join(parts)}</robot>'))
+    with Runner(gripper, 1, control="effort", workers=0, physics=physics, ground=False, build=add_post) as runner:
+        np.testing.assert_array_equal(runner.reset([0.01, 5.0]).qpos[0], np.float32([0.01, 0.01]))
+        rollout = runner.rollout(np.tile([10.0, 0.0], (50, 1)))
+    assert rollout.ok.all()
+    # Surfaces meet at 0.045; half of 10 N goes through the coupling, whose stiffness is m / (8 dt^2).
+    np.testing.assert_allclose(rollout.qpos[-10:, 0], 0.045, atol=2e-3)
+    assert np.ptp(rollout.qpos[-10:, 0], axis=0).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_free_fall_is_that_of_mujocos_equality_constraint(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    robot = arm(tmp_path, joints=4)
+    spec = mujoco.MjSpec.from_string(robot.urdf)
+    for joint in robot.joints:
+        if joint.mimic is not None:
+            equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            equality.name1, equality.name2 = joint.name, joint.mimic.joint
+            equality.data[:5], equality.solref = [joint.mimic.offset, joint.mimic.multiplier, 0, 0, 0], [2e-4, 1]
+    model = spec.compile()
+    model.opt.timestep = 5e-5
+    data, columns = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in robot.joint_names]
+    start = robot.coupled([0.3, 0.5, -0.4, 0.3, 0.02, 0, 0])
+    data.qpos[columns] = start
+    with Runner(
+        robot, 1, control="effort", compensate="none", workers=0, ground=False, substeps=80, timestep=1 / 16000
+    ) as runner:
+        runner.reset(start)
+        qpos = runner.rollout(np.zeros((40, robot.dof))).qpos[-1, 0]
+    for _ in range(4000):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(qpos[robot.independent], data.qpos[columns][robot.independent], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_lost_worker_is_replaced_bit_identically(tmp_path):
+    robot = arm(tmp_path, joints=2)
+    start, goal = robot.sample(4, seed=1), robot.sample(4, seed=2)
+    courses = []
+    for kill in (False, True):
+        with Runner(robot, 4, workers=2, checkpoint_steps=100) as runner:
+            runner.reset(start)
+            for tick in range(12):
+                if kill and tick == 7:
+                    os.kill(runner.pids[0], signal.SIGKILL)
+                    with pytest.warns(RecoveryWarning):
+                        runner.step(goal)
+                else:
+                    runner.step(goal)
+            assert runner.recoveries == kill
+            courses.append(runner.observe())
+    assert_identical(*courses)

@@ -58,7 +58,7 @@ def push(robot, efforts, seconds, physics="accurate", qvel=0.0, qpos=0.0, subste
 @pytest.mark.parametrize("physics", PRESETS)
 @pytest.mark.parametrize(("inertia", "friction"), [(0.1, 1.0), (10.0, 1.0), (1e-5, 0.1)])
 def test_a_joint_sticks_below_its_friction_and_moves_above_it(physics, inertia, friction, tmp_path):
-    seconds, efforts = 1.0, friction * np.array([0.95, -0.95, 0.0, 1.05, -1.2])
+    seconds, efforts = 0.5, friction * np.array([0.95, -0.95, 0.0, 1.05, -1.2])
     if inertia < 1e-3:
         seconds = 0.01  # then it is at PhysX's largest joint speed
     rollout = push(wheel(tmp_path, inertia, friction=friction), efforts, seconds, physics, substeps=1)

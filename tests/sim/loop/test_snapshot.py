@@ -34,7 +34,8 @@ def params(robot, **options):
     return robot.params(**options)
 
 
-KINDS = [(name, control, 0) for name in ("panda", RUBBING, "jaco2") for control in ("pid", "drive", "effort")]
+KINDS = [(name, control, 0) for name in ("panda", "jaco2") for control in ("pid", "drive", "effort")]
+KINDS += [(RUBBING, "pid", 0), (RUBBING, "drive", 0)]
 
 
 @pytest.mark.parametrize(("name", "control", "workers"), [*KINDS, ("jaco2", "pid", 2)])

@@ -1,0 +1,103 @@
+"""Watch over the contacts of robots that share PhysX systems: which of them have to move to a system to themselves.
+
+A robot is looked at where the engine lists pairs of its links and it has no region in which no contact can be
+predicted, or has left that region (:mod:`sim.engine.contact_prediction`). When a robot is looked at depends on it
+alone, and not on the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine.building import SceneSpec, link_extents
+from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
+from sim.engine.dynamics import scene_dynamics
+
+Float64 = NDArray[np.float64]
+
+
+class ContactWatch:
+    """Watch over ``size`` robots of ``spec``, of which ``robot`` is one of SAPIEN's."""
+
+    def __init__(self, spec: SceneSpec, robot: Any, size: int) -> None:
+        self._spec = spec
+        self._predictor = ContactPredictor(link_extents(robot), robot.dof, spec.timestep)
+        self._regions = SafeRegions(size, robot.dof)
+        self._sharing: dict[int, Any] = {}
+
+    def bind(self, robots: Sequence[Any], systems: Sequence[Any], rows: Iterable[int]) -> None:
+        """Watch the robots ``rows``, those that share systems and may touch, and no others."""
+        self._robots, self._sharing = robots, {row: systems[row] for row in rows}
+        self._links = {link: (row, i) for row in self._sharing for i, link in enumerate(robots[row].links)}
+        self._choose_systems()
+
+    def _choose_systems(self) -> None:
+        """Choose the systems to look at in every sim step: those with a robot that has no region."""
+        known = self._regions.known
+        self._systems = list(dict.fromkeys(system for row, system in self._sharing.items() if not known[row]))
+
+    def place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> list[bool]:
+        """Return for each robot of ``rows`` whether contact is predicted, after it was placed there (rows, dof)."""
+        self._regions.drop(list(rows))
+        model, found = scene_dynamics(self._spec), dict[bytes, tuple[bool, Float64 | None]]()
+        predicted = []
+        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+            state = position.tobytes() + velocity.tobytes()
+            if state not in found:
+                found[state] = self._judge(model.near_pairs(position), position, velocity)
+            touches, weights = found[state]
+            predicted.append(touches)
+            if weights is not None:
+                self._regions.enter(row, position, weights)
+        self._choose_systems()
+        return predicted
+
+    def step(self, read_qpos: Callable[[], Float64]) -> tuple[list[int], Float64 | None]:
+        """Return the robots for which contact is predicted after a sim step, and the positions if they were needed."""
+        qpos, left = None, list[int]()
+        if self._regions.any:
+            qpos = read_qpos()
+            if left := self._regions.left(qpos):
+                self._regions.drop(left)
+                left = [row for row in left if row in self._sharing]
+        systems = self._systems
+        if left:
+            systems = list(dict.fromkeys([*systems, *(self._sharing[row] for row in left)]))
+        near: dict[int, list[NearPair]] = {row: [] for row in left}
+        for system in systems:
+            if contacts := system.get_contacts():
+                self._add_near_pairs(contacts, near)
+        return (self._look(near) if near else []), qpos
+
+    def _add_near_pairs(self, contacts: Iterable[Any], near: dict[int, list[NearPair]]) -> None:
+        """Add to ``near`` the pairs in a system's contacts, those of robots without a region."""
+        for contact in contacts:
+            (row, first), (other, second) = (self._links.get(body, (None, WORLD)) for body in contact.bodies)
+            row = other if row is None else row
+            if row is not None and not self._regions.known[row]:
+                distance = min([point.separation for point in contact.points])
+                near.setdefault(row, []).append(NearPair(first, second, distance))
+
+    def _look(self, near: dict[int, list[NearPair]]) -> list[int]:
+        """Return the robots for which their pairs predict contact; give the others with pairs a region."""
+        predicted = []
+        for row, pairs in near.items():
+            qpos = self._robots[row].get_qpos()
+            touches, weights = self._judge(pairs, qpos, self._robots[row].get_qvel())
+            if touches:
+                predicted.append(row)
+            if weights is not None:
+                self._regions.enter(row, qpos, weights)
+        self._choose_systems()
+        return predicted
+
+    def _judge(self, pairs: list[NearPair], qpos: NDArray[Any], qvel: NDArray[Any]) -> tuple[bool, Float64 | None]:
+        """Return whether contact is predicted, and the weights of a region if not, but pairs are near."""
+        touches = self._predictor.predicts_contact(pairs, qvel)
+        if touches or not pairs:
+            return touches, None
+        return False, self._predictor.region_weights(pairs, qvel, scene_dynamics(self._spec).link_positions(qpos))

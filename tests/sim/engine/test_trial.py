@@ -1,0 +1,41 @@
+"""Trials: results and errors come from a child process, whose end is told and harms no one."""
+
+import os
+import signal
+
+import pytest
+
+from batchpid.errors import RobotError
+from sim.engine.trial import in_child
+
+
+def parent_and_self() -> tuple[int, int]:
+    return os.getppid(), os.getpid()
+
+
+def refuse() -> None:
+    raise RobotError("no such robot")
+
+
+def test_a_trial_runs_in_a_child_of_one_server():
+    (server, first), (again, second) = in_child(parent_and_self), in_child(parent_and_self)
+    assert server == again
+    assert len({server, first, second, os.getpid()}) == 4
+    assert in_child(divmod, 7, 3) == (2, 1)
+
+
+def test_errors_are_raised_here():
+    with pytest.raises(RobotError, match="no such robot"):
+        in_child(refuse)
+
+
+def test_a_crash_is_told_and_the_next_trial_runs():
+    with pytest.raises(RobotError, match=f"crashes .exit status {-signal.SIGABRT}.*self_collision"):
+        in_child(os.abort)
+    assert in_child(abs, -1) == 1
+
+
+def test_a_server_that_has_ended_is_replaced():
+    server, _ = in_child(parent_and_self)
+    os.kill(server, signal.SIGKILL)
+    assert in_child(parent_and_self)[0] != server
