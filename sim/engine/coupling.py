@@ -12,7 +12,7 @@ constraints and integrals of motion in dynamical systems", Computer Methods in A
 on the follower alone, as of an object, displaces it by 4 F dt^2 (J M^-1 J^T).
 
 PhysX's fixed tendons, which SAPIEN takes for this, hold one follower, but several followers of one leader shake a whole
-arm, or make it diverge. See docs/robots.md.
+arm, or make it diverge. See docs/joints.md.
 """
 
 from __future__ import annotations
