@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from batchpid.errors import InvalidArgumentError
 from batchpid.reference import SimplePID
 from sim.engine.user_content import HeadlessScene
-from sim.robot.description import Settings
+from sim.robot.parts import Settings
 from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]

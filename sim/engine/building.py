@@ -21,9 +21,9 @@ from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
 from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
-from sim.robot.description import Joint
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
+from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
 
 

@@ -14,8 +14,9 @@ from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid
 from sim.engine.collision_groups import Pair
 from sim.engine.contact_prediction import WORLD, NearPair
 from sim.engine.physics import PHYSICS
-from sim.robot.description import Joint, RobotDescription
+from sim.robot.description import RobotDescription
 from sim.robot.mimics import coupling_of
+from sim.robot.parts import Joint
 
 Float64 = NDArray[np.float64]
 

@@ -16,7 +16,8 @@ from sim.engine.collision_groups import Pair
 from sim.engine.dynamics import Dynamics
 from sim.engine.physics import PHYSICS
 from sim.engine.trial import in_child
-from sim.robot.description import Joint, RobotDescription
+from sim.robot.description import RobotDescription
+from sim.robot.parts import Joint
 from sim.robot.self_collision import (
     PENETRATION,
     SAMPLES,

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 from lxml import etree
 
-from sim.robot.description import MOVING_TYPES
 from sim.robot.findings import Finding, finding_of
+from sim.robot.parts import MOVING_TYPES
 from sim.robot.xml import readable
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from lxml import etree
 
-from sim.robot.description import MOVING_TYPES, Placement
+from sim.robot.parts import MOVING_TYPES, Placement
 from sim.robot.rotations import from_rpy, multiply, rotate, to_rpy
 from sim.robot.spatial_inertia import SpatialInertia, total
 from sim.robot.xml import number, numbers

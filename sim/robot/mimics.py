@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from batchpid.coupling import Coupling, Follower
-from sim.robot.description import Joint
+from sim.robot.parts import Joint
 
 
 @lru_cache(maxsize=32)

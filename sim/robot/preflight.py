@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import array, choice, instance, number, within
-from sim.robot.description import Joint, RobotDescription
+from sim.robot.description import RobotDescription
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES
 from sim.robot.findings import SEVERITIES, Finding
+from sim.robot.parts import Joint
 from sim.robot.stability import stability_report
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding

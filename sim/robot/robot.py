@@ -17,11 +17,12 @@ import batchpid as bp
 from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
-from sim.robot.description import Joint, RobotDescription, Settings
+from sim.robot.description import RobotDescription
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.findings import Finding
 from sim.robot.merging import place_links
 from sim.robot.mimics import couple, coupling_of
+from sim.robot.parts import Joint, Settings
 from sim.robot.preflight import check
 from sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from sim.robot.urdf import read_urdf

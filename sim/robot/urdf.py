@@ -15,12 +15,12 @@ from typing import Any
 from lxml import etree
 
 from batchpid.errors import RobotError
-from sim.robot.description import Joint, Link, Mimic, Urdf
 from sim.robot.findings import Finding, refuse
 from sim.robot.inertia import from_entries, triangle_excess
 from sim.robot.joint_repair import ends_of
 from sim.robot.link_repair import MOMENTS
 from sim.robot.meshes import find_mesh, mesh_problem
+from sim.robot.parts import Joint, Link, Mimic, Urdf
 from sim.robot.repair import repair
 from sim.robot.xml import number, numbers, parse_xml
 

@@ -25,7 +25,7 @@ from lxml import etree
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.validate import integer, number
-from sim.robot.description import MOVING_TYPES
+from sim.robot.parts import MOVING_TYPES
 from sim.robot.xml import SIZE_LIMIT
 from sim.workers.worker import ONE_THREAD
 

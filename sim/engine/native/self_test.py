@@ -12,7 +12,7 @@ from sim.engine.building import SceneSpec, build_scene, new_system
 from sim.engine.calls import PythonCalls
 from sim.engine.native import NativeCalls
 from sim.engine.physics import PHYSICS
-from sim.robot.description import Joint
+from sim.robot.parts import Joint
 
 STEPS = 50
 _BODY = """<inertial><mass value="1.5"/>

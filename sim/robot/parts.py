@@ -1,0 +1,132 @@
+"""Parts of a robot's description: joints, links, the text for the simulator, and the settings of bundled robots."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.observation import OBSERVED
+from sim.robot.findings import Finding
+
+Float64 = NDArray[np.float64]
+
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+"""URDF joint types that SAPIEN turns into degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """Coupling of a joint's position to another's: ``q = multiplier * q_of_joint + offset``."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint of a URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
+
+    Limits that the URDF leaves out are infinite. ``origin`` [m] and ``rpy`` [rad] place the joint in its parent link;
+    ``axis`` is a direction in the joint's frame, not normalised.
+    """
+
+    name: str
+    type: str
+    parent_link: str
+    child_link: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort_limit: float = math.inf
+    velocity_limit: float = math.inf
+    damping: float = 0.0
+    friction: float = 0.0
+    mimic: Mimic | None = None
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+
+    @property
+    def moves(self) -> bool:
+        """True if the joint is a degree of freedom."""
+        return self.type in MOVING_TYPES
+
+    @property
+    def continuous(self) -> bool:
+        """True if positions wrap at a full turn (URDF type ``continuous``)."""
+        return self.type == "continuous"
+
+    @property
+    def unit(self) -> str:
+        """Unit of position: ``"m"`` for a prismatic joint, else ``"rad"``."""
+        return "m" if self.type == "prismatic" else "rad"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
+        return OBSERVED["effort"].unit_for(self.unit)
+
+
+@dataclass(frozen=True)
+class Link:
+    """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
+
+    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
+    that inertia tensor: see :func:`sim.robot.inertia.triangle_excess`.
+    """
+
+    name: str
+    mass: float | None
+    collisions: int
+    inertial: bool
+    triangle_excess: float = 0.0
+
+
+class Placement(NamedTuple):
+    """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz`` (4,)."""
+
+    link: str
+    position: Float64
+    wxyz: Float64
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Tutorial's poses and gains of a bundled robot, in joint order.
+
+    ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID; ``drive_stiffness`` and
+    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate; ``notes``: differences from
+    the tutorial, in words.
+    """
+
+    start: Float64
+    target: Float64
+    kp: Float64
+    ki: Float64
+    kd: Float64
+    drive_stiffness: float
+    drive_damping: float
+    rate_hz: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Urdf:
+    """URDF prepared for headless simulation.
+
+    ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
+    fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
+    that were not found or cannot be read, the latter with the reason. ``repairs`` are the findings of what was changed
+    so that the simulator can run it.
+    """
+
+    name: str
+    urdf: str
+    all_joints: tuple[Joint, ...]
+    links: tuple[Link, ...]
+    missing_meshes: tuple[str, ...]
+    repairs: tuple[Finding, ...]
