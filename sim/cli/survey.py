@@ -48,9 +48,11 @@ class SurveyCommand:
     out: flags.OptionalPath = None
     """Table to write in Markdown, .md."""
 
+    imports = ("sim.tuning.survey",)
+
     def run(self) -> int:
         """Run the command; the exit status is 1 if a robot crashed its process."""
-        from sim.cli.run import bar
+        from sim.cli.progress import bar
         from sim.tuning.survey import find_urdfs, survey
 
         json_path = flags.output_path("json", self.json, (".json",))

@@ -30,8 +30,12 @@ KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
 MAX_OVERSHOOT = 0.05
 """Overshoot that a good move may have, as a fraction of it."""
+LONGEST = 1.0
+"""Shortest duration [s] above which a random move is too hard for the effort limits to be drawn."""
 _LINE = 24
 """Points of a move's line."""
+_STUCK = 0.9
+"""Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
 _EDGE = 0.02
 _PATIENCE = 50
 """Draws in vain after which moves get smaller."""
@@ -93,16 +97,24 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     """Return ``count`` seeded moves within the joint limits, free of contact on the straight line and 5 % beyond it.
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
-    whole range] of them, by the :data:`KINDS` in turn. A robot that is seldom free, such as one with many fingers or
-    legs, moves nearer to its start pose: after each 50 draws in vain, starts and steps lie within half the range.
-    ``ground`` says whether there is one at height 0, by default as :attr:`Robot.has_ground`. Raises
-    InvalidArgumentError where ``count`` or ``size`` is out of range, or the robot touches itself in nearly every pose.
+    whole range] of them, by the :data:`KINDS` in turn. The effort limits allow each move within LONGEST, and hold its
+    ends. A robot that is seldom free, such as one with many fingers or legs, or that is weak, moves nearer to its start
+    pose, or to the pose that it holds most easily: after each 50 draws in vain, starts and steps lie within half the
+    range. ``ground`` says whether there is one at height 0, by default as :attr:`Robot.has_ground`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        ``count`` or ``size`` is out of range, or there are no such moves: the robot touches itself, or is too weak, in
+        nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
     dynamics, rng = robot.dynamics(ground), np.random.default_rng(seed)
-    reach = np.ptp(robot.sample(1000, seed=0), axis=0)
+    poses = robot.sample(1000, seed=0)
+    reach = np.ptp(poses, axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
+    center, movable = _center(robot, poses[:200])
     share, in_vain = 1.0, 0
 
     def draw(index: int) -> tuple[Float64, Float64, str] | None:
@@ -111,7 +123,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
             share, in_vain = share / 2, 0
         kind = KINDS[index % len(KINDS)]
         drawn = robot.sample(1, seed=int(rng.integers(2**31)))[0]
-        start = np.clip(drawn if share == 1 else robot.start + share * (drawn - robot.start), low, high)
+        start = np.clip(drawn if share == 1 else center + share * (drawn - center), low, high)
         joint, fraction = rng.integers(robot.dof), rng.uniform(-1, 1, robot.dof)
         if kind == "all alike":
             fraction[:] = fraction[0]
@@ -120,17 +132,31 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
                 joint = robot.coupling.leader[joint]
             fraction[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
-        step = share * fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
+        step = movable * share * fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
         target = np.clip(start + step, low, high)
         start, target = robot.coupled(start), robot.coupled(target)
         path = start + line * (target - start)
-        if dynamics.in_contact(path[[0, -1]]).any() or dynamics.in_contact(path).any():
+        free = not (dynamics.in_contact(path[[0, -1]]).any() or dynamics.in_contact(path).any())
+        if not free or shortest_durations(robot, Moves(start[None], target[None], (kind,)))[0] > LONGEST:
             in_vain += 1
             return None
         in_vain = 0
         return start, target, kind
 
     return draw_moves(robot, count, draw)
+
+
+def _center(robot: Robot, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+    """Return the pose about which moves lie if they are hard to find, and the joints that can move (dof,).
+
+    It is the start pose, or the one of ``poses`` that takes the least share of the effort limits, if that holds and the
+    start pose does not.
+    """
+    held = np.concatenate([robot.start[None], poses])
+    load = np.abs(motion_effort(robot, held, np.zeros_like(held), np.zeros_like(held)))
+    movable = (load + robot.friction >= robot.design_effort_limit).mean(0) <= _STUCK
+    share = (load / robot.design_effort_limit).max(1)
+    return held[0 if share[0] < 1 else int(np.argmin(share))], movable
 
 
 def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Float64, str] | None]) -> Moves:
@@ -148,9 +174,9 @@ def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Fl
     if len(moves) < count:
         raise InvalidArgumentError(
             "robot",
-            f"{robot.name!r} touches itself or the ground where it should not in nearly every draw of a move: "
-            f"{len(moves)} of {count} were found",
-            remedy="give the moves yourself, or correct the collision shapes (batchpid inspect shows them)",
+            f"{robot.name!r} touches itself or the ground where it should not, or is too weak, in nearly every draw of "
+            f"a move: {len(moves)} of {count} were found",
+            remedy="give the moves yourself, or correct what batchpid inspect lists as touching or weak",
         )
     starts, targets = (np.array([move[end] for move in moves]).reshape(-1, robot.dof) for end in (0, 1))
     return Moves(starts, targets, tuple(name for _, _, name in moves))
