@@ -19,7 +19,7 @@ Impulse-based Dynamic Simulation of Rigid Body Systems, PhD thesis, University o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -93,6 +93,7 @@ class ContactPredictor:
         parents = {(link.parent, number) for number, link in enumerate(links)}
         pairs = [pair for pair in combinations(solid, 2) if pair not in parents and self._arm[pair].any()]
         self._first, self._second = np.array(pairs, int).reshape(-1, 2).T
+        self._arms = self._arm[self._first, self._second]
         radii = np.array([*(link.radius for link in links), 0.0])
         self._radii = radii[self._first] + radii[self._second]
 
@@ -109,13 +110,13 @@ class ContactPredictor:
         accelerated = distance <= ahead + self._lookahead * self._speed_gain
         return bool((distance <= ahead).any()) or int(accelerated.sum()) > 1
 
-    def region_weights(
-        self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], positions: NDArray[np.float64]
-    ) -> Float64:
-        """Return the weights w (dof,) of a region around the present joint positions, of a robot without prediction.
+    def region(
+        self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], positions: Callable[[], Float64]
+    ) -> Float64 | None:
+        """Return the bounds W (pairs, dof) of a region around the present joint positions, where none is predicted.
 
-        No contact is predicted while w . (|q - q0| + STEP_FACTOR |q - q'|) < 1, with q0 the present positions, q those
-        of a later step and q' those of the step before. A pair that is d apart now, whose joints have the reach r, was
+        No contact is predicted while W (|q - q0| + STEP_FACTOR |q - q'|) < 1, with q0 the present positions, q those of
+        a later step and q' those of the step before. A pair that is d apart now, whose joints have the reach r, was
         at least d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
 
         Parameters
@@ -123,20 +124,29 @@ class ContactPredictor:
         pairs, qvel
             Pairs that the engine lists, and joint velocities (dof,): :meth:`predicts_contact` is False for them.
         positions
-            Origins of the links (links, 3) [m]. Pairs that are not listed are LISTED_DISTANCE apart, or as far as the
-            balls around their origins.
+            Function that returns the origins of the links (links, 3) [m]. Pairs that are not listed are LISTED_DISTANCE
+            apart, or as far as the balls around their origins.
+
+        Returns None where listed pairs let the robot leave its region within a step.
         """
         speed, from_rest = np.abs(qvel), self._lookahead * self._speed_gain
-        places = np.vstack([positions, np.zeros(3)])
-        apart = np.linalg.norm(places[self._first] - places[self._second], axis=1)
-        apart = np.where(self._second == WORLD, places[self._first, 2], apart) - self._radii
         arm, distance = self._listed(pairs)
-        arms = np.concatenate([arm, self._arm[self._first, self._second]])
-        # The nearest pair may touch first: one contact has no order.
-        nearest = np.arange(len(distance)) == np.argmin(distance) if len(distance) else np.zeros(0, bool)
-        slack = np.concatenate([distance - from_rest * ~nearest, np.maximum(apart, LISTED_DISTANCE) - from_rest])
-        slack -= self._timestep * (arms @ speed)  # distances are listed of the step before
-        return (arms / np.maximum(slack, 1e-9)[:, None]).max(0)
+        slack = distance - from_rest
+        slack[np.argmin(distance)] += from_rest  # the nearest pair may touch first: one contact has no order
+        listed = self._bounds(arm, slack, speed)
+        if (listed @ speed).max() * (STEP_FACTOR + 1) * self._timestep >= 1:
+            return None
+        places = positions()
+        between = places[self._first] - places[self._second]  # WORLD stands for the last link here
+        apart = np.sqrt(np.einsum("ij,ij->i", between, between))
+        apart = np.where(self._second == WORLD, places[self._first, 2], apart) - self._radii
+        slack = np.maximum(apart, LISTED_DISTANCE) - from_rest
+        return np.concatenate([listed, self._bounds(self._arms, slack, speed)])
+
+    def _bounds(self, arms: Float64, slack: Float64, speed: NDArray[np.floating]) -> Float64:
+        """Return arms / slack, less what pairs (pairs, dof) closed by since the step that distances are listed of."""
+        left = slack - self._timestep * (arms @ speed)
+        return arms / np.maximum(left, 1e-9)[:, None]
 
     def _listed(self, pairs: Iterable[NearPair]) -> tuple[Float64, Float64]:
         """Return the arms (pairs, dof) and the distances (pairs,) of listed pairs."""
@@ -154,11 +164,14 @@ class SafeRegions:
         self.known, self.any = np.zeros(size, bool), False
         self._places = np.zeros((2, size, dof))  # of the step before, and at the center of the region
         self._weights, self._moved = np.zeros_like(self._places), np.zeros_like(self._places)
+        self._bounds = [np.zeros((1, dof))] * size
 
-    def enter(self, row: int, qpos: NDArray[np.floating], weights: Float64) -> None:
-        """Give a robot the region around ``qpos`` (dof,) with these :meth:`ContactPredictor.region_weights`."""
+    def enter(self, row: int, qpos: NDArray[np.floating], bounds: Float64) -> None:
+        """Give a robot the region around ``qpos`` (dof,) with the ``bounds`` of :meth:`ContactPredictor.region`."""
+        weights = bounds.max(0)
         self._places[:, row] = qpos
         self._weights[:, row] = STEP_FACTOR * weights, weights
+        self._bounds[row] = bounds
         self.known[row] = self.any = True
 
     def drop(self, rows: int | list[int] | NDArray[np.bool_]) -> None:
@@ -172,6 +185,8 @@ class SafeRegions:
         moved = np.subtract(qpos, self._places, self._moved)
         np.abs(moved, moved)
         self._places[0] = qpos
-        if np.vdot(moved, self._weights) < 1:  # of all robots together, which costs least
+        # All robots together, then each with the largest of its bounds, then with each of them: the cheapest first.
+        if np.vdot(moved, self._weights) < 1:
             return []
-        return np.flatnonzero(np.einsum("kij,kij->i", moved, self._weights) >= 1).tolist()
+        near = np.flatnonzero(np.einsum("kij,kij->i", moved, self._weights) >= 1).tolist()
+        return [row for row in near if (self._bounds[row] @ (STEP_FACTOR * moved[0, row] + moved[1, row])).max() >= 1]

@@ -8,6 +8,7 @@ alone, and not on the others.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from sim.engine.building import SceneSpec, link_extents
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
-from sim.engine.dynamics import scene_dynamics
+from sim.engine.dynamics import Dynamics, scene_dynamics
 
 Float64 = NDArray[np.float64]
 
@@ -35,6 +36,10 @@ class ContactWatch:
         self._links = {link: (row, i) for row in self._sharing for i, link in enumerate(robots[row].links)}
         self._choose_systems()
 
+    @cached_property
+    def _model(self) -> Dynamics:
+        return scene_dynamics(self._spec)
+
     def _choose_systems(self) -> None:
         """Choose the systems to look at in every sim step: those with a robot that has no region."""
         known = self._regions.known
@@ -43,16 +48,16 @@ class ContactWatch:
     def place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> list[bool]:
         """Return for each robot of ``rows`` whether contact is predicted, after it was placed there (rows, dof)."""
         self._regions.drop(list(rows))
-        model, found = scene_dynamics(self._spec), dict[bytes, tuple[bool, Float64 | None]]()
+        found = dict[bytes, tuple[bool, Float64 | None]]()
         predicted = []
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
             state = position.tobytes() + velocity.tobytes()
             if state not in found:
-                found[state] = self._judge(model.near_pairs(position), position, velocity)
-            touches, weights = found[state]
+                found[state] = self._judge(self._model.near_pairs(position), position, velocity)
+            touches, bounds = found[state]
             predicted.append(touches)
-            if weights is not None:
-                self._regions.enter(row, position, weights)
+            if bounds is not None:
+                self._regions.enter(row, position, bounds)
         self._choose_systems()
         return predicted
 
@@ -87,17 +92,17 @@ class ContactWatch:
         predicted = []
         for row, pairs in near.items():
             qpos = self._robots[row].get_qpos()
-            touches, weights = self._judge(pairs, qpos, self._robots[row].get_qvel())
+            touches, bounds = self._judge(pairs, qpos, self._robots[row].get_qvel())
             if touches:
                 predicted.append(row)
-            if weights is not None:
-                self._regions.enter(row, qpos, weights)
+            if bounds is not None:
+                self._regions.enter(row, qpos, bounds)
         self._choose_systems()
         return predicted
 
     def _judge(self, pairs: list[NearPair], qpos: NDArray[Any], qvel: NDArray[Any]) -> tuple[bool, Float64 | None]:
-        """Return whether contact is predicted, and the weights of a region if not, but pairs are near."""
+        """Return whether contact is predicted, and the bounds of a region if it has one."""
         touches = self._predictor.predicts_contact(pairs, qvel)
         if touches or not pairs:
             return touches, None
-        return False, self._predictor.region_weights(pairs, qvel, scene_dynamics(self._spec).link_positions(qpos))
+        return False, self._predictor.region(pairs, qvel, lambda: self._model.link_positions(qpos))

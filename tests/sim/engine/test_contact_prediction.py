@@ -106,13 +106,15 @@ def test_no_contact_is_predicted_within_a_region(near, qvel, moved, step, share)
     """Pairs close as fast as they can, those that were not listed from LISTED_DISTANCE on."""
     predictor, qvel = ContactPredictor(LINKS, 4, DT), np.array(qvel)
     pairs = [NearPair(*links, distance) for links, distance in near]
-    if predictor.predicts_contact(pairs, qvel):
+    if not pairs or predictor.predicts_contact(pairs, qvel):
         return
     touching = np.zeros((len(LINKS), 3))  # so that balls around the links say nothing
-    weights, regions = predictor.region_weights(pairs, qvel, touching), SafeRegions(1, 4)
-    regions.enter(0, np.zeros(4), weights)
+    bounds, regions = predictor.region(pairs, qvel, lambda: touching), SafeRegions(1, 4)
+    if bounds is None:
+        return
+    regions.enter(0, np.zeros(4), bounds)
     moved, step = np.array(moved), np.array(step)
-    used = weights @ (np.abs(moved + step) + STEP_FACTOR * np.abs(step))
+    used = (bounds @ (np.abs(moved + step) + STEP_FACTOR * np.abs(step))).max()
     if used > 0:
         moved, step = share / used * moved, share / used * step
     regions.left(moved[None])
@@ -128,8 +130,8 @@ def test_no_contact_is_predicted_within_a_region(near, qvel, moved, step, share)
 
 def test_a_region_ends_where_a_joint_has_moved_by_its_weight():
     regions = SafeRegions(3, 2)
-    regions.enter(1, np.array([0.5, 0.0]), np.array([10.0, 0.0]))
-    qpos = np.array([[9.0, 9.0], [0.5, 9.0], [np.nan, 0.0]])
+    regions.enter(1, np.array([0.5, 0.0]), np.array([[10.0, 0.0], [0.0, 3.0]]))
+    qpos = np.array([[9.0, 9.0], [0.5, 0.0], [np.nan, 0.0]])
     assert regions.any
     assert regions.left(qpos) == []
     qpos[1, 0] += 0.5 / (10 * (1 + STEP_FACTOR))
