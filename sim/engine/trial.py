@@ -54,7 +54,6 @@ def in_child(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) 
         try:
             answer = _ask(request)
         except (OSError, EOFError):  # the server has ended
-            _servers.pop(os.getpid(), None)
             answer = _ask(request)
     result, error = pickle.loads(answer)
     if error is not None:
@@ -63,12 +62,12 @@ def in_child(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) 
 
 
 def _ask(request: bytes) -> bytes:
-    if os.getpid() not in _servers:
-        _servers.clear()
-        _servers[os.getpid()] = _start()
-    server = _servers[os.getpid()]
+    server = _servers.pop(os.getpid(), None) or _start()
+    _servers.clear()
     server.send_bytes(request)
-    return server.recv_bytes()
+    answer = server.recv_bytes()
+    _servers[os.getpid()] = server  # not after an interrupt: the answer to this request would be that to the next
+    return answer
 
 
 def _start() -> Connection:

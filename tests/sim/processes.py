@@ -1,4 +1,4 @@
-"""Processes of tests: waiting for their end."""
+"""Processes of tests: children, and waiting for an end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import time
 from collections.abc import Iterable
 
 import psutil
+
+
+def children() -> set[psutil.Process]:
+    """Return the children of this process; libraries of other tests may have some that stay."""
+    return set(psutil.Process().children())
 
 
 def have_ended(pids: Iterable[int], seconds: float = 5.0) -> bool:

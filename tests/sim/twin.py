@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 from identical import assert_identical
-from processes import have_ended
+from processes import children, have_ended
 from robots import load_bundled
 
 import sim.runner
@@ -121,7 +121,7 @@ class Twin:
     """
 
     def __init__(self, folder: Path, workers: int) -> None:
-        self._folder, self._workers, self._files = folder, workers, 0
+        self._folder, self._workers, self._files, self._others = folder, workers, 0, children()
         self.runner, self._model = self._make(workers), self._make(0)
         self._recorders: tuple[Recorder, Recorder] | None = None
         self.snapshots: list[Snapshot] = []
@@ -227,7 +227,7 @@ class Twin:
             runner.close()
         made.clear()
         gc.collect()  # the exception and the frames that it holds refer to each other
-        assert {child.pid for child in psutil.Process().children()} == set(self.runner.pids)
+        assert {child.pid for child in children() - self._others} == set(self.runner.pids)
 
     def compare(self) -> None:
         """Raise AssertionError unless the two agree."""
@@ -262,9 +262,9 @@ def assert_same_snapshot(ours: Snapshot, theirs: Snapshot) -> None:
 def nothing_left() -> Iterator[None]:
     """Raise AssertionError if the block leaves a process, or more than two file descriptors."""
     me = psutil.Process()
-    descriptors, shared = me.num_fds(), set(os.listdir("/dev/shm"))
+    others, descriptors, shared = children(), me.num_fds(), set(os.listdir("/dev/shm"))
     yield
     gc.collect()  # an mmap keeps its descriptor until the arrays on it are collected
-    assert not me.children()
+    assert children() <= others
     assert me.num_fds() <= descriptors + 2
     assert set(os.listdir("/dev/shm")) <= shared

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import threading
+import time
 
 import pytest
 
@@ -39,3 +41,11 @@ def test_a_server_that_has_ended_is_replaced():
     server, _ = in_child(parent_and_self)
     os.kill(server, signal.SIGKILL)
     assert in_child(parent_and_self)[0] != server
+
+
+def test_the_answer_to_an_interrupted_trial_is_not_that_to_the_next():
+    in_child(abs, -1)
+    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        in_child(time.sleep, 0.3)
+    assert in_child(abs, -1) == 1
