@@ -481,7 +481,7 @@ class Runner:
 
         def commit(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
             faults, unrecorded = books.faults, books.unrecorded
-            for done, arrays in enumerate(pool.ticks[:ticks], start=1):
+            for done, arrays in enumerate(pool.ticks.first(ticks), start=1):
                 faults = faults.noting(arrays)
                 if self.recorder is not None:
                     time = (books.steps + done * substeps) * self.timestep

@@ -71,3 +71,25 @@ class Arrays(NamedTuple):
         part = itemgetter(index)
         command, observation, fault = (map(part, group) for group in self)
         return Arrays(Command._make(command), Observation._make(observation), FaultArrays._make(fault))
+
+
+class Ticks:
+    """Views of :class:`Arrays` (ticks, envs, ...) at each tick, made when first used."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        self._arrays, self._views = arrays, list[Arrays]()
+
+    def __len__(self) -> int:
+        return len(self._arrays.observation.ok)
+
+    def __getitem__(self, tick: int) -> Arrays:
+        """Return the views at a tick, 0 or more."""
+        views = self._views
+        return views[tick] if tick < len(views) else self.first(tick + 1)[tick]
+
+    def first(self, count: int) -> list[Arrays]:
+        """Return the views at the first ``count`` ticks."""
+        views = self._views
+        while len(views) < count:
+            views.append(self._arrays.at(len(views)))
+        return views[:count]

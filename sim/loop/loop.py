@@ -15,7 +15,7 @@ import batchpid as bp
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.engine.variation import VariedPack
-from sim.loop.arrays import Arrays, Command
+from sim.loop.arrays import Arrays, Command, Ticks
 from sim.loop.env_group import EnvGroup
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.options import RunnerOptions
@@ -43,7 +43,7 @@ class Loop:
     def __init__(self, options: RunnerOptions, params: bp.PIDParams, envs: slice, arrays: Arrays) -> None:
         robot = options.robot
         self.options, self.arrays = options, arrays
-        self.ticks = [arrays.at(tick) for tick in range(len(arrays.observation.ok))]
+        self.ticks = Ticks(arrays)
         """Input and output of each tick."""
         self._first_env = envs.start
         self._scene = SceneSpec(
@@ -88,7 +88,7 @@ class Loop:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
         began = time.perf_counter()
         for group, first_rows in zip(self.groups, self._first_rows, strict=True):
-            for done, tick in enumerate(self.ticks[:ticks]):
+            for done, tick in enumerate(self.ticks.first(ticks)):
                 rows = tick.at(group.envs) if done else first_rows
                 setpoint, rate, feedforward = rows.command
                 command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, WorkerError
-from sim.loop.arrays import Arrays
+from sim.loop.arrays import Arrays, Ticks
 from sim.options import RunnerOptions
 from sim.workers.background import BACKGROUND
 from sim.workers.memory import check_memory
@@ -88,7 +88,7 @@ class WorkerPool:
         self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
-        self.ticks = [self.arrays.at(tick) for tick in range(ticks)]
+        self.ticks = Ticks(self.arrays)
         """Input and output of each tick."""
         self.present = self.ticks[0]
         """The tick that holds the present observation."""
