@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer, number
+from sim.robot.description import Dynamics
 from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
@@ -34,8 +35,10 @@ LONGEST = 1.0
 """Shortest duration [s] above which a random move is too hard for the effort limits to be drawn."""
 _LINE = 24
 """Points of a move's line."""
+_EASY, _ROUNDS, _TRIED, _CHANGED = 0.6, 80, 8, 0.3
 _STUCK = 0.9
 """Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
+_CLEARANCE, _ROOMY = 1e-3, 1e-2  # m
 _EDGE = 0.02
 _PATIENCE = 50
 """Draws in vain after which moves get smaller."""
@@ -114,7 +117,8 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     reach = np.ptp(poses, axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
-    center, movable = _center(robot, poses[:200])
+    center, movable = _center(robot, dynamics, poses[:200])
+    clearance = 0.0 if dynamics.in_contact(center[None], _CLEARANCE)[0] else _CLEARANCE
     share, in_vain = 1.0, 0
 
     def draw(index: int) -> tuple[Float64, Float64, str] | None:
@@ -136,7 +140,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         target = np.clip(start + step, low, high)
         start, target = robot.coupled(start), robot.coupled(target)
         path = start + line * (target - start)
-        free = not (dynamics.in_contact(path[[0, -1]]).any() or dynamics.in_contact(path).any())
+        free = not any(dynamics.in_contact(qpos, clearance).any() for qpos in (path[[0, -1]], path))
         if not free or shortest_durations(robot, Moves(start[None], target[None], (kind,)))[0] > LONGEST:
             in_vain += 1
             return None
@@ -146,17 +150,37 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     return draw_moves(robot, count, draw)
 
 
-def _center(robot: Robot, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+def _center(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
     """Return the pose about which moves lie if they are hard to find, and the joints that can move (dof,).
 
-    It is the start pose, or the one of ``poses`` that takes the least share of the effort limits, if that holds and the
-    start pose does not.
+    It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise it is one for which
+    that is more so, found by descent: some joints of the best so far move towards those of random poses, ever less.
     """
-    held = np.concatenate([robot.start[None], poses])
-    load = np.abs(motion_effort(robot, held, np.zeros_like(held), np.zeros_like(held)))
-    movable = (load + robot.friction >= robot.design_effort_limit).mean(0) <= _STUCK
-    share = (load / robot.design_effort_limit).max(1)
-    return held[0 if share[0] < 1 else int(np.argmin(share))], movable
+    rng = np.random.default_rng(0)
+
+    def shares(qpos: Float64) -> Float64:
+        still = np.zeros_like(qpos)
+        return np.abs(motion_effort(robot, qpos, still, still)) / robot.design_effort_limit
+
+    def cost(qpos: Float64, share: float) -> tuple[float, ...]:
+        levels = (0.0, _CLEARANCE, _ROOMY)  # contact at one of them is contact at the next
+        apart = next((n for n, level in enumerate(levels) if dynamics.in_contact(qpos[None], level)[0]), len(levels))
+        return float(apart == 0), float(share >= 1), float(len(levels) - apart), max(share, _EASY)
+
+    movable = (shares(poses) + robot.friction / robot.design_effort_limit >= 1).mean(0) <= _STUCK
+    center = robot.start
+    least = cost(center, float(shares(center[None]).max()))
+    for spread in np.geomspace(1.0, 0.05, _ROUNDS):
+        if least == (0, 0, 0, _EASY):
+            break
+        changed = rng.random(poses.shape) < _CHANGED
+        tried = robot.coupled(np.where(changed, center + spread * (poses - center), center))
+        share = shares(tried).max(1)
+        for index in np.argsort(share, kind="stable")[:_TRIED]:
+            if (found := cost(tried[index], float(share[index]))) < least:
+                center, least = tried[index], found
+                break
+    return center, movable
 
 
 def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Float64, str] | None]) -> Moves:
@@ -198,7 +222,7 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
         moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
         along = moving * step > 0  # there friction and damping take their share of the effort
         room = np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
-        if (room > 0).all():
+        if (room > 0).all() and (np.abs(gravity) < limit).all():
             drag = along * robot.damping * np.abs(rate * step)  # room T^2 - drag T - |moving| >= 0
             durations[row] = ((drag + np.sqrt(drag**2 + 4 * room * np.abs(moving))) / (2 * room)).max()
     return durations
