@@ -19,6 +19,7 @@ from sim.engine.trial import in_child
 from sim.robot.description import RobotDescription
 from sim.robot.parts import Joint
 from sim.robot.self_collision import (
+    GAP,
     PENETRATION,
     SAMPLES,
     DisabledPair,
@@ -59,7 +60,7 @@ def self_contact(robot: RobotDescription) -> SelfContact:
     elif touching:
         at_rest, *samples = measured.distances
         rest = [pair for pair, distance in at_rest.items() if distance < -PENETRATION]
-        contacts = [[pair for pair, distance in sample.items() if distance < 0] for sample in samples]
+        contacts = [[pair for pair, distance in sample.items() if distance < GAP] for sample in samples]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, contacts)
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]

@@ -18,6 +18,8 @@ SELF_COLLISION = ("auto", "urdf", "none")
 """Values of the option ``self_collision`` of :meth:`sim.Robot.load`."""
 ALWAYS = 0.95
 """Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
+GAP = 1e-3
+"""Distance [m] that counts as contact there: links built to glide along each other never come apart."""
 SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
 PENETRATION = 1e-3
