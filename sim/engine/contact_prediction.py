@@ -127,21 +127,23 @@ class ContactPredictor:
             Function that returns the origins of the links (links, 3) [m]. Pairs that are not listed are LISTED_DISTANCE
             apart, or as far as the balls around their origins.
 
-        Returns None where listed pairs let the robot leave its region within a step.
+        Returns None where the robot would leave its region within a step.
         """
         speed, from_rest = np.abs(qvel), self._lookahead * self._speed_gain
         arm, distance = self._listed(pairs)
         slack = distance - from_rest
         slack[np.argmin(distance)] += from_rest  # the nearest pair may touch first: one contact has no order
         listed = self._bounds(arm, slack, speed)
-        if (listed @ speed).max() * (STEP_FACTOR + 1) * self._timestep >= 1:
+        step = (STEP_FACTOR + 1) * self._timestep * speed
+        if (listed @ step).max() >= 1:
             return None
         places = positions()
         between = places[self._first] - places[self._second]  # WORLD stands for the last link here
         apart = np.sqrt(np.einsum("ij,ij->i", between, between))
         apart = np.where(self._second == WORLD, places[self._first, 2], apart) - self._radii
         slack = np.maximum(apart, LISTED_DISTANCE) - from_rest
-        return np.concatenate([listed, self._bounds(self._arms, slack, speed)])
+        bounds = np.concatenate([listed, self._bounds(self._arms, slack, speed)])
+        return None if (bounds @ step).max() >= 1 else bounds
 
     def _bounds(self, arms: Float64, slack: Float64, speed: NDArray[np.floating]) -> Float64:
         """Return arms / slack, less what pairs (pairs, dof) closed by since the step that distances are listed of."""

@@ -20,6 +20,9 @@ from sim.engine.dynamics import Dynamics, scene_dynamics
 
 Float64 = NDArray[np.float64]
 
+RETRY_LOOKS = 10
+"""Looks at a robot after one that found no region, as it moves too fast, until a region is tried again."""
+
 
 class ContactWatch:
     """Watch over ``size`` robots of ``spec``, of which ``robot`` is one of SAPIEN's."""
@@ -28,6 +31,7 @@ class ContactWatch:
         self._spec = spec
         self._predictor = ContactPredictor(link_extents(robot), robot.dof, spec.timestep)
         self._regions = SafeRegions(size, robot.dof)
+        self._waits = np.zeros(size, int)  # looks until a region is tried again
         self._sharing: dict[int, Any] = {}
 
     def bind(self, robots: Sequence[Any], systems: Sequence[Any], rows: Iterable[int]) -> None:
@@ -48,6 +52,7 @@ class ContactWatch:
     def place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> list[bool]:
         """Return for each robot of ``rows`` whether contact is predicted, after it was placed there (rows, dof)."""
         self._regions.drop(list(rows))
+        self._waits[list(rows)] = 0
         found = dict[bytes, tuple[bool, Float64 | None]]()
         predicted = []
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
@@ -92,17 +97,22 @@ class ContactWatch:
         predicted = []
         for row, pairs in near.items():
             qpos = self._robots[row].get_qpos()
-            touches, bounds = self._judge(pairs, qpos, self._robots[row].get_qvel())
+            self._waits[row] -= self._waits[row] > 0
+            touches, bounds = self._judge(pairs, qpos, self._robots[row].get_qvel(), not self._waits[row])
             if touches:
                 predicted.append(row)
             if bounds is not None:
                 self._regions.enter(row, qpos, bounds)
+            elif pairs and not self._waits[row]:
+                self._waits[row] = RETRY_LOOKS
         self._choose_systems()
         return predicted
 
-    def _judge(self, pairs: list[NearPair], qpos: NDArray[Any], qvel: NDArray[Any]) -> tuple[bool, Float64 | None]:
-        """Return whether contact is predicted, and the bounds of a region if it has one."""
+    def _judge(
+        self, pairs: list[NearPair], qpos: NDArray[Any], qvel: NDArray[Any], settles: bool = True
+    ) -> tuple[bool, Float64 | None]:
+        """Return whether contact is predicted, and the bounds of a region if it has one and ``settles``."""
         touches = self._predictor.predicts_contact(pairs, qvel)
-        if touches or not pairs:
+        if touches or not pairs or not settles:
             return touches, None
         return False, self._predictor.region(pairs, qvel, lambda: self._model.link_positions(qpos))
