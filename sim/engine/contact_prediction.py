@@ -105,10 +105,13 @@ class ContactPredictor:
         MAX_ACCELERATION * timestep: fingers at rest a millimetre apart that spring together touch at one place first,
         and one contact has no order.
         """
-        arm, distance = self._listed(pairs)
-        ahead = self._lookahead * (arm @ np.abs(qvel))
-        accelerated = distance <= ahead + self._lookahead * self._speed_gain
-        return bool((distance <= ahead).any()) or int(accelerated.sum()) > 1
+        speed, accelerated = np.abs(qvel), 0
+        for pair in pairs:
+            closing = float(self._arm[pair.first, pair.second] @ speed)
+            if pair.distance <= self._lookahead * closing:
+                return True
+            accelerated += pair.distance <= self._lookahead * (closing + self._speed_gain)
+        return accelerated > 1
 
     def region(
         self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], positions: Callable[[], Float64]

@@ -20,7 +20,7 @@ from sim.engine.dynamics import Dynamics, scene_dynamics
 
 Float64 = NDArray[np.float64]
 
-RETRY_LOOKS = 10
+RETRY_LOOKS = 50
 """Looks at a robot after one that found no region, as it moves too fast, until a region is tried again."""
 
 
