@@ -8,11 +8,19 @@ from robots import load_bundled
 
 import batchpid as bp
 from sim.cli import parse
+from sim.tuning.moves import random_moves
 from sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
-SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--workers", 0)
+SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--workers", 0, "--physics", "fast")
+
+
+@pytest.fixture(autouse=True)
+def few_moves(monkeypatch):
+    """Let the final of a search and the table of the commands have two random moves."""
+    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 2)
+    monkeypatch.setattr("sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 2), seed))
 
 
 def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_path):
