@@ -31,7 +31,7 @@ SHORTER = {
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
-ONLY_PARSED = ("bench", "tune", "render")
+ONLY_PARSED = ("bench", "tune", "render", "survey")
 
 
 def name(page: Path) -> str:
