@@ -5,9 +5,13 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +19,7 @@ from numpy.typing import NDArray
 from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from sim.benchmark.workload import Case, Workload
 from sim.engine.pack import Pack
+from sim.workers.background import BACKGROUND
 from sim.workers.placement import pinned_cores
 from sim.workers.worker import ONE_THREAD
 
@@ -40,7 +45,7 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
         arguments = (theirs, workload, bounds[index + 1] - bounds[index])
         process = context.Process(target=_serve, args=arguments, daemon=True)
         with single_threaded():
-            process.start()
+            BACKGROUND.call(partial(_start, process))
         theirs.close()
         if cores:
             os.sched_setaffinity(process.pid or 0, {cores[index]})
@@ -74,6 +79,13 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
         return Case(workload.steps * envs, reset, run, close)
 
     return {name: case(name) for name in (*TUTORIALS, *ENGINES)}
+
+
+def _start(process: BaseProcess) -> None:
+    """Start a process that Ctrl-C does not reach; called in the background thread, where SIGINT is blocked."""
+    resource_tracker.ensure_running()  # the first start of a process does this, and unblocks SIGINT
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    process.start()
 
 
 @contextmanager

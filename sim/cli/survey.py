@@ -71,8 +71,10 @@ class SurveyCommand:
         )
         done = list(bar("surveying", unit="robot", total=len(urdfs))(reports))
         if json_path is not None:
+            json_path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(json_path, json.dumps([report.asdict() for report in done], indent=1) + "\n")
         if out is not None:
+            out.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(out, survey_table(done, "github") + "\n")
         print(survey_table(done, "simple"))
         print(f"\n{survey_summary(done)}")

@@ -140,20 +140,26 @@ def survey(
         "dissipation": dissipation,
     }
     running: set[subprocess.Popen[str]] = set()
+    stop = threading.Event()
     pool = ThreadPoolExecutor(integer("processes", processes, 1, 1024))
     try:
-        yield from pool.map(lambda urdf: _in_a_process(urdf, options, time_limit, running), urdfs)
+        yield from pool.map(lambda urdf: _in_a_process(urdf, options, time_limit, running, stop), urdfs)
     finally:
+        stop.set()
         pool.shutdown(wait=False, cancel_futures=True)
         for child in list(running):
             child.kill()
 
 
 def _in_a_process(
-    urdf: Path, options: dict[str, Any], time_limit: float, running: set[subprocess.Popen[str]]
+    urdf: Path,
+    options: dict[str, Any],
+    time_limit: float,
+    running: set[subprocess.Popen[str]],
+    stop: threading.Event,
 ) -> RobotReport:
     """Return the report on ``urdf`` that a process makes; a process that crashes is an error of its robot."""
-    began, report = time.monotonic(), RobotReport(str(urdf))
+    began, report, stage = time.monotonic(), RobotReport(str(urdf)), STAGES[0]
     child = subprocess.Popen(
         [sys.executable, "-P", "-c", _PROGRAM, json.dumps(sys.path), json.dumps([str(urdf), options])],
         stdin=subprocess.PIPE,  # its end is the parent's
@@ -163,6 +169,8 @@ def _in_a_process(
         env=os.environ | ONE_THREAD,
     )
     running.add(child)
+    if stop.is_set():  # while the process was started
+        child.kill()
     timer = threading.Timer(time_limit, child.kill)
     timer.start()
     try:

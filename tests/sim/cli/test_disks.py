@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from disks import fill, limited_file_size, make_read_only, small_disk
+from tiny_urdf import one_joint, write
 
 import batchpid as bp
 from batchpid.files import try_writing
 from sim import Recorder, Runner, Snapshot, plots, write_recording
+from sim.benchmark import benchmark
+from sim.cli import run as cli_run
+from sim.tuning import survey as surveying
 from sim.view import film
 
 SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
-TUNE = ("tune", "--generations", "1", "--population", "2", "--search-seconds", "0.02", "--workers", "0")
+TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
 COMMANDS = {
     "demo": (("demo", *SHORT, "--picture"), "a.png"),
     "rollout npz": (("rollout", *SHORT, "--out"), "a.npz"),
@@ -26,11 +30,13 @@ COMMANDS = {
     "render": (("render", "RUN", "--fps", "120", "--width", "64", "--height", "64", "--out"), "a.mp4"),
     "compare": (("compare", "--moves", "1", "--workers", "0", "--seconds", "0.02", "--picture"), "a.png"),
     "bench": (("bench", "--num-envs", "1", "--workers", "0", "--ticks", "100", "--rounds", "1", "--out"), "a.json"),
+    "survey json": (("survey", "URDF", "--workers", "1", "--out", "OTHER.md", "--json"), "a.json"),
+    "survey": (("survey", "URDF", "--workers", "1", "--json", "OTHER.json", "--out"), "a.md"),
     "tune": ((*TUNE, "--picture", "OTHER.png", "--out"), "a.yaml"),
     "tune picture": ((*TUNE, "--out", "OTHER.yaml", "--picture"), "a.png"),
 }
 """Flags of each command that writes, its output last."""
-SECONDS_LONG = {"compare", "bench", "tune", "tune picture"}
+SECONDS_LONG = {"compare", "bench", "survey json", "survey", "tune", "tune picture"}
 NEEDS = {"rollout h5": "h5py", "render": "imageio_ffmpeg", "tune": "cmaes", "tune picture": "cmaes"}
 
 
@@ -68,11 +74,13 @@ def command(batchpid, rollout, tmp_path, monkeypatch):
     monkeypatch.setattr(film, "render_problem", lambda: None)
     monkeypatch.setattr(film, "_RenderScene", Grey)
     run = write_recording(rollout, tmp_path / "run.npz")
+    urdf = write(tmp_path, one_joint(), "one_joint.urdf")
 
     def run_it(name: str, path: Path) -> tuple[int, str]:
         if name in NEEDS:
             pytest.importorskip(NEEDS[name])
-        words = {"RUN": run, "OTHER.png": tmp_path / "other.png", "OTHER.yaml": tmp_path / "other.yaml"}
+        words = {"RUN": run, "URDF": urdf}
+        words |= {word: tmp_path / word.lower() for word in COMMANDS[name][0] if word.startswith("OTHER.")}
         status, _, err = batchpid(*(words.get(word, word) for word in COMMANDS[name][0]), path)
         return status, err
 
@@ -159,7 +167,28 @@ def test_a_disk_that_fills_up_during_the_run_keeps_the_older_file(name, command,
         assert run_while_filling(command, name, disk, 0, monkeypatch) == 2
 
 
+@pytest.fixture
+def simulated_once(monkeypatch):
+    """Long simulations of the commands give their first result in every later run too."""
+
+    def once(function):
+        results = []
+
+        def remember(*arguments, **options):
+            if not results:
+                result = function(*arguments, **options)
+                results.append(list(result) if isinstance(result, Iterator) else result)
+            return results[0]
+
+        return remember
+
+    for module, name in ((cli_run, "evaluate_sets"), (benchmark, "measure_rates"), (benchmark, "measure_phases")):
+        monkeypatch.setattr(module, name, once(getattr(module, name)))
+    monkeypatch.setattr(surveying, "survey", once(surveying.survey))
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("simulated_once")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_disk_with_any_space_left_keeps_the_older_file_or_holds_the_new_one(name, command, tmp_path, monkeypatch):
     statuses = set()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 
 import pytest
 from tiny_urdf import one_joint
@@ -39,6 +41,12 @@ def test_reports_come_in_order_with_all_that_is_known(folder):
 def test_a_robot_that_takes_too_long_is_ended(folder):
     (report,) = survey([folder / "deep" / "arm.urdf"], moves=1000, seconds=600.0, time_limit=2.0)
     assert report.error.endswith("more than 2 s")
+
+
+def test_a_process_that_ends_at_once_is_an_error_of_its_robot(folder, monkeypatch):
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    (report,) = survey([folder / "deep" / "arm.urdf"])
+    assert report.error == "reading the URDF: exit status 1"
 
 
 def test_files_and_folders_are_found_once(folder):
