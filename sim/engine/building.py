@@ -18,7 +18,6 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
 from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
-from sim.engine.contact_prediction import LinkExtent
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
 from sim.robot.dissipation import DISSIPATION
@@ -238,25 +237,6 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             built.set_drive_properties(0.0, 0.0)
             built.set_armature(np.array([spec.timestep * joint.damping], np.float32))
     return scene, robot
-
-
-def link_extents(robot: Any) -> list[LinkExtent]:
-    """Return the extents of a robot's links, parents first."""
-    dofs = {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
-    numbers = {link: number for number, link in enumerate(robot.links)}
-    extents = []
-    for link in robot.links:
-        joint, slides = link.joint, link.joint.type == "prismatic"
-        offset = np.linalg.norm(joint.pose_in_parent.p) + np.linalg.norm(joint.pose_in_child.p)
-        if slides:
-            offset += np.abs(np.clip(joint.limits, -10.0, 10.0)).max(initial=0.0)  # a rail may have no end
-        radius = 0.0
-        if link.collision_shapes:
-            corners = np.abs(link.compute_global_aabb_tight() - link.entity_pose.p)
-            radius = float(np.linalg.norm(corners.max(0)))
-        parent = None if link.parent is None else numbers[link.parent]
-        extents.append(LinkExtent(parent, dofs.get(joint.name), slides, float(offset), radius))
-    return extents
 
 
 def link_frames(spec: SceneSpec, robot: Any) -> Frames:

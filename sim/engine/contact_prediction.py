@@ -20,7 +20,6 @@ Impulse-based Dynamic Simulation of Rigid Body Systems, PhD thesis, University o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -55,8 +54,13 @@ class LinkExtent(NamedTuple):
     """True if that joint is prismatic."""
     offset: float
     """Largest distance of the link's frame from its parent's [m]."""
-    radius: float
-    """Largest distance of a point of its shapes from its frame [m]."""
+    balls: Float64
+    """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a point of its shapes from its frame [m]."""
+        return float((np.linalg.norm(self.balls[:, :3], axis=1) + self.balls[:, 3]).max(initial=0.0))
 
 
 class NearPair(NamedTuple):
@@ -68,13 +72,16 @@ class NearPair(NamedTuple):
 
 
 class ContactPredictor:
-    """Predictor of contact for a robot made of ``links``, parents first.
+    """Predictor of contact for a robot made of ``links``, parents first, of which the ``pairs`` may touch.
 
     ``reach`` (len(links) + 1, dof) is the largest speed of a point of each link per unit of each joint's speed: the
-    distance from the joint [m], or 1 for a joint that slides. The last row is the world's.
+    distance from the joint [m], or 1 for a joint that slides. The last row is the world's. ``arms`` (pairs, dof) is how
+    fast the links of a pair close, at most, per unit of each joint's speed.
     """
 
-    def __init__(self, links: Sequence[LinkExtent], dof: int, timestep: float) -> None:
+    def __init__(
+        self, links: Sequence[LinkExtent], pairs: Iterable[tuple[int, int]], dof: int, timestep: float
+    ) -> None:
         self.reach = reach = np.zeros((len(links) + 1, dof))
         for row, link in zip(reach, links, strict=False):
             radius, at = link.radius, link
@@ -88,14 +95,18 @@ class ContactPredictor:
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
         self._lookahead, self._speed_gain = LOOKAHEAD_STEPS * timestep, MAX_ACCELERATION * timestep
         self._timestep = timestep
-        # Pairs that the engine may list: it ignores those of a link and its parent.
-        solid = [*(number for number, link in enumerate(links) if link.radius > 0), WORLD]
-        parents = {(link.parent, number) for number, link in enumerate(links)}
-        pairs = [pair for pair in combinations(solid, 2) if pair not in parents and self._arm[pair].any()]
+        pairs = [pair for pair in pairs if self._arm[pair].any()]
         self._first, self._second = np.array(pairs, int).reshape(-1, 2).T
-        self._arms = self._arm[self._first, self._second]
-        radii = np.array([*(link.radius for link in links), 0.0])
-        self._radii = radii[self._first] + radii[self._second]
+        self.arms = self._arm[self._first, self._second]
+        self._index = np.full(self._arm.shape[:2], -1)
+        self._index[self._first, self._second] = self._index[self._second, self._first] = np.arange(len(pairs))
+        self._balls = np.concatenate([link.balls for link in links])
+        counts = np.array([len(link.balls) for link in links])
+        self._owner = np.repeat(np.arange(len(links)), counts)
+        # Rows of the links with shapes in tables of them; WORLD has the last.
+        self._starts = (np.cumsum(counts) - counts)[counts > 0]
+        rows = np.append(np.cumsum(counts > 0) - 1, np.count_nonzero(counts))
+        self._first_row, self._second_row = rows[self._first], rows[self._second]
 
     def predicts_contact(self, pairs: Iterable[NearPair], qvel: NDArray[np.floating]) -> bool:
         """Return whether contact may act within LOOKAHEAD_STEPS, at joint velocities ``qvel`` (dof,).
@@ -114,84 +125,83 @@ class ContactPredictor:
         return accelerated > 1
 
     def region(
-        self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], positions: Callable[[], Float64]
+        self, pairs: Sequence[NearPair], qvel: NDArray[np.floating], poses: Callable[[], Float64]
     ) -> Float64 | None:
-        """Return the bounds W (pairs, dof) of a region around the present joint positions, where none is predicted.
+        """Return the sizes s (pairs,) [m] of a region around the present joint positions, where none is predicted.
 
-        No contact is predicted while W (|q - q0| + STEP_FACTOR |q - q'|) < 1, with q0 the present positions, q those of
-        a later step and q' those of the step before. A pair that is d apart now, whose joints have the reach r, was
-        at least d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
+        No contact is predicted while ``arms`` (|q - q0| + STEP_FACTOR |q - q'|) < s, with q0 the present positions, q
+        those of a later step and q' those of the step before. A pair that is d apart now, with the arms r, was at least
+        d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
 
         Parameters
         ----------
         pairs, qvel
             Pairs that the engine lists, and joint velocities (dof,): :meth:`predicts_contact` is False for them.
-        positions
-            Function that returns the origins of the links (links, 3) [m]. Pairs that are not listed are LISTED_DISTANCE
-            apart, or as far as the balls around their origins.
+        poses
+            Function that returns the poses of the links (links, 4, 4), homogeneous. Pairs that are not listed are
+            LISTED_DISTANCE apart, or as far as the balls that cover them.
 
         Returns None where the robot would leave its region within a step.
         """
         speed, from_rest = np.abs(qvel), self._lookahead * self._speed_gain
-        arm, distance = self._listed(pairs)
-        slack = distance - from_rest
-        slack[np.argmin(distance)] += from_rest  # the nearest pair may touch first: one contact has no order
-        listed = self._bounds(arm, slack, speed)
-        step = (STEP_FACTOR + 1) * self._timestep * speed
-        if (listed @ step).max() >= 1:
-            return None
-        places = positions()
-        between = places[self._first] - places[self._second]  # WORLD stands for the last link here
-        apart = np.sqrt(np.einsum("ij,ij->i", between, between))
-        apart = np.where(self._second == WORLD, places[self._first, 2], apart) - self._radii
-        slack = np.maximum(apart, LISTED_DISTANCE) - from_rest
-        bounds = np.concatenate([listed, self._bounds(self._arms, slack, speed)])
-        return None if (bounds @ step).max() >= 1 else bounds
+        nearest = min(range(len(pairs)), key=lambda number: pairs[number].distance)
+        closing = self.arms @ (self._timestep * speed)
+        # Distances are listed of the step before.
+        slack = np.full(len(closing), LISTED_DISTANCE - from_rest) - closing
+        for number, pair in enumerate(pairs):
+            index = self._index[pair.first, pair.second]
+            if index < 0:  # links that no joint moves apart
+                return None
+            # The nearest pair may touch first: one contact has no order.
+            left = pair.distance - closing[index] - (from_rest if number != nearest else 0.0)
+            if (STEP_FACTOR + 1) * closing[index] >= left:
+                return None
+            slack[index] = min(slack[index], left)
+        sizes = np.maximum(slack, self.distances(poses()) - from_rest - closing)
+        return None if ((STEP_FACTOR + 1) * closing >= sizes).any() else sizes
 
-    def _bounds(self, arms: Float64, slack: Float64, speed: NDArray[np.floating]) -> Float64:
-        """Return arms / slack, less what pairs (pairs, dof) closed by since the step that distances are listed of."""
-        left = slack - self._timestep * (arms @ speed)
-        return arms / np.maximum(left, 1e-9)[:, None]
-
-    def _listed(self, pairs: Iterable[NearPair]) -> tuple[Float64, Float64]:
-        """Return the arms (pairs, dof) and the distances (pairs,) of listed pairs."""
-        first, second, distance = np.array([*pairs], float).reshape(-1, 3).T
-        return self._arm[first.astype(int), second.astype(int)], distance
+    def distances(self, poses: Float64) -> Float64:
+        """Return lower bounds of the distances of the pairs that may touch, at these poses of the links."""
+        at, radii = poses[self._owner], self._balls[:, 3]
+        centers = np.einsum("bij,bj->bi", at[:, :3, :3], self._balls[:, :3]) + at[:, :3, 3]
+        squares = np.einsum("bi,bi->b", centers, centers)
+        between = np.sqrt(np.maximum(squares[:, None] + squares - 2 * (centers @ centers.T), 0.0))
+        table = np.column_stack([between - radii, centers[:, 2]]) - radii[:, None]
+        table = np.minimum.reduceat(table, self._starts, axis=0)
+        table = np.minimum.reduceat(table, [*self._starts, len(radii)], axis=1)
+        return table[self._first_row, self._second_row]
 
 
 class SafeRegions:
     """Regions of the joint positions of ``size`` robots, within which no contact is predicted; a robot may have none.
 
-    ``known`` is the mask (size,) of the robots with a region, ``any`` is True if there is one.
+    ``arms`` are those of :class:`ContactPredictor`. ``known`` is the mask (size,) of the robots with a region, ``any``
+    is True if there is one.
     """
 
-    def __init__(self, size: int, dof: int) -> None:
+    def __init__(self, size: int, arms: Float64) -> None:
         self.known, self.any = np.zeros(size, bool), False
-        self._places = np.zeros((2, size, dof))  # of the step before, and at the center of the region
-        self._weights, self._moved = np.zeros_like(self._places), np.zeros_like(self._places)
-        self._bounds = [np.zeros((1, dof))] * size
+        self._arms = arms.T.copy()
+        self._before, self._centers = np.zeros((2, size, len(self._arms)))
+        self._sizes = np.full((size, len(arms)), np.inf)
 
-    def enter(self, row: int, qpos: NDArray[np.floating], bounds: Float64) -> None:
-        """Give a robot the region around ``qpos`` (dof,) with the ``bounds`` of :meth:`ContactPredictor.region`."""
-        weights = bounds.max(0)
-        self._places[:, row] = qpos
-        self._weights[:, row] = STEP_FACTOR * weights, weights
-        self._bounds[row] = bounds
+    def enter(self, row: int, qpos: NDArray[np.floating], sizes: Float64) -> None:
+        """Give a robot the region around ``qpos`` (dof,) with the ``sizes`` of :meth:`ContactPredictor.region`."""
+        self._before[row] = self._centers[row] = qpos
+        self._sizes[row] = sizes
         self.known[row] = self.any = True
 
     def drop(self, rows: int | list[int] | NDArray[np.bool_]) -> None:
         """Take the regions of some robots (rows or a mask) away."""
         self.known[rows] = False
-        self._weights[:, rows] = 0.0
+        self._sizes[rows] = np.inf
         self.any = bool(self.known.any())
 
     def left(self, qpos: Float64) -> list[int]:
         """Return the robots that are outside of their regions, one sim step after the last call, at ``qpos``."""
-        moved = np.subtract(qpos, self._places, self._moved)
-        np.abs(moved, moved)
-        self._places[0] = qpos
-        # All robots together, then each with the largest of its bounds, then with each of them: the cheapest first.
-        if np.vdot(moved, self._weights) < 1:
-            return []
-        near = np.flatnonzero(np.einsum("kij,kij->i", moved, self._weights) >= 1).tolist()
-        return [row for row in near if (self._bounds[row] @ (STEP_FACTOR * moved[0, row] + moved[1, row])).max() >= 1]
+        moved = np.abs(qpos - self._centers) + STEP_FACTOR * np.abs(qpos - self._before)
+        self._before[...] = qpos
+        # Robot by robot, so that no result depends on how many there are.
+        used = np.matmul(moved[:, None], self._arms)[:, 0]
+        outside = used >= self._sizes
+        return np.flatnonzero(outside.any(1)).tolist() if outside.any() else []

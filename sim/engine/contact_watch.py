@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import SceneSpec, link_extents
+from sim.engine.building import SceneSpec
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
 from sim.engine.dynamics import Dynamics, scene_dynamics
+from sim.engine.extents import link_extents, touching_pairs
 
 Float64 = NDArray[np.float64]
 
@@ -29,8 +30,10 @@ class ContactWatch:
 
     def __init__(self, spec: SceneSpec, robot: Any, size: int) -> None:
         self._spec = spec
-        self._predictor = ContactPredictor(link_extents(robot), robot.dof, spec.timestep)
-        self._regions = SafeRegions(size, robot.dof)
+        self._predictor = ContactPredictor(
+            link_extents(robot), touching_pairs(robot, spec.ground), robot.dof, spec.timestep
+        )
+        self._regions = SafeRegions(size, self._predictor.arms)
         self._waits = np.zeros(size, int)  # looks until a region is tried again
         self._sharing: dict[int, Any] = {}
 
@@ -115,4 +118,4 @@ class ContactWatch:
         touches = self._predictor.predicts_contact(pairs, qvel)
         if touches or not pairs or not settles:
             return touches, None
-        return False, self._predictor.region(pairs, qvel, lambda: self._model.link_positions(qpos))
+        return False, self._predictor.region(pairs, qvel, lambda: self._model.link_poses(qpos))

@@ -110,10 +110,12 @@ class Dynamics:
         boxes = (link.compute_global_aabb_tight() for link in moving if link.collision_shapes)
         return min((float(box[0, 2]) for box in boxes), default=np.inf)
 
-    def link_positions(self, qpos: NDArray[Any]) -> Float64:
-        """Return the origins of the simulated links (links, 3) [m], at one pose (dof,)."""
+    def link_poses(self, qpos: NDArray[Any]) -> Float64:
+        """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
         self._model.compute_forward_kinematics(np.asarray(qpos, np.float64))
-        return np.array([self._model.get_link_pose(link).p for link in range(len(self._links))], np.float64)
+        return np.array(
+            [self._model.get_link_pose(link).to_transformation_matrix() for link in range(len(self._links))], np.float64
+        )
 
     def near_pairs(self, qpos: NDArray[Any]) -> list[NearPair]:
         """Return the pairs of shapes that the engine lists as near each other, at one pose (dof,)."""

@@ -10,7 +10,7 @@ from robots import load_bundled
 
 from sim import Runner
 from sim.benchmark.accuracy import contact_moves
-from sim.engine.building import SceneSpec, build_scene, link_extents, new_system
+from sim.engine.building import SceneSpec, build_scene, new_system
 from sim.engine.contact_prediction import (
     LISTED_DISTANCE,
     LOOKAHEAD_STEPS,
@@ -22,6 +22,8 @@ from sim.engine.contact_prediction import (
     NearPair,
     SafeRegions,
 )
+from sim.engine.dynamics import scene_dynamics
+from sim.engine.extents import link_extents, touching_pairs
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
 from sim.robot.kinematics import Kinematics
@@ -29,18 +31,24 @@ from sim.robot.kinematics import Kinematics
 DT = 1 / 2000
 # A base, an arm that turns, and on it two fingers that slide and one that turns.
 LINKS = [
-    LinkExtent(None, None, False, 0.0, 0.1),
-    LinkExtent(0, 0, False, 0.3, 0.2),
-    LinkExtent(1, 1, True, 0.1, 0.05),
-    LinkExtent(1, 2, True, 0.1, 0.05),
-    LinkExtent(1, 3, False, 0.1, 0.04),
+    LinkExtent(parent, dof, slides, offset, np.array([[0.0, 0.0, 0.0, radius]]))
+    for parent, dof, slides, offset, radius in (
+        (None, None, False, 0.0, 0.1),
+        (0, 0, False, 0.3, 0.2),
+        (1, 1, True, 0.1, 0.05),
+        (1, 2, True, 0.1, 0.05),
+        (1, 3, False, 0.1, 0.04),
+    )
 ]
+PAIRS = [(0, 2), (0, 3), (0, 4), (2, 3), (2, 4), (3, 4), *((link, WORLD) for link in range(5))]
 FROM_REST = MAX_ACCELERATION * DT * LOOKAHEAD_STEPS * DT
 """Distance that may close from rest [m]."""
 
 
 def predicts_contact(pairs, qvel, timestep=DT):
-    return ContactPredictor(LINKS, 4, timestep).predicts_contact([NearPair(*pair) for pair in pairs], np.array(qvel))
+    return ContactPredictor(LINKS, PAIRS, 4, timestep).predicts_contact(
+        [NearPair(*pair) for pair in pairs], np.array(qvel)
+    )
 
 
 @pytest.mark.parametrize(("far", "expected"), [(0.9, True), (1.1, False)])
@@ -104,17 +112,17 @@ def reach_between(predictor: ContactPredictor, first: int, second: int) -> np.nd
 )
 def test_no_contact_is_predicted_within_a_region(near, qvel, moved, step, share):
     """Pairs close as fast as they can, those that were not listed from LISTED_DISTANCE on."""
-    predictor, qvel = ContactPredictor(LINKS, 4, DT), np.array(qvel)
+    predictor, qvel = ContactPredictor(LINKS, PAIRS, 4, DT), np.array(qvel)
     pairs = [NearPair(*links, distance) for links, distance in near]
     if not pairs or predictor.predicts_contact(pairs, qvel):
         return
-    touching = np.zeros((len(LINKS), 3))  # so that balls around the links say nothing
-    bounds, regions = predictor.region(pairs, qvel, lambda: touching), SafeRegions(1, 4)
-    if bounds is None:
+    touching = np.zeros((len(LINKS), 4, 4))  # so that balls around the links say nothing
+    sizes, regions = predictor.region(pairs, qvel, lambda: touching), SafeRegions(1, predictor.arms)
+    if sizes is None:
         return
-    regions.enter(0, np.zeros(4), bounds)
+    regions.enter(0, np.zeros(4), sizes)
     moved, step = np.array(moved), np.array(step)
-    used = (bounds @ (np.abs(moved + step) + STEP_FACTOR * np.abs(step))).max()
+    used = (predictor.arms @ (np.abs(moved + step) + STEP_FACTOR * np.abs(step)) / sizes).max()
     if used > 0:
         moved, step = share / used * moved, share / used * step
     regions.left(moved[None])
@@ -129,8 +137,8 @@ def test_no_contact_is_predicted_within_a_region(near, qvel, moved, step, share)
 
 
 def test_a_region_ends_where_a_joint_has_moved_by_its_weight():
-    regions = SafeRegions(3, 2)
-    regions.enter(1, np.array([0.5, 0.0]), np.array([[10.0, 0.0], [0.0, 3.0]]))
+    regions = SafeRegions(3, np.array([[10.0, 0.0], [0.0, 3.0]]))
+    regions.enter(1, np.array([0.5, 0.0]), np.ones(2))
     qpos = np.array([[9.0, 9.0], [0.5, 0.0], [np.nan, 0.0]])
     assert regions.any
     assert regions.left(qpos) == []
@@ -186,11 +194,44 @@ def test_a_closed_gripper_at_rest_needs_no_look(panda, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_pairs_that_the_engine_lists_may_touch_and_are_no_nearer_than_their_balls(name):
+    """At sampled poses: a region counts on both where a pair is not listed."""
+    robot = load_bundled(name)
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, DT, PHYSICS["fast"])
+    _scene, built = build_scene(spec, new_system(spec))
+    pairs, model = touching_pairs(built, ground=True), scene_dynamics(spec)
+    predictor = ContactPredictor(link_extents(built), pairs, robot.dof, DT)
+    pairs = [pair for pair in pairs if (predictor.reach[list(pair)] > 0).any()]
+    seen = 0
+    for qpos in robot.sample(200, seed=0):
+        apart = predictor.distances(model.link_poses(qpos))
+        for first, second, distance in model.near_pairs(qpos):
+            pair = next(pair for pair in ((first, second), (second, first)) if pair in pairs)
+            assert apart[pairs.index(pair)] <= distance + 1e-5
+            seen += 1
+    assert seen > 10
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_balls_cover_the_shapes(name):
+    robot = load_bundled(name)
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, DT, PHYSICS["fast"])
+    _scene, built = build_scene(spec, new_system(spec))
+    for link, extent in zip(built.links, link_extents(built), strict=True):
+        if link.collision_shapes:
+            pose = link.entity_pose.to_transformation_matrix()
+            centers, radii = extent.balls[:, :3] @ pose[:3, :3].T + pose[:3, 3], extent.balls[:, 3:]
+            low, high = link.compute_global_aabb_tight()
+            assert ((centers - radii).min(0) <= low + 1e-5).all()
+            assert ((centers + radii).max(0) >= high - 1e-5).all()
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_no_link_is_faster_than_its_reach_allows(name):
     robot = load_bundled(name)
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, DT, PHYSICS["fast"])
     _scene, built = build_scene(spec, new_system(spec))
-    reach = ContactPredictor(link_extents(built), robot.dof, DT).reach[:-1]
+    reach = ContactPredictor(link_extents(built), (), robot.dof, DT).reach[:-1]
     body = Kinematics(robot)
     order = [body.index(link.name) for link in built.links]
     rng = np.random.default_rng(0)
