@@ -88,8 +88,8 @@ class Loop:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
         began = time.perf_counter()
         for group, first_rows in zip(self.groups, self._first_rows, strict=True):
-            for done, tick in enumerate(self.ticks.first(ticks)):
-                rows = tick.at(group.envs) if done else first_rows
+            for done in range(ticks):
+                rows = self.ticks[done].at(group.envs) if done else first_rows
                 setpoint, rate, feedforward = rows.command
                 command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
                 group.run(self._steps + done * substeps, substeps, command)
