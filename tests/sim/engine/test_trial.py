@@ -2,10 +2,14 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
+import psutil
 import pytest
+from processes import children, have_ended
 
 from batchpid.errors import RobotError
 from sim.engine.trial import in_child
@@ -49,3 +53,11 @@ def test_the_answer_to_an_interrupted_trial_is_not_that_to_the_next():
     with pytest.raises(KeyboardInterrupt):
         in_child(time.sleep, 0.3)
     assert in_child(abs, -1) == 1
+
+
+def test_a_server_is_no_child_of_its_caller_and_ends_with_it():
+    server, _ = in_child(parent_and_self)
+    assert psutil.Process(server) not in children()
+    program = "import os; from sim.engine.trial import in_child; print(in_child(os.getppid))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert have_ended([int(done.stdout)])
