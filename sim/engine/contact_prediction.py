@@ -52,15 +52,14 @@ class LinkExtent(NamedTuple):
     """Number of the joint above it; None if that joint is fixed."""
     slides: bool
     """True if that joint is prismatic."""
-    offset: float
-    """Largest distance of the link's frame from its parent's [m]."""
+    in_parent: Float64
+    """Pose of that joint in the parent's frame (4, 4), homogeneous [m]: the joint turns about x, or slides along it."""
+    in_link: Float64
+    """Pose of that joint in this link's frame (4, 4)."""
+    travel: float
+    """Largest distance by which that joint slides [m]."""
     balls: Float64
     """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
-
-    @property
-    def radius(self) -> float:
-        """Largest distance of a point of its shapes from its frame [m]."""
-        return float((np.linalg.norm(self.balls[:, :3], axis=1) + self.balls[:, 3]).max(initial=0.0))
 
 
 class NearPair(NamedTuple):
@@ -84,12 +83,7 @@ class ContactPredictor:
     ) -> None:
         self.reach = reach = np.zeros((len(links) + 1, dof))
         for row, link in zip(reach, links, strict=False):
-            radius, at = link.radius, link
-            while at.parent is not None:
-                if at.dof is not None:
-                    row[at.dof] = 1.0 if at.slides else radius
-                radius += at.offset
-                at = links[at.parent]
+            _add_reach(row, link, links)
         between = (reach[:, None] > 0) != (reach[None] > 0)
         # A joint above both links moves them alike.
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
@@ -172,6 +166,29 @@ class ContactPredictor:
         return table[self._first_row, self._second_row]
 
 
+def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) -> None:
+    """Write into ``reach`` (dof,) the largest distance of the shapes of ``link`` from the axis of each joint above it.
+
+    Whatever the positions of the joints between: a ball that turns about an axis stays in a ball around a point on it.
+    A second bound is the sum of the distances along the chain.
+    """
+    centers, radii, at = link.balls[:, :3], link.balls[:, 3], link
+    farthest = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)
+    while at.parent is not None:
+        centers = (centers - at.in_link[:3, 3]) @ at.in_link[:3, :3]
+        farthest += np.linalg.norm(at.in_link[:3, 3])
+        if at.slides:
+            radii, farthest = radii + at.travel, farthest + at.travel
+        elif at.dof is not None:
+            radii = radii + np.hypot(centers[:, 1], centers[:, 2])
+            centers = centers * (1.0, 0.0, 0.0)
+        if at.dof is not None:
+            reach[at.dof] = 1.0 if at.slides else min(farthest, radii.max(initial=0.0))
+        centers = centers @ at.in_parent[:3, :3].T + at.in_parent[:3, 3]
+        farthest += np.linalg.norm(at.in_parent[:3, 3])
+        at = links[at.parent]
+
+
 class SafeRegions:
     """Regions of the joint positions of ``size`` robots, within which no contact is predicted; a robot may have none.
 
@@ -181,13 +198,14 @@ class SafeRegions:
 
     def __init__(self, size: int, arms: Float64) -> None:
         self.known, self.any = np.zeros(size, bool), False
-        self._arms = arms.T.copy()
-        self._before, self._centers = np.zeros((2, size, len(self._arms)))
-        self._sizes = np.full((size, len(arms)), np.inf)
+        self._arms = np.concatenate([STEP_FACTOR * arms.T, arms.T])
+        self._places = np.zeros((size, 2, arms.shape[1]))  # of the step before, and at the center of the region
+        self._moved, self._used = np.zeros_like(self._places), np.zeros((size, 1, len(arms)))
+        self._sizes = np.full_like(self._used, np.inf)
 
     def enter(self, row: int, qpos: NDArray[np.floating], sizes: Float64) -> None:
         """Give a robot the region around ``qpos`` (dof,) with the ``sizes`` of :meth:`ContactPredictor.region`."""
-        self._before[row] = self._centers[row] = qpos
+        self._places[row] = qpos
         self._sizes[row] = sizes
         self.known[row] = self.any = True
 
@@ -199,9 +217,9 @@ class SafeRegions:
 
     def left(self, qpos: Float64) -> list[int]:
         """Return the robots that are outside of their regions, one sim step after the last call, at ``qpos``."""
-        moved = np.abs(qpos - self._centers) + STEP_FACTOR * np.abs(qpos - self._before)
-        self._before[...] = qpos
+        moved = np.subtract(qpos[:, None], self._places, self._moved)
+        np.abs(moved, moved)
+        self._places[:, 0] = qpos
         # Robot by robot, so that no result depends on how many there are.
-        used = np.matmul(moved[:, None], self._arms)[:, 0]
-        outside = used >= self._sizes
-        return np.flatnonzero(outside.any(1)).tolist() if outside.any() else []
+        outside = np.matmul(moved.reshape(len(moved), 1, -1), self._arms, self._used) >= self._sizes
+        return np.flatnonzero(outside.any((1, 2))).tolist() if outside.any() else []

@@ -25,13 +25,15 @@ def link_extents(robot: Any) -> list[LinkExtent]:
     extents = []
     for link in robot.links:
         joint, slides = link.joint, link.joint.type == "prismatic"
-        offset = np.linalg.norm(joint.pose_in_parent.p) + np.linalg.norm(joint.pose_in_child.p)
-        if slides:
-            offset += np.abs(np.clip(joint.limits, -10.0, 10.0)).max(initial=0.0)  # a rail may have no end
+        in_parent, in_link = (
+            np.asarray(pose.to_transformation_matrix(), float) for pose in (joint.pose_in_parent, joint.pose_in_child)
+        )
+        # A rail may have no end.
+        travel = float(np.abs(np.clip(joint.limits, -10.0, 10.0)).max(initial=0.0)) if slides else 0.0
         parent = None if link.parent is None else numbers[link.parent]
         balls = [_balls(shape) for shape in link.collision_shapes]
         covered = np.concatenate(balls) if balls else np.empty((0, 4))
-        extents.append(LinkExtent(parent, dofs.get(joint.name), slides, float(offset), covered))
+        extents.append(LinkExtent(parent, dofs.get(joint.name), slides, in_parent, in_link, travel, covered))
     return extents
 
 
