@@ -135,7 +135,7 @@ def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
 @pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_robots_in_free_motion_share_systems(name, packs):
     robot = load_bundled(name)
-    with Runner(robot, 64, params=robot.params(), workers=0) as runner:
+    with Runner(robot, 16, params=robot.params(), workers=0) as runner:
         runner.rollout(np.broadcast_to(robot.settings.target, (50, robot.dof)))
         assert packs.isolated() == 0
 
