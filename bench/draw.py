@@ -104,7 +104,7 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
         new["resources"] = {}
         for row in benchmarks:
             if row["group"] == "resources":
-                robot = new["resources"].setdefault(row["params"]["setup"], {})
+                robot = new["resources"].setdefault(row["params"]["workload"], {})
                 robot |= {key: value for key, value in row["extra_info"].items() if key in RESOURCES}
     if (path := folder / "accuracy.json").is_file():
         new["accuracy"] = json.loads(path.read_text())["accuracy"]
