@@ -315,7 +315,7 @@ def test_kills_at_random_moments_of_many_rollouts(undisturbed):
         with make_runner() as runner, warnings.catch_warnings():
             warnings.simplefilter("ignore", RecoveryWarning)
             pids = runner.pids
-            with later(chance.uniform(0, 0.35), lambda pids=pids: send(chance.choice(pids), signal.SIGKILL)):
+            with later(chance.uniform(0, 0.2), lambda pids=pids: send(chance.choice(pids), signal.SIGKILL)):
                 rollout = runner.rollout(setpoints())
             recovered += runner.recoveries
             pids += runner.pids
