@@ -213,7 +213,7 @@ def main() -> None:
             for stage, fields in _stages(Path(urdf), **options):  # noqa: B007
                 tell(**fields)
     except BatchPIDError as error:
-        tell(error=f"{stage}: {error}")
+        tell(error=f"{stage}: {str(error).removeprefix(f'{Path(urdf).absolute()}: ')}")
     except Exception as error:
         tell(error=f"{stage}: {type(error).__name__}: {error}")
     out.flush()
