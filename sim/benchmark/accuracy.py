@@ -149,8 +149,8 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     for step in range(steps):
         passive = plant.passive_force(True, True)
         effort = control.effort(plant.read_qpos(), passive, step)
-        for fine_step in range(step * refinement, (step + 1) * refinement):
-            total = effort if friction is None else friction.effort(effort, plant.read_qvel(), fine_step)
+        for _ in range(refinement):
+            total = effort if friction is None else friction.effort(effort, plant.read_qvel())
             plant.write_qf(total)
             plant.step()
         table[step] = plant.read_qpos()

@@ -137,7 +137,7 @@ class EnvGroup:
                 self._motor[...] = effort = pack.delivered(effort)
             if qvel is not None:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
-                effort = friction.effort(motor, qvel, self._steps + step)
+                effort = friction.effort(motor, qvel)
             if effort is not None:
                 pack.write_qf(effort)
             pack.step(step % COUPLING_STEPS == 0)

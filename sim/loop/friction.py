@@ -12,13 +12,14 @@ from batchpid.elementwise import TURN, wrap
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
+from sim.loop.snapshot import AGE
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
 
 REFRESH_STEPS = 64
-"""Sim steps for which the inertia that the joints show is kept."""
+"""Sim steps of an env for which the inertia that its joints show is kept."""
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, in which the compensation is less than the friction."""
 
@@ -48,6 +49,8 @@ class JointFriction:
         self._turns = turns if turns.any() else None
         self.compensates = bool(self._known.any())
         self._state = friction.FrictionState()
+        # Counted from an env's own reset: its motion must not depend on how long the runner has run.
+        self._age = np.zeros(pack.size, np.int64)
         self.reset(np.ones(pack.size, bool))
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
@@ -60,27 +63,36 @@ class JointFriction:
             load = self._coupling.efforts(load)
         fresh = friction.init(self._model, velocity, load, self._mass_matrix(), pack.spec.timestep, *self.drive)
         self._state = fresh if self._state.effort is None else friction.reset(self._state, fresh, mask)
+        self._age[mask] = 0
 
     def feedforward(self, command: Command, qpos: Float64) -> Float64:
         """Return the efforts that cancel the known friction on the way to the setpoint of ``command`` (M, dof)."""
         error = wrap(command.setpoint - qpos, self._turns, np)
         return friction.compensation(self._known, error, command.setpoint_rate, self._band)
 
-    def effort(self, motor: Float64, qvel: Float64, step: int) -> Float64:
-        """Return the efforts to apply in sim step ``step``, counted from the start of the runner (M, dof)."""
-        if step % REFRESH_STEPS == 0 and self._model.coulomb is not None:
-            timestep = self._pack.spec.timestep
-            self._state = friction.refresh(self._model, self._state, self._mass_matrix(), timestep, *self.drive)
+    def effort(self, motor: Float64, qvel: Float64) -> Float64:
+        """Return the efforts to apply in the next sim step (M, dof)."""
+        if self._model.coulomb is not None:
+            if (due := self._age == REFRESH_STEPS).any():
+                timestep = self._pack.spec.timestep
+                fresh = friction.refresh(self._model, self._state, self._mass_matrix(), timestep, *self.drive)
+                self._state = friction.reset(self._state, fresh, due)
+                self._age[due] = 0
+            self._age += 1
         self._state, total = friction.advance(self._model, self._state, motor, qvel)
         return total
 
     def read(self) -> dict[str, NDArray[Any]]:
         """Return the state of the model by name, for :meth:`write`."""
-        return {name: leaf for name, leaf in self._state._asdict().items() if leaf is not None}
+        if self._state.effort is None:
+            return {}
+        return {**self._state._asdict(), AGE: self._age.copy()}
 
     def write(self, state: dict[str, NDArray[Any]]) -> None:
         """Set the state of the model."""
-        self._state = friction.FrictionState(**state)
+        if state:
+            self._state = friction.FrictionState(**{name: state[name] for name in friction.FrictionState._fields})
+            self._age = state[AGE].copy()
 
     def _mass_matrix(self) -> Float64:
         matrix = scene_dynamics(self._pack.spec).joint_mass_matrix(self._pack.read_qpos())

@@ -27,6 +27,8 @@ from batchpid.npz import read_npz
 from batchpid.validate import file_path, integer, names
 from sim.loop.faults import CAUSES, FaultContainment
 
+AGE = "age"
+"""Name of the sim steps since the friction model of an env took its inertia (envs,)."""
 _FORMAT = 4
 _CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
 _CHOICES["conditional"] = (Everywhere(),)
@@ -50,7 +52,7 @@ class EnvStates:
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
     friction: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.friction.FrictionState`."""
+    """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
     containment: dict[str, NDArray[Any]]
     """See :class:`sim.loop.faults.FaultContainment`."""
 
@@ -92,7 +94,7 @@ class EnvStates:
             isolated=row,
             saturated=table > 0,
             controller=controller,
-            friction=dict.fromkeys(FrictionState._fields, table) if friction else {},
+            friction={**dict.fromkeys(FrictionState._fields, table), AGE: row.astype(np.int64)} if friction else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = _flatten(vars(expected)), _flatten(vars(self))

@@ -74,6 +74,21 @@ def test_a_robot_with_friction_and_damping(control):
     assert_identical(alone, expected, slice(0, 1))
 
 
+def test_an_episode_with_friction_does_not_depend_on_when_it_begins():
+    robot = load_bundled(RUBBING)
+    setpoints = np.broadcast_to(robot.settings.target, (160, robot.dof))
+    episodes = []
+    with Runner(robot, 3, params=robot.params(), workers=0, substeps=5, compensate="gravity+coriolis") as runner:
+        for ticks in (7, 3, 11):
+            episodes.append(runner.rollout(setpoints))
+            runner.rollout(setpoints[:ticks])
+            runner.reset(mask=[True, True, False])
+            runner.rollout(setpoints[:ticks])
+            runner.reset()
+    for episode in episodes[1:]:
+        assert_identical(episode, episodes[0], skip=["time"])
+
+
 def test_a_rollout_and_its_ticks_one_by_one(panda):
     with Runner(panda, 20, params=panda.params(), workers=2) as runner:
         runner.reset(start_poses(panda, 20))

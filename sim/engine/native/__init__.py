@@ -52,7 +52,7 @@ _SECONDS = 60.0
 
 
 class NativeStatus(NamedTuple):
-    """Whether the native calls are used, and the reason if they are not."""
+    """State of the native calls: used or not, and the reason if not."""
 
     active: bool
     reason: str
