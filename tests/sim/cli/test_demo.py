@@ -37,14 +37,21 @@ def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
         assert len(np.unique(np.asarray(picture))) > 20
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures are not drawn: that takes longer than the robots."""
+    monkeypatch.setattr("sim.plots.step_responses", lambda *_, **__: None)
+    monkeypatch.setattr("sim.plots.save", lambda _, path: path)
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_demo_notes_where_it_differs_from_the_tutorial(batchpid, tmp_path):
     args = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02, "--picture", tmp_path / "x.svg")
     assert "panda_joint4 goes to -1 rad" in batchpid("demo", *args)[1]
 
 
-def test_demo_depends_on_nothing_but_its_flags(batchpid, tmp_path, monkeypatch):
-    monkeypatch.setattr("sim.plots.figures.save", lambda _, path: path)  # drawing takes longer than the robots
-
+@pytest.mark.usefixtures("undrawn")
+def test_demo_depends_on_nothing_but_its_flags(batchpid, tmp_path):
     def table(*flags):
         args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--picture", tmp_path / "x.png")
         return batchpid("demo", *args, *flags)[1].partition("\n\n")[2]
@@ -84,6 +91,7 @@ def test_a_robot_without_tutorial_settings_is_sent_to_rollout(batchpid, tmp_path
     assert f"batchpid rollout {path}" in err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_demo_runs_with_gains_by_name_or_from_a_file(batchpid, tmp_path):
     robot = ROBOTS["panda"]
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=7.0), robot.joint_names)

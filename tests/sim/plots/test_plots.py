@@ -112,7 +112,7 @@ def test_quantiles_are_those_of_the_finite_values(values, q):
             assert np.isnan(value)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(
     bad=st.sampled_from([np.nan, np.inf, -np.inf, 1e38]),
     first=st.integers(0, TICKS - 1),

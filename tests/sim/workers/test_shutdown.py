@@ -46,8 +46,9 @@ def start(body, **options):
 
 LONG = "while True: runner.step(robot.settings.target, substeps=1000000)"
 SHORT = "while True: runner.step(robot.settings.target)"
-ENDS = [(number, LONG) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV)]
-ENDS += [(number, SHORT) for number in (signal.SIGINT, signal.SIGKILL)]
+ENDS: list = [(signal.SIGINT, LONG), (signal.SIGKILL, LONG), (signal.SIGINT, SHORT)]
+MORE_ENDS = [(signal.SIGTERM, LONG), (signal.SIGSEGV, LONG), (signal.SIGKILL, SHORT)]
+ENDS += [pytest.param(*end, marks=pytest.mark.slow) for end in MORE_ENDS]
 
 
 @pytest.mark.parametrize(("number", "body"), ENDS)
