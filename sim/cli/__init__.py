@@ -25,6 +25,7 @@ from batchpid.versions import package_versions
 from sim.cli.bench import BenchCommand
 from sim.cli.compare import CompareCommand
 from sim.cli.demo import DemoCommand
+from sim.cli.excite import ExciteCommand
 from sim.cli.inspect import InspectCommand
 from sim.cli.plot import PlotCommand
 from sim.cli.progress import close_bars
@@ -40,6 +41,7 @@ COMMANDS: dict[str, type[Any]] = {
     "bench": BenchCommand,
     "tune": TuneCommand,
     "compare": CompareCommand,
+    "excite": ExciteCommand,
     "inspect": InspectCommand,
     "survey": SurveyCommand,
     "plot": PlotCommand,

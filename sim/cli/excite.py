@@ -1,0 +1,63 @@
+"""``batchpid excite``: a motion to record for ``batchpid identify``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim import Robot
+from sim.cli import flags
+
+
+@dataclass(frozen=True)
+class ExciteCommand:
+    """Make the motion to record for `batchpid identify`: a chirp of every joint within limits, free of contact.
+
+    Writes setpoints as CSV with the header "time, setpoint:JOINT, ...". Move the robot to the first row before it
+    starts, and add the measured positions to the log as qpos:JOINT.
+    """
+
+    robot: flags.RobotName = "panda"
+    seconds: float = 10.0
+    """Duration of the motion [s]."""
+    rate: float = 500.0
+    """Rows per second [Hz]."""
+    lowest: float = 0.15
+    """Lowest frequency of the chirp [Hz]."""
+    highest: float = 3.0
+    """Highest frequency [Hz]."""
+    seed: int = 0
+    """Seed of the phases."""
+    missing_meshes: flags.MissingMeshes = "skip"
+    out: flags.OptionalPath = None
+    """File to write: .csv. Default: out/ROBOT.excite.csv."""
+
+    imports = ("sim.engine.dynamics", "sim.tuning.identification.excitation")
+
+    def run(self) -> None:
+        """Run the command."""
+        from batchpid.files import write_atomically
+        from sim.cli.report import table
+        from sim.tuning.identification.excitation import excite
+        from sim.tuning.identification.logs import setpoint_csv
+
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        out = flags.output_path("out", self.out or Path(f"out/{robot.path.stem}.excite.csv"), (".csv",))
+        motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, setpoint_csv(robot, motion))
+        rows = [
+            [name, f"{low:.3f} to {high:.3f} {unit}", f"{speed:.3g} {unit}/s"]
+            for name, unit, low, high, speed in zip(
+                robot.joint_names,
+                robot.units,
+                motion.position.min(0),
+                motion.position.max(0),
+                abs(motion.velocity).max(0),
+                strict=True,
+            )
+        ]
+        print(table(rows, ["joint", "moves from ... to", "fastest"], "lrr"))
+        print(
+            f"\nwritten: {out}: {motion.ticks} rows of {motion.time[0]:g} s; the robot starts at rest at the first row"
+        )

@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+
+import batchpid as bp
+from sim import Robot, Runner, write_recording
+from sim.tuning.identification.logs import logs_of_rollout, read_logs
+
+ROWS = 60
+
+
+def text(columns: dict, delimiter: str = ",") -> str:
+    rows = zip(*columns.values(), strict=True)
+    lines = [delimiter.join(columns), *(delimiter.join(str(value) for value in row) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def columns() -> dict:
+    time = np.arange(ROWS) / 200 + np.random.default_rng(0).uniform(0, 1e-3, ROWS)  # irregular
+    wave = 0.1 * np.sin(time)
+    names = ("panda_joint6", "panda_joint2")  # in another order than the robot's
+    return {
+        "time": time,
+        **{f"setpoint:{name}": 1.0 + wave for name in names},
+        **{f"qpos:{name}": 1.0 + k * wave for k, name in enumerate(names)},
+    }
+
+
+def read(panda: Robot, folder, content: str, **options):
+    path = folder / "log.csv"
+    path.write_text(content)
+    return read_logs(panda, [path], **options)[0]
+
+
+def test_columns_are_found_by_name_in_the_order_of_the_robot(panda, tmp_path, columns):
+    log = read(panda, tmp_path, text(columns))
+    assert log.joints == (1, 5)
+    assert log.kind == "setpoint"
+    assert np.array_equal(log.time, columns["time"])
+    assert np.array_equal(log.qpos[:, 0], columns["qpos:panda_joint2"])
+    assert np.array_equal(log.command[:, 1], columns["setpoint:panda_joint6"])
+    assert log.qvel is None
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", ", "])
+def test_delimiters_comments_blank_lines_and_other_columns_do_not_matter(panda, tmp_path, columns, delimiter):
+    plain = read(panda, tmp_path, text(columns))
+    decorated = "\ufeff# from the robot\n\n" + text({**columns, "mode": ["idle"] * ROWS}, delimiter).replace(
+        "\n", "\r\n"
+    )
+    log = read(panda, tmp_path, decorated)
+    assert np.array_equal(log.qpos, plain.qpos)
+    assert np.array_equal(log.command, plain.command)
+
+
+def test_hdf5_columns_read_as_those_of_a_csv_file(panda, tmp_path, columns):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in columns.items():
+            file[name] = values
+    (log,) = read_logs(panda, [tmp_path / "log.h5"])
+    plain = read(panda, tmp_path, text(columns))
+    assert np.array_equal(log.qpos, plain.qpos)
+    assert np.array_equal(log.command, plain.command)
+
+
+def test_commands_are_interpolated_or_held(panda, tmp_path, columns):
+    linear, held = (read(panda, tmp_path, text(columns), hold=hold) for hold in (False, True))
+    middle = (columns["time"][3:5]).mean(keepdims=True)
+    rows = linear.command[3:5]
+    np.testing.assert_allclose(linear.commands_at(middle)[0], rows.mean(0))
+    assert np.array_equal(held.commands_at(middle)[0], rows[0])
+    assert np.array_equal(held.commands_at(linear.time), linear.commands_at(linear.time))
+
+
+def damaged(columns: dict, change: str) -> str:
+    columns = {name: list(values) for name, values in columns.items()}
+    if change == "no time":
+        del columns["time"]
+    elif change == "no position":
+        del columns["qpos:panda_joint2"]
+    elif change == "no setpoint":
+        del columns["setpoint:panda_joint2"]
+    elif change == "unknown joint":
+        columns["qpos:elbow"] = columns.pop("qpos:panda_joint2")
+    elif change == "text":
+        columns["qpos:panda_joint2"][3] = "1,0"
+    elif change == "word":
+        columns["qpos:panda_joint2"][3] = "off"
+    elif change == "nan":
+        columns["qpos:panda_joint2"][3] = "nan"
+    elif change == "backwards":
+        columns["time"][3] = columns["time"][1]
+    elif change == "degrees":
+        columns["qpos:panda_joint2"] = [57.3 * q for q in columns["qpos:panda_joint2"]]
+    elif change == "milliseconds":
+        columns["time"] = [1e3 * t for t in columns["time"]]
+    elif change == "short":
+        columns = {name: values[:20] for name, values in columns.items()}
+    return text(columns)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("no time", r"no column 'time'"),
+        ("no position", r"column qpos:panda_joint2.*is missing"),
+        ("no setpoint", r"column setpoint:panda_joint2.*is missing"),
+        ("unknown joint", r"'qpos:elbow'.*unknown.*panda_joint1"),
+        ("text", r"line 5 has 6 cells, the header 5"),
+        ("word", r"line 5, column 'qpos:panda_joint2' is no number \(got 'off'\)"),
+        ("nan", r"line 5, column 'qpos:panda_joint2' is empty or not finite"),
+        ("backwards", r"line 5: time does not increase"),
+        ("degrees", r"line 2, column 'qpos:panda_joint2' is far beyond.*positions are in rad"),
+        ("milliseconds", r"time is in seconds"),
+        ("short", r"has 20 rows"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_named_by_line_and_column(panda, tmp_path, columns, change, message):
+    with pytest.raises(bp.InvalidArgumentError, match=message):
+        read(panda, tmp_path, damaged(columns, change))
+
+
+def test_files_of_other_kinds_are_refused(panda, tmp_path, columns):
+    with pytest.raises(bp.InvalidArgumentError, match="unknown file format"):
+        read_logs(panda, [tmp_path / "log.mat"])
+    with pytest.raises(FileNotFoundError):
+        read_logs(panda, [tmp_path / "none.csv"])
+    with pytest.raises(bp.InvalidArgumentError, match="name one file"):
+        read_logs(panda, [])
+    with pytest.raises(bp.InvalidArgumentError, match="no column effort:JOINT"):
+        read(panda, tmp_path, text(columns), kind="effort")
+    with pytest.raises(bp.InvalidArgumentError, match="has no rows"):
+        read(panda, tmp_path, "time,qpos:panda_joint1\n")
+
+
+def test_a_recording_is_a_log_of_each_env(panda, tmp_path):
+    setpoints = panda.sample(1)[0] + 0.01 * np.sin(np.arange(60) / 9)[:, None, None] * np.ones((60, 2, panda.dof))
+    with Runner(panda, 2, workers=0, substeps=10) as runner:
+        runner.reset(setpoints[0])
+        rollout = runner.rollout(np.clip(panda.coupled(setpoints), panda.lower, panda.upper))
+    first, second = read_logs(panda, [write_recording(rollout, tmp_path / "run.npz")])
+    assert second.source.endswith("env 1")
+    assert np.array_equal(first.qpos, rollout.qpos[:, 0, first.joints].astype(float))
+    # The setpoint of a row acts during the tick that ends at its time.
+    within = rollout.time[[7]] - 0.3 * rollout.tick
+    assert np.array_equal(first.commands_at(within)[0], rollout.setpoint[7, 0, first.joints])
+    with pytest.raises(bp.InvalidArgumentError, match="fit its setpoints"):
+        logs_of_rollout(panda, rollout, "effort")
