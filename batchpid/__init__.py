@@ -15,6 +15,7 @@ Params say how to control, a state is carried from step to step, and every array
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.
+- Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.actuators`.
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
   inertia in :mod:`batchpid.computed_torque`, errors in :mod:`batchpid.errors`.
 
@@ -25,7 +26,8 @@ from batchpid import startup
 
 startup.prepare()
 
-from batchpid import presets
+from batchpid import actuators, presets
+from batchpid.actuators import Actuators, make_actuators
 from batchpid.bumpless import track
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.controller import BatchPID
@@ -39,6 +41,7 @@ from batchpid.stability import spectral_radius, stability_bound
 from batchpid.state import PIDState, Terms
 
 __all__ = [
+    "Actuators",
     "BatchPID",
     "BatchPIDError",
     "Coefficients",
@@ -47,6 +50,7 @@ __all__ = [
     "PIDParams",
     "PIDState",
     "Terms",
+    "actuators",
     "advance",
     "design_gains",
     "discretise",
@@ -56,6 +60,7 @@ __all__ = [
     "load_about",
     "load_params",
     "loads_params",
+    "make_actuators",
     "make_params",
     "presets",
     "reset",

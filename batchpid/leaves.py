@@ -1,4 +1,4 @@
-"""Leaves of the params, from the options of :func:`batchpid.make_params`: checked, broadcast and read-only.
+"""Leaves of params and actuators, from the options of their constructors: checked, broadcast and read-only.
 
 Inside jax.jit, jax.grad and jax.vmap the entries of an array are not known. Of such a traced array the shape is
 checked alone, and it stays a leaf even where it might turn out to be off.
@@ -22,7 +22,7 @@ MOST_JOINTS = 100_000
 
 
 class LeafBuilder:
-    """Builder of the leaves of one :class:`batchpid.PIDParams`, which agree in joints, envs and dtype."""
+    """Builder of the leaves of one :class:`batchpid.PIDParams` or the like, which agree in joints, envs and dtype."""
 
     def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: Any, values: Iterable[Any]) -> None:
         """Without a ``dtype`` it is that of the traced arrays among ``values``, else float64."""
@@ -49,9 +49,9 @@ class LeafBuilder:
         array = self._by_env_and_joint(name, array)
         return array if is_traced(array) else at_least(name, array, low, self.names, above=above, infinite=infinite)
 
-    def option(self, name: str, value: Any, *, neutral: float, above: bool = False) -> Any:
+    def option(self, name: str, value: Any, *, neutral: float, above: bool = False, low: float = 0.0) -> Any:
         """Return an option's leaf: None where it is ``neutral`` on every joint of every env."""
-        array = self.array(name, value, 0.0, above=above, infinite=math.isinf(neutral))
+        array = self.array(name, value, low, above=above, infinite=math.isinf(neutral))
         return None if _is_everywhere(array, neutral) else self.freeze(array)
 
     def limits(self, name: str, symmetric: Any, low: Any, high: Any) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ import batchpid as bp
 from batchpid.computed_torque import check_gain_units
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
+from sim.robot.actuators import fit_actuators
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -101,6 +102,10 @@ class RunnerOptions:
     ``speed_limit``. The other envs are not affected."""
     speed_limit: ArrayLike | None = None
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    actuators: bp.Actuators | None = None
+    """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
+    row per env. Default none. The control sees measured positions and velocities; observations hold the true ones, and
+    the effort that was delivered."""
     variation: Variation | None = None
     """Differences of each env's robot from the model: :func:`sim.tuning.randomization.draw_variation`. Snapshots do
     not hold it, so that it turns off recovery and checkpoints."""
@@ -155,6 +160,8 @@ class RunnerOptions:
                     "variation", f"is for {count} envs, not {checked['num_envs']}", remedy="draw one for each env"
                 )
         vars(self).update(checked)
+        if self.actuators is not None:
+            vars(self)["actuators"] = self.check_actuators(self.actuators)
 
     @property
     def solver(self) -> Physics:
@@ -182,10 +189,10 @@ class RunnerOptions:
         """
         return min(self.pack_size, max(1, self.num_envs // 8))
 
-    @property
-    def has_stiction(self) -> bool:
-        """True if joints have Coulomb friction that the loop models."""
-        return bool(self.robot.friction.any()) or self.variation is not None
+    def has_stiction(self, actuators: bp.Actuators | None) -> bool:
+        """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
+        added = actuators is not None and actuators.coulomb is not None
+        return bool(self.robot.friction.any()) or added or self.variation is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params`` if they fit the robot, the number of envs and the control.
@@ -216,6 +223,16 @@ class RunnerOptions:
                 remedy="give one row, or one row per env",
             )
         return params
+
+    def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
+        """Return ``actuators`` as :func:`sim.robot.actuators.fit_actuators` does.
+
+        Raises
+        ------
+        InvalidArgumentError
+            They do not fit.
+        """
+        return None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
 
     def about(self) -> dict[str, Any]:
         """Return the options that two runners must share to restore each other's snapshots, as plain values."""

@@ -26,7 +26,7 @@ from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
 from sim.loop.custom import initial_state
 from sim.loop.faults import Fault, FaultLog, FaultWarning
-from sim.loop.snapshot import EnvStates, Snapshot
+from sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
     Compensation,
@@ -42,7 +42,17 @@ from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
 from sim.workers.ledger import Commit, Ledger
 from sim.workers.pool import RecoveryWarning, WorkerPool
-from sim.workers.requests import ReadContentSizes, ReadPoses, Request, Reset, Restore, Run, SetParams, TakeSnapshot
+from sim.workers.requests import (
+    ReadContentSizes,
+    ReadPoses,
+    Request,
+    Reset,
+    Restore,
+    Run,
+    SetActuators,
+    SetParams,
+    TakeSnapshot,
+)
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
@@ -73,6 +83,7 @@ class _Books(NamedTuple):
     work_seconds: NDArray[np.float64] = np.zeros(0)
     unrecorded: tuple[tuple[float, NDArray[Any], Observation], ...] = ()
     """Ticks for the recorder: arguments of :meth:`TickRecorder.append`."""
+    actuators: bp.Actuators | None = None
 
 
 class Runner:
@@ -112,6 +123,7 @@ class Runner:
         pack_size: int = 4,
         on_fault: FaultAction = "hold",
         speed_limit: ArrayLike | None = None,
+        actuators: bp.Actuators | None = None,
         variation: Variation | None = None,
         on_invalid_input: InvalidInputAction = "raise",
         recover: bool = True,
@@ -133,6 +145,7 @@ class Runner:
             pack_size=pack_size,
             on_fault=on_fault,
             speed_limit=speed_limit,
+            actuators=actuators,
             variation=variation,
             on_invalid_input=on_invalid_input,
             recover=recover,
@@ -152,7 +165,7 @@ class Runner:
         self._has_warned = False
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
         self._pool = WorkerPool(options, params)
-        self._ledger = Ledger(self._pool, _Books(params, faults))
+        self._ledger = Ledger(self._pool, _Books(params, faults, actuators=options.actuators))
         try:
             self._pool.open()
             self.reset()
@@ -324,6 +337,17 @@ class Runner:
         request = SetParams(self.options.check_params(params))
         self._execute(request, lambda books, _: (books._replace(params=params), None))
 
+    @property
+    def actuators(self) -> bp.Actuators | None:
+        """Actuators; assign others to change them in flight, None for ideal ones. Delays keep their histories."""
+        return self._books.actuators
+
+    @actuators.setter
+    def actuators(self, actuators: bp.Actuators | None) -> None:
+        self._settle()
+        checked = self.options.check_actuators(actuators)
+        self._execute(SetActuators(checked), lambda books, _: (books._replace(actuators=checked), None))
+
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
 
@@ -333,7 +357,9 @@ class Runner:
         self._refuse_variation()
 
         def commit(books: _Books, results: list[Any]) -> tuple[_Books, Snapshot]:
-            snapshot = Snapshot(self.options.about(), books.steps, books.params, EnvStates.join(results))
+            snapshot = Snapshot(
+                self.options.about(), books.steps, books.params, EnvStates.join(results), books.actuators
+            )
             self._pool.start_replay_from(Restore(snapshot))
             return books._replace(steps_since_checkpoint=0), snapshot
 
@@ -354,13 +380,19 @@ class Runner:
         snapshot.check(self.options.about())
         self.options.check_params(snapshot.params)
         sizes = [size for part in self._execute(ReadContentSizes(), _read) for size in part]
-        controller = initial_state(self.options, snapshot.params)
-        snapshot.states.check(self.num_envs, self.robot.dof, controller, self.options.has_stiction, sizes)
+        controller, actuators = (
+            initial_state(self.options, snapshot.params),
+            self.options.check_actuators(snapshot.actuators),
+        )
+        motors = initial_actuators(actuators, *self._shape, self.timestep)
+        stiction = self.options.has_stiction(actuators)
+        snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, sizes)
 
         def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
             self._pool.start_replay_from(Restore(snapshot))
             books = books._replace(
                 params=snapshot.params,
+                actuators=actuators,
                 steps=snapshot.steps,
                 steps_since_checkpoint=0,
                 faults=books.faults.restored(snapshot.states.containment["step"]),
@@ -488,7 +520,8 @@ class Runner:
                     unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
             steps = ticks * substeps
             since = books.steps_since_checkpoint + steps
-            return _Books(books.params, faults, books.steps + steps, since, np.array(seconds) / ticks, unrecorded), None
+            books = books._replace(faults=faults, steps=books.steps + steps, steps_since_checkpoint=since)
+            return books._replace(work_seconds=np.array(seconds) / ticks, unrecorded=unrecorded), None
 
         self._execute(request, commit, stacklevel=4)
 

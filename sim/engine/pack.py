@@ -16,15 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.actuators import Actuators
 from batchpid.friction import Friction
-from sim.engine.building import (
-    SceneSpec,
-    build_scene,
-    engine_settings,
-    link_frames,
-    new_system,
-    set_collision_group,
-)
+from sim.engine.building import SceneSpec, build_scene, engine_settings, link_frames, new_system, set_collision_group
 from sim.engine.contact_watch import ContactWatch
 from sim.engine.coupling import ConstraintEfforts
 from sim.engine.dynamics import scene_dynamics
@@ -52,6 +46,8 @@ class Pack:
         Efforts last written, in the engine's precision; those of a coupling are not among them.
     friction
         Friction and damping that the loop has to apply to the joints.
+    armature
+        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
     """
 
     def __init__(
@@ -80,6 +76,8 @@ class Pack:
         self._watch = ContactWatch(spec, self.robots[0], size)
         self._stepped_qpos: NDArray[Any] | None = None  # of the last sim step, where they were read
         self.friction = self._friction()
+        self._implicit = np.array([[joint.armature[0] for joint in self.robots[0].active_joints]])
+        self.armature: NDArray[Any] = np.zeros((1, self.dof))
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
@@ -87,7 +85,6 @@ class Pack:
         self._constraint, self._joint_qf = None, self.qf
         if coupling is not None:
             self._joint_qf = np.zeros_like(self.qf)
-            self._armature = np.diag([joint.armature[0] for joint in self.robots[0].active_joints])
             continuous = np.array([joint.continuous for joint in spec.joints])
             self._constraint = ConstraintEfforts(coupling, continuous, spec.timestep)
         self._bind()
@@ -131,7 +128,8 @@ class Pack:
         qpos = self._calls.qpos(np.float64)
         if update:
             passive = self._calls.passive_force(True, True, np.float64)
-            constraint.update(scene_dynamics(self.spec).joint_mass_matrix(qpos) + self._armature, passive)
+            matrix = scene_dynamics(self.spec).joint_mass_matrix(qpos)
+            constraint.update(matrix + self._implicit[:, None] * np.eye(self.dof), passive)
         self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
         self._calls.write_qf()
 
@@ -165,6 +163,7 @@ class Pack:
                 joint.set_drive_properties(before.stiffness, before.damping, before.force_limit, before.drive_mode)
                 joint.set_drive_target(before.drive_target)
                 joint.set_drive_velocity_target(before.drive_velocity_target)
+                joint.set_armature(before.armature)
             _disable_gravity(new, bool(self._suspended[row]))
             old_scene.clear()
             self.systems[row], self._scenes[row], self.robots[row] = system, scene, new
@@ -253,6 +252,19 @@ class Pack:
     def read_poses(self) -> list[Float32]:
         """Return the poses of each scene's watched entities, (watched, 7) each."""
         return [content.poses() for content in self._contents]
+
+    def write_joints(self, actuators: Actuators | None) -> None:
+        """Add the friction, damping and reflected inertia of ``actuators`` to those of the robot's description."""
+        added = Actuators() if actuators is None else actuators
+        own = self._friction()
+        both = zip(own, (added.coulomb, added.viscous), strict=True)
+        self.friction = Friction(*(one if more is None else more if one is None else one + more for one, more in both))
+        self.armature = np.zeros((1, self.dof)) if added.armature is None else added.armature
+        viscous = 0.0 if self.friction.viscous is None else self.friction.viscous
+        self._implicit = self.armature + self.spec.timestep * viscous
+        values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
+        for joint, value in zip(self._joints, values.reshape(-1, 1), strict=True):
+            joint.set_armature(value)
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).

@@ -127,7 +127,7 @@ class PIDControl(Control):
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Advance the law by one sim step."""
         if self.params.gain_units is not None and step % MASS_MATRIX_STEPS == 0:
-            self._update_mass_matrix(qpos, min(MASS_MATRIX_STEPS, self._substeps - step))
+            self._update_mass_matrix(qpos, min(MASS_MATRIX_STEPS, self._substeps - step), qvel)
         if qvel is None and (self._measures_rate or self._damping is not None):
             qvel = self._plant.read_qvel()
         if self._damping is not None and qvel is not None:
@@ -148,11 +148,12 @@ class PIDControl(Control):
         self._state, effort = new[:2]
         return effort
 
-    def _update_mass_matrix(self, qpos: Float64, steps: int) -> None:
+    def _update_mass_matrix(self, qpos: Float64, steps: int, qvel: Float64 | None) -> None:
         """Set the mass matrix, and the gains that depend on it, for so many sim steps from ``qpos``."""
         # At the pose half-way through these steps, so that the error is zero on average: near upright, axes nearly in
         # line, a jaco2 leaves its path by 18 mrad under matrices that are 0.3 steps ahead.
-        half_way = qpos + 0.5 * (steps - 1) * self._scene.timestep * self._plant.read_qvel()
+        qvel = self._plant.read_qvel() if qvel is None else qvel
+        half_way = qpos + 0.5 * (steps - 1) * self._scene.timestep * qvel
         self._matrix = self._mass_matrix(half_way, self._damping)
         if not self._whole:
             self._scaled = per_inertia(self._coefficients, np.diagonal(self._matrix, axis1=1, axis2=2))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
 from sim.engine.pack import Pack
+from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
 from sim.loop.custom import make_control
 from sim.loop.faults import FaultContainment, finite
@@ -39,11 +42,25 @@ class EnvGroup:
         self._qpos = pack.read_qpos()
         self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
         self._steps = 0
+        self._actuators: JointActuators | None = None
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
         self._control.set_params(params)
         self._friction.drive = self._control.drive
+
+    def set_actuators(self, actuators: bp.Actuators | None) -> None:
+        """Change the actuators in flight; their state carries on."""
+        ours = self._actuators
+        if actuators is None:
+            self._actuators = None
+        elif ours is None:
+            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep)
+        else:
+            ours.set_actuators(actuators, self._qpos)
+        if actuators is not None or ours is not None:
+            self.pack.write_joints(actuators)
+            self._friction.update()
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
@@ -99,12 +116,16 @@ class EnvGroup:
             saturated=self._control.saturated,
             controller=self._control.read(),
             friction=self._friction.read(),
+            actuators={} if self._actuators is None else self._actuators.read(),
             containment=self._containment.read(),
         )
 
     def write(self, pack: Pack, states: EnvStates) -> None:
         """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
+        if self._actuators is not None:
+            pack.write_joints(self._actuators.actuators)
+            self._actuators.write(states.actuators)
         self._control = make_control(self._options, pack.spec, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
@@ -124,18 +145,22 @@ class EnvGroup:
         """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
         pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
-        reads_qpos = control.reads_qpos_each_step or self._compensates
+        actuators = self._actuators
+        reads_qpos = control.reads_qpos_each_step or self._compensates or actuators is not None
         for step in range(substeps):
             forward = self._feedforward(command)
             if not reads_qpos and not self._sound(forward):
                 # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
                 self._contain(pack.read_qpos(), step)
                 forward = self._feedforward(command)
-            qvel = pack.read_qvel() if friction.acts else None
-            effort = control.effort(self._qpos, forward, step, qvel)
+            qvel: Any = pack.read_qvel() if friction.acts or actuators is not None else None
+            seen = (self._qpos, qvel) if actuators is None else actuators.measure(self._qpos, qvel)
+            effort = control.effort(seen[0], forward, step, seen[1])
             if effort is not None:
+                if actuators is not None:
+                    effort = actuators.deliver(effort, self._qpos, qvel)
                 self._motor[...] = effort = pack.delivered(effort)
-            if qvel is not None:
+            if friction.acts:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
                 effort = friction.effort(motor, qvel)
             if effort is not None:
@@ -213,5 +238,12 @@ class EnvGroup:
         self.pack.suspend(self._containment.suspended)
         self._motor[mask] = 0.0
         self._qpos = self.pack.read_qpos()
-        self._control.reset(self._qpos, mask)
+        qpos = self._qpos
+        if self._actuators is not None:
+            holding = self.pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
+            if holding is not None and self._coupling is not None:
+                holding = self._coupling.efforts(holding)
+            self._actuators.reset(mask, qpos, (qvel := self.pack.read_qvel()), holding)
+            qpos, _ = self._actuators.measured(qpos, qvel)
+        self._control.reset(qpos, mask)
         self._friction.reset(mask)

@@ -38,9 +38,8 @@ class JointFriction:
     """
 
     def __init__(self, pack: Pack, drive: tuple[Any, Any] = (0.0, 0.0)) -> None:
-        self._pack, self._model, self.drive = pack, pack.friction, drive
+        self._pack, self.drive = pack, drive
         self._coupling = coupling_of(pack.spec.joints)
-        self.acts = any(leaf is not None for leaf in self._model)
         joints = pack.spec.joints
         modelled = DISSIPATION[pack.spec.dissipation].modelled
         self._known = np.array([joint.friction * modelled for joint in joints])  # the controller knows the URDF's
@@ -51,7 +50,18 @@ class JointFriction:
         self._state = friction.FrictionState()
         # Counted from an env's own reset: its motion must not depend on how long the runner has run.
         self._age = np.zeros(pack.size, np.int64)
-        self.reset(np.ones(pack.size, bool))
+        self.update()
+
+    def update(self) -> None:
+        """Take the friction of the pack, which has changed; the state carries on."""
+        self._model = self._pack.friction
+        self.acts = any(leaf is not None for leaf in self._model)
+        if self._model.coulomb is None:
+            self._state = friction.FrictionState()
+        elif self._state.effort is None:
+            self.reset(np.ones(self._pack.size, bool))
+        else:
+            self._age[:] = REFRESH_STEPS
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Reset the envs of ``mask`` (M,), which were placed."""
@@ -95,5 +105,8 @@ class JointFriction:
             self._age = state[AGE].copy()
 
     def _mass_matrix(self) -> Float64:
-        matrix = scene_dynamics(self._pack.spec).joint_mass_matrix(self._pack.read_qpos())
+        pack = self._pack
+        matrix = scene_dynamics(pack.spec).joint_mass_matrix(pack.read_qpos())
+        if pack.armature.any():
+            matrix = matrix + pack.armature[:, None] * np.eye(pack.dof)
         return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)

@@ -63,6 +63,8 @@ class Loop:
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
+        if options.actuators is not None:
+            self.set_actuators(options.actuators.for_envs(envs))
         self._first_rows = [self.ticks[0].at(group) for group in slices]  # made once: every single tick uses them
 
     def _build(self, envs: slice) -> Pack:
@@ -83,6 +85,11 @@ class Loop:
         """Change gains, limits and times in flight; the controller's state is kept."""
         for group in self.groups:
             group.set_params(params.for_envs(group.envs))
+
+    def set_actuators(self, actuators: bp.Actuators | None) -> None:
+        """Change the actuators in flight; their state is kept."""
+        for group in self.groups:
+            group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
 
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
@@ -107,6 +114,7 @@ class Loop:
         """Put every env into its state in ``snapshot``, with its params."""
         self._steps = snapshot.steps
         self.set_params(snapshot.params)
+        self.set_actuators(snapshot.actuators)
         self._place(snapshot.states)
         for group, rows in zip(self.groups, self._first_rows, strict=True):
             group.observe(rows)

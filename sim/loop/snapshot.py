@@ -29,7 +29,8 @@ from sim.loop.faults import CAUSES, FaultContainment
 
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 4
+_FORMAT = 5
+_ACTUATORS = "actuator_params"
 _CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
 _CHOICES["conditional"] = (Everywhere(),)
 """Params that hold no numbers, by name, with their values."""
@@ -53,6 +54,8 @@ class EnvStates:
     """Leaves of :class:`batchpid.PIDState`."""
     friction: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
+    actuators: dict[str, NDArray[Any]]
+    """Leaves of :class:`batchpid.actuators.ActuatorState`; none without actuators."""
     containment: dict[str, NDArray[Any]]
     """See :class:`sim.loop.faults.FaultContainment`."""
 
@@ -73,11 +76,13 @@ class EnvStates:
         dof: int,
         controller: dict[str, NDArray[Any]],
         friction: bool,
+        actuators: dict[str, NDArray[Any]],
         content_sizes: Sequence[int],
     ) -> None:
         """Check that these are states of so many envs and joints, with content of such sizes (envs,).
 
-        ``controller`` is a state of the control; ``friction`` tells whether joints have Coulomb friction.
+        ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
+        have Coulomb friction.
 
         Raises
         ------
@@ -95,6 +100,7 @@ class EnvStates:
             saturated=table > 0,
             controller=controller,
             friction={**dict.fromkeys(FrictionState._fields, table), AGE: row.astype(np.int64)} if friction else {},
+            actuators=actuators,
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = _flatten(vars(expected)), _flatten(vars(self))
@@ -135,6 +141,7 @@ class Snapshot:
     """Sim steps up to this moment."""
     params: bp.PIDParams
     states: EnvStates
+    actuators: bp.Actuators | None = None
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Check that a runner with options ``about`` can restore it.
@@ -154,7 +161,8 @@ class Snapshot:
 
     def for_envs(self, envs: slice) -> Snapshot:
         """Return the snapshot of some envs."""
-        return replace(self, params=self.params.for_envs(envs), states=self.states.for_envs(envs))
+        actuators = None if self.actuators is None else self.actuators.for_envs(envs)
+        return replace(self, params=self.params.for_envs(envs), states=self.states.for_envs(envs), actuators=actuators)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz file, as a whole or not at all: an older file stays until this one is complete.
@@ -170,7 +178,7 @@ class Snapshot:
         head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": choices}
         tables: dict[str, Any] = {
             "head": np.array(json.dumps(head)),
-            **_flatten({"params": arrays, **vars(self.states)}),
+            **_flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
         }
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
 
@@ -206,6 +214,8 @@ class Snapshot:
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
         groups = _nest(tables)
+        motors = groups.pop(_ACTUATORS, None)
+        actuators = None if motors is None else bp.make_actuators(dof, **motors)
         kinds = {name: {type(one).__name__: one for one in _CHOICES[name]} for name in choices}
         chosen = {name: kinds[name][kind] for name, kind in choices.items()}
         params, states = bp.PIDParams(**groups.pop("params"), **chosen), EnvStates(**groups)
@@ -219,8 +229,9 @@ class Snapshot:
             controller = bp.init(params, np.zeros((num_envs, dof), np.float32)).leaves()
         if any(leaf.shape[:1] != (num_envs,) for leaf in controller.values()):
             raise ValueError(f"the state of its controller is not of {num_envs} envs")
-        states.check(num_envs, dof, controller, bool(states.friction), ())
-        return cls(about, steps, params, states)
+        motors = initial_actuators(actuators, num_envs, dof, about["timestep"])
+        states.check(num_envs, dof, controller, bool(states.friction), motors, ())
+        return cls(about, steps, params, states, actuators)
 
     def __repr__(self) -> str:
         about = self.about
@@ -228,6 +239,24 @@ class Snapshot:
             f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control {about.get('control')!r}, "
             f"after {self.steps} sim steps)"
         )
+
+
+def initial_actuators(
+    actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float
+) -> dict[str, NDArray[Any]]:
+    """Return a state of ``actuators`` in the shapes that it has for so many envs and joints, by name."""
+    if actuators is None:
+        return {}
+    longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))
+    state = bp.actuators.init(longest, np.zeros((1, dof)), timestep).leaves()
+    return {name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()}
+
+
+def _options(actuators: bp.Actuators | None) -> dict[str, NDArray[Any]]:
+    """Return the arguments of :func:`batchpid.make_actuators` as arrays."""
+    if actuators is None:
+        return {}
+    return {name: np.asarray(value) for name, value in actuators.options().items() if name != "dtype"}
 
 
 def _flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
@@ -240,7 +269,7 @@ def _flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 
 def _nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the groups of :func:`_flatten`."""
-    groups: dict[str, Any] = {"controller": {}, "friction": {}, "containment": {}}
+    groups: dict[str, Any] = {"controller": {}, "friction": {}, "actuators": {}, "containment": {}}
     for name, rows in tables.items():
         group, dot, leaf = name.partition(".")
         if dot:

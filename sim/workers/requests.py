@@ -159,6 +159,19 @@ class SetParams(Request):
 
 
 @dataclass(frozen=True)
+class SetActuators(Request):
+    """Change the actuators in flight; None removes them."""
+
+    actuators: bp.Actuators | None
+
+    def for_envs(self, envs: slice) -> Self:
+        return type(self)(None if self.actuators is None else self.actuators.for_envs(envs))
+
+    def apply(self, loop: Loop) -> None:
+        loop.set_actuators(self.actuators)
+
+
+@dataclass(frozen=True)
 class TakeSnapshot(Request):
     """Read the state of every env, and go on as if restored from it."""
 

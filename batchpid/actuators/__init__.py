@@ -1,0 +1,40 @@
+"""Actuators and sensors between the controller and the joints: delay, lag, envelope, strength, resolution.
+
+Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and :func:`measure`::
+
+    actuators = bp.make_actuators(joints=7, command_delay=0.005, strength=0.9)
+    state = bp.actuators.init(actuators, qpos, dt)
+    state, measured, rate = bp.actuators.measure(actuators, state, qpos, qvel, dt)
+    state, effort = bp.actuators.deliver(actuators, state, effort, qpos, qvel, dt)
+
+See docs/actuators.md.
+"""
+
+from batchpid.actuators.dynamics import (
+    Coefficients,
+    advance_effort,
+    advance_measurement,
+    deliver,
+    discretise,
+    init,
+    measure,
+    reset,
+)
+from batchpid.actuators.model import JOINT_SIDE, Actuators, check_actuators, make_actuators
+from batchpid.actuators.state import ActuatorState
+
+__all__ = [
+    "JOINT_SIDE",
+    "ActuatorState",
+    "Actuators",
+    "Coefficients",
+    "advance_effort",
+    "advance_measurement",
+    "check_actuators",
+    "deliver",
+    "discretise",
+    "init",
+    "make_actuators",
+    "measure",
+    "reset",
+]

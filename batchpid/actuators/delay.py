@@ -1,0 +1,84 @@
+r"""Delay of sampled signals by any time, interpolated between samples.
+
+With samples x_k at t = k dt, and a delay d = (n + f) dt with whole n and 0 <= f < 1::
+
+    y_k = (1 - f) x_{k-n} + f x_{k-n-1}
+
+A sine of angular frequency w is delayed by d exactly at f = 0, and by d to second order in w dt otherwise, with its
+amplitude lowered by at most the factor cos(w dt / 2) (T. I. Laakso et al., "Splitting the unit delay", IEEE Signal
+Processing Magazine 13, 1996: linear interpolation is the Lagrange filter of order 1).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.elementwise import namespace, wrap
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import is_traced
+
+MOST_SAMPLES = 20_000
+_NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding is one
+
+
+class Delay(NamedTuple):
+    """A delay at one time step, for histories (envs, samples, joints)."""
+
+    later: Any
+    """Flat index of x_{k-n} in a history (envs, joints)."""
+    earlier: Any
+    """Flat index of x_{k-n-1}."""
+    fraction: Any
+    """f (envs, joints)."""
+
+
+def samples_of(name: str, delay: Any, dt: float) -> int:
+    """Return the samples that a history needs for the largest of ``delay`` [s].
+
+    Raises
+    ------
+    InvalidArgumentError
+        The delay is traced by JAX, so that its size is not known, or it needs too many samples.
+    """
+    if is_traced(delay) or is_traced(dt):
+        raise InvalidArgumentError(name, "is traced, its size is not known", remedy="pass samples= to init")
+    count = math.floor(float(np.max(delay)) / dt + _NEAR) + 2
+    if count > MOST_SAMPLES:
+        remedy = f"use a longer time step, or at most {(MOST_SAMPLES - 2) * dt:g} s"
+        raise InvalidArgumentError(name, f"needs {count} samples", value=float(np.max(delay)), remedy=remedy)
+    return count
+
+
+def discretise(delay: Any, dt: Any, history: Any) -> Delay:
+    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, joints), its longest."""
+    xp = namespace(delay, history)
+    envs, samples, joints = history.shape
+    steps = delay / dt
+    whole = xp.rint(steps)
+    steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
+    steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
+    floor = xp.minimum(xp.floor(steps), samples - 2)
+    first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)
+    later = first + floor.astype(int) * joints
+    return Delay(later, later + joints, steps - floor)
+
+
+def start(value: Any, samples: int) -> Any:
+    """Return a history (envs, samples, joints) that has been ``value`` (envs, joints) so far."""
+    xp = namespace(value)
+    return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
+
+
+def push(history: Any, value: Any, xp: Any) -> Any:
+    """Return ``history`` (envs, samples, joints) with ``value`` (envs, joints) as its latest sample."""
+    return xp.concatenate((value[:, None], history[:, :-1]), axis=1)
+
+
+def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
+    """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
+    flat = history.reshape(-1)
+    later, earlier = flat.take(k.later), flat.take(k.earlier)
+    return later + k.fraction * wrap(earlier - later, turns, xp)

@@ -1,0 +1,208 @@
+"""Parameters of actuators and sensors: build, broadcast, validate.
+
+:class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
+that is off is ``None``: it is no leaf and costs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.display import span, summary
+from batchpid.errors import InvalidArgumentError
+from batchpid.leaves import LeafBuilder
+from batchpid.validate import at_least, is_traced
+
+NEUTRAL: dict[str, float] = {
+    "command_delay": 0.0,
+    "sensor_delay": 0.0,
+    "lag": 0.0,
+    "strength": 1.0,
+    "bias": 0.0,
+    "saturation_effort": math.inf,
+    "no_load_speed": math.inf,
+    "effort_limit": math.inf,
+    "coulomb": 0.0,
+    "viscous": 0.0,
+    "armature": 0.0,
+    "position_resolution": 0.0,
+    "velocity_resolution": 0.0,
+}
+"""Numbers of a joint, with the value that is off."""
+JOINT_SIDE = ("coulomb", "viscous", "armature")
+"""Fields that act on the joint and not on the signals: :class:`sim.Runner` gives them to the simulator."""
+MAX_DELAY = 1.0
+"""Longest delay [s]."""
+
+
+class Actuators(NamedTuple):
+    """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
+
+    Build it with :func:`make_actuators`, change it with :meth:`replace`: both validate. The fields have the meaning
+    and the units of the options of :func:`make_actuators`.
+    """
+
+    command_delay: Any = None
+    sensor_delay: Any = None
+    lag: Any = None
+    strength: Any = None
+    bias: Any = None
+    saturation_effort: Any = None
+    no_load_speed: Any = None
+    effort_limit: Any = None
+    coulomb: Any = None
+    viscous: Any = None
+    armature: Any = None
+    position_resolution: Any = None
+    velocity_resolution: Any = None
+    continuous: Any = None
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+
+    @property
+    def num_joints(self) -> int | None:
+        """Number of joints; None where every effect is off."""
+        return next((int(leaf.shape[1]) for leaf in self if leaf is not None), None)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs with actuators of their own; 1 where all envs share them."""
+        return max((leaf.shape[0] for leaf in self if leaf is not None), default=1)
+
+    @property
+    def measures(self) -> bool:
+        """True if measurements differ from the joints' true positions or velocities."""
+        return any(leaf is not None for leaf in (self.sensor_delay, self.position_resolution, self.velocity_resolution))
+
+    @property
+    def delivers(self) -> bool:
+        """True if the efforts delivered differ from those asked for."""
+        return any(
+            leaf is not None
+            for leaf in (self.command_delay, self.lag, self.strength, self.bias, self.effort_limit, self.no_load_speed)
+        )
+
+    def for_envs(self, envs: slice | Any) -> Actuators:
+        """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
+        return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+
+    def options(self) -> dict[str, Any]:
+        """Return the effects that are on, as arguments of :func:`make_actuators` that build these actuators again."""
+        options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+        if self.continuous is not None:
+            options["continuous"] = self.continuous > 0
+        if options:
+            options["dtype"] = next(leaf.dtype for leaf in self if leaf is not None)
+        return options
+
+    def replace(self, **options: Any) -> Actuators:
+        """Return actuators with some options of :func:`make_actuators` changed, checked as there."""
+        known = self.options()
+        if any(is_traced(value) for value in options.values()):
+            known.pop("dtype", None)
+        if self.num_joints is None and "joints" not in options:
+            remedy = "build them with make_actuators(), or give joints="
+            raise InvalidArgumentError("joints", "is not known: every effect is off", remedy=remedy)
+        return make_actuators(**{"joints": self.num_joints, **known, **options})
+
+    def __repr__(self) -> str:
+        on = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+        sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [f"{self.num_joints} joints"] * bool(on)
+        return summary("Actuators", [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())])
+
+
+def make_actuators(
+    joints: int,
+    *,
+    command_delay: Any = None,
+    sensor_delay: Any = None,
+    lag: Any = None,
+    strength: Any = None,
+    bias: Any = None,
+    saturation_effort: Any = None,
+    no_load_speed: Any = None,
+    effort_limit: Any = None,
+    coulomb: Any = None,
+    viscous: Any = None,
+    armature: Any = None,
+    position_resolution: Any = None,
+    velocity_resolution: Any = None,
+    continuous: Any = None,
+    joint_names: Sequence[str] | None = None,
+    dtype: Any = None,
+) -> Actuators:
+    """Build validated :class:`Actuators`; a number may be a scalar, (joints,) or (envs, joints).
+
+    ``None`` is off, and so is a value that changes nothing anywhere. Numbers may be traced by JAX; their shapes are
+    checked, their values are not.
+
+    Parameters
+    ----------
+    joints
+        Number of joints.
+    command_delay, sensor_delay
+        Age of the command that the motor follows, and of the position and velocity that the controller sees, from 0 to
+        1 [s]. Any real number: values between two samples are interpolated.
+    lag
+        Time constant T >= 0 of the effort's first-order lag [s].
+    strength
+        Factor >= 0 of the effort, 1 for a motor as the controller believes it to be.
+    bias
+        Effort added by the motor [N m or N].
+    saturation_effort, no_load_speed
+        Effort at stall, > 0 [N m or N], and speed without load, > 0 [rad/s or m/s], of the line between them: the
+        torque-speed envelope (:mod:`batchpid.actuators.envelope`). Given together.
+    effort_limit
+        Largest effort that the motor delivers, >= 0 [N m or N].
+    coulomb, viscous
+        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to that of the robot's description, by
+        the model of :mod:`batchpid.friction`.
+    armature
+        Reflected inertia of the motor >= 0 [kg m^2 or kg].
+    position_resolution, velocity_resolution
+        Step >= 0 of measured positions [rad or m] and velocities [rad/s or m/s].
+    continuous
+        Bools: joints whose position is an angle modulo 2 pi [rad].
+    joint_names
+        Used in error messages.
+    dtype
+        float32 or float64; None: float64, or that of the traced arrays.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, joint, env and value.
+    """
+    given = locals()
+    build = LeafBuilder(joints, joint_names, dtype, given.values())
+    leaves: dict[str, Any] = {}
+    for name, neutral in NEUTRAL.items():
+        above, low = name in ("saturation_effort", "no_load_speed"), -math.inf if name == "bias" else 0.0
+        leaves[name] = build.option(name, given[name], neutral=neutral, above=above, low=low)
+    for name in ("command_delay", "sensor_delay"):
+        if (delay := leaves[name]) is not None and not is_traced(delay) and (delay > MAX_DELAY).any():
+            remedy = f"use a number from 0 to {MAX_DELAY:g} (seconds)"
+            raise InvalidArgumentError(name, "out of range", value=float(delay.max()), remedy=remedy)
+    if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
+        missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
+        raise InvalidArgumentError(missing, "is missing", remedy="give both ends of the torque-speed line, or none")
+    return Actuators(**leaves, continuous=build.mask("continuous", continuous))
+
+
+def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
+    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+    shapes = (1, len(joint_names)), (num_envs, len(joint_names))
+    for name, leaf in actuators._asdict().items():
+        if leaf is None:
+            continue
+        if leaf.shape not in shapes:
+            raise InvalidArgumentError(
+                f"actuators.{name}",
+                f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
+                remedy=f"give one row, or one row per env, of {', '.join(joint_names)}",
+            )
+        low = -math.inf if name == "bias" else 0.0
+        at_least(f"actuators.{name}", np.asarray(leaf), low, joint_names, infinite=True)

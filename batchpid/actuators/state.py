@@ -1,0 +1,45 @@
+"""State of actuators and sensors between steps."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.display import array_summary
+
+
+class ActuatorState(NamedTuple):
+    """State of actuators and sensors; None where no effect needs it. Every array has the envs as its first axis."""
+
+    command: Any = None
+    """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
+    effort: Any = None
+    """Effort behind the lag (envs, joints) [N m or N]."""
+    position: Any = None
+    """Positions, latest first (envs, samples, joints) [rad or m]."""
+    velocity: Any = None
+    """Velocities, latest first (envs, samples, joints) [rad/s or m/s]."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+    def leaves(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+
+    def matched_to(self, fresh: ActuatorState) -> ActuatorState:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped.
+
+        A history that is longer there is continued by its oldest sample.
+        """
+        both = zip(self, fresh, strict=True)
+        return ActuatorState(*(new if new is None or old is None else _resized(old, new) for old, new in both))
+
+
+def _resized(old: Any, new: Any) -> Any:
+    if old.ndim < 3 or old.shape == new.shape:
+        return old
+    xp, samples = old.__array_namespace__(), new.shape[1]
+    if samples < old.shape[1]:
+        return old[:, :samples].copy()
+    oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
+    return xp.concatenate((old, oldest), axis=1)

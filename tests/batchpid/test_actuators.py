@@ -1,0 +1,73 @@
+"""Actuators: parameters checked, histories matched, off at no cost."""
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+
+DT = 1 / 2000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"strength": -0.1}, "strength, joint 0: must be finite and >= 0"),
+        ({"strength": [1, np.nan, 1]}, "strength, joint 1"),
+        ({"command_delay": 1.5}, "command_delay: out of range"),
+        ({"sensor_delay": -1e-3}, "sensor_delay"),
+        ({"saturation_effort": 10.0}, "no_load_speed: is missing"),
+        ({"no_load_speed": 10.0}, "saturation_effort: is missing"),
+        ({"saturation_effort": 0.0, "no_load_speed": 1.0}, "saturation_effort, joint 0: must be > 0"),
+        ({"armature": np.inf}, "armature"),
+        ({"coulomb": np.ones((2, 2))}, "coulomb: has shape"),
+        ({"bias": "much"}, "bias: cannot be read"),
+    ],
+)
+def test_bad_input_is_refused(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        bp.make_actuators(3, **options)
+
+
+def test_a_neutral_value_is_off():
+    actuators = bp.make_actuators(2, command_delay=0.0, strength=1.0, bias=0.0, effort_limit=np.inf, armature=0.0)
+    assert all(leaf is None for leaf in actuators)
+    assert not actuators.measures
+    assert not actuators.delivers
+    q = np.zeros((3, 2))
+    state = bp.actuators.init(actuators, q, DT)
+    assert state.leaves() == {}
+    effort = np.ones((3, 2))
+    assert bp.actuators.deliver(actuators, state, effort, q, q, DT)[1] is effort
+
+
+def test_replace_and_parts():
+    actuators = bp.make_actuators(2, strength=[[0.9, 1.0], [1.1, 1.2]], bias=0.5)
+    assert actuators.replace(bias=None).bias is None
+    np.testing.assert_array_equal(actuators.replace(lag=0.01).strength, actuators.strength)
+    part = actuators.for_envs(slice(1, 2))
+    assert part.strength.tolist() == [[1.1, 1.2]]
+    assert part.bias.shape == (1, 2)
+    assert repr(actuators) == "Actuators(2 envs, 2 joints, strength 0.9 to 1.2, bias 0.5)"
+    with pytest.raises(InvalidArgumentError, match="every effect is off"):
+        bp.make_actuators(2).replace(lag=0.1)
+
+
+def test_a_longer_delay_in_flight_keeps_the_history():
+    short, long = (bp.make_actuators(1, command_delay=steps * DT) for steps in (2, 4))
+    q = np.zeros((1, 1))
+    state = bp.actuators.init(short, q, DT)
+    for step in range(6):
+        state, effort = bp.actuators.deliver(short, state, q + step, q, q, DT)
+    assert effort == 3.0
+    state = state.matched_to(bp.actuators.init(long, q, DT))
+    state, effort = bp.actuators.deliver(long, state, q + 6, q, q, DT)
+    assert effort == 2.0, "the oldest that is known"
+    for step in range(7, 12):
+        state, effort = bp.actuators.deliver(long, state, q + step, q, q, DT)
+    assert effort == 7.0
+
+
+def test_a_time_step_far_shorter_than_the_delay_is_refused():
+    with pytest.raises(InvalidArgumentError, match="needs 1000002 samples"):
+        bp.actuators.init(bp.make_actuators(1, command_delay=1.0), np.zeros((1, 1)), 1e-6)

@@ -1,0 +1,146 @@
+"""Actuators in the loop: independent of workers, company and restores; changed in flight; as the models say."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import numpy as np
+import pytest
+from identical import assert_identical
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim import Runner, Snapshot
+from sim.workers.pool import RecoveryWarning
+
+N = 5
+
+
+def actuators(robot, seed=0, **more):
+    """Return actuators with every effect on, of every env its own."""
+    rng, shape = np.random.default_rng(seed), (N, robot.dof)
+    options = {
+        "command_delay": rng.uniform(0, 0.004, shape),
+        "sensor_delay": rng.uniform(0, 0.003, shape),
+        "lag": rng.uniform(0, 0.002, shape),
+        "strength": rng.uniform(0.8, 1.2, shape),
+        "bias": rng.normal(0, 0.1, shape),
+        "saturation_effort": 80.0,
+        "no_load_speed": rng.uniform(2, 5, shape),
+        "effort_limit": 60.0,
+        "coulomb": rng.uniform(0, 0.2, shape),
+        "viscous": rng.uniform(0, 0.5, shape),
+        "armature": rng.uniform(0, 0.05, shape),
+        "position_resolution": 2 * np.pi / 2**16,
+        "velocity_resolution": 1e-3,
+    }
+    return bp.make_actuators(robot.dof, **{**options, **more})
+
+
+def commands(robot, ticks, seed=0):
+    noise = np.random.default_rng(seed).uniform(-0.3, 0.3, (ticks, N, robot.dof))
+    return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
+
+
+def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
+    chosen, table = actuators(panda), commands(panda, 16)
+    with Runner(panda, N, workers=0, actuators=chosen) as runner:
+        first = runner.rollout(table[:8])
+        snapshot = runner.snapshot()
+        second = runner.rollout(table[8:])
+        runner.restore(snapshot)
+        assert_identical(second, runner.rollout(table[8:]))
+    snapshot.save(tmp_path / "at8.npz")
+    with Runner(panda, N, workers=2, actuators=chosen) as runner:
+        assert_identical(first, runner.rollout(table[:8]))
+        runner.restore(Snapshot.load(tmp_path / "at8.npz"))
+        assert_identical(second, runner.rollout(table[8:]))
+    with Runner(panda, 2, workers=0, actuators=chosen.for_envs(slice(2, 4))) as runner:
+        assert_identical(first.for_envs(slice(2, 4)), runner.rollout(table[:8, 2:4]))
+
+
+def test_a_lost_worker_leaves_no_trace(panda):
+    chosen, table = actuators(panda), commands(panda, 12)
+    other = actuators(panda, seed=1, command_delay=0.006, lag=None)
+
+    def run(workers):
+        with Runner(panda, N, workers=workers, actuators=chosen) as runner:
+            runner.rollout(table[:4])
+            runner.actuators = other
+            runner.rollout(table[4:8])
+            for pid in runner.pids:
+                os.kill(pid, signal.SIGKILL)
+            return runner.rollout(table[8:])
+
+    with pytest.warns(RecoveryWarning):
+        lost = run(1)
+    assert_identical(run(0), lost)
+
+
+def test_actuators_that_are_off_change_no_bit(panda):
+    table = commands(panda, 5)
+    with Runner(panda, N, workers=0) as runner:
+        ideal = runner.rollout(table)
+    with Runner(panda, N, workers=0, actuators=bp.make_actuators(panda.dof, strength=1.0)) as runner:
+        assert_identical(ideal, runner.rollout(table))
+        runner.actuators = actuators(panda)
+        runner.reset()
+        assert not np.array_equal(ideal.qpos, runner.rollout(table).qpos)
+        assert runner.actuators.strength is not None
+        runner.actuators = None
+        runner.reset()
+        assert_identical(ideal.observation, runner.rollout(table).observation)
+
+
+def test_a_masked_reset_forgets_histories_of_its_envs_alone(panda):
+    chosen, table = actuators(panda), commands(panda, 4)
+    mask = np.array([True, False, True, False, False])
+    with Runner(panda, N, workers=0, actuators=chosen) as runner:
+        first = runner.rollout(table)
+        runner.reset(mask=mask)
+        again = runner.rollout(table)
+        assert_identical(first.for_envs(mask).observation, again.for_envs(mask).observation)
+    with Runner(panda, N, workers=0, actuators=chosen) as runner:
+        runner.rollout(table)
+        assert_identical(runner.rollout(table).for_envs(~mask), again.for_envs(~mask))
+
+
+def test_the_effort_is_that_delivered(panda):
+    """Late by the delay, times the strength, under control "effort"."""
+    asked = np.zeros((6, 1, panda.dof))
+    asked[3:, :, :7] = [4.0, 3, 3, 3, 1, 1, 1]
+    chosen = bp.make_actuators(panda.dof, command_delay=0.0015, strength=0.5)
+    with Runner(panda, 1, workers=0, control="effort", compensate="none", substeps=1, actuators=chosen) as runner:
+        effort = runner.rollout(np.concatenate((asked, asked[-1:]))).effort
+    np.testing.assert_allclose(effort[3:], np.float32(0.5 * np.concatenate((asked, asked[-1:]))[:4]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"joints": 3}, "shape"),
+        ({"joints": 9, "strength": np.ones((4, 9)) * 0.5}, "one row per env"),
+        ("strong", "must be a Actuators"),
+    ],
+)
+def test_actuators_that_do_not_fit_are_refused_before_anything_changes(panda, wrong, message):
+    built = bp.make_actuators(**{"strength": 0.9, **wrong}) if isinstance(wrong, dict) else wrong
+    with Runner(panda, N, workers=0) as runner:
+        with pytest.raises(InvalidArgumentError, match=message):
+            runner.actuators = built
+        assert runner.actuators is None
+    with pytest.raises(InvalidArgumentError, match=message):
+        Runner(panda, N, workers=0, actuators=built)
+
+
+def test_drives_take_friction_and_armature_alone(panda):
+    with pytest.raises(InvalidArgumentError, match="drives bypass both"):
+        Runner(panda, 1, workers=0, control="drive", actuators=bp.make_actuators(panda.dof, strength=0.9))
+    heavy = bp.make_actuators(panda.dof, armature=1.0)
+    with Runner(panda, 1, workers=0, control="drive") as runner:
+        free = runner.rollout(np.tile(panda.settings.target, (5, 1)))
+        runner.actuators = heavy
+        runner.reset()
+        loaded = runner.rollout(np.tile(panda.settings.target, (5, 1)))
+    assert np.abs(loaded.qvel[:, :, :7]).max() < 0.8 * np.abs(free.qvel[:, :, :7]).max()
