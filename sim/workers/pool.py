@@ -54,6 +54,8 @@ class _Slot:
     losses: int = 0
     cause: str = ""
     lost_at: float = 0.0
+    poller: select.poll = field(default_factory=select.poll)
+    """Of the worker's file descriptor."""
 
 
 class WorkerPool:
@@ -197,7 +199,7 @@ class WorkerPool:
 
     def _send(self, slot: _Slot) -> None:
         slot.phase = "transfer"
-        slot.worker.send(slot.queue[0].for_envs(slot.start.envs))
+        slot.worker.send(slot.queue[0])
         slot.phase = "waiting"
 
     def _receive(self, slot: _Slot) -> None:
@@ -220,7 +222,16 @@ class WorkerPool:
         waiting = [slot for slot in busy if slot.phase == "waiting"]
         if self.is_local:
             return waiting
-        readable = {descriptor for descriptor, _ in self._poller.poll(1e3 * _POLL_INTERVAL)}
+        left = 1e3 * _POLL_INTERVAL
+        if all(len(slot.queue) == 1 for slot in waiting):
+            # For all, one after another: to wake up for the first takes the core of one that still runs.
+            end = time.monotonic() + _POLL_INTERVAL
+            for slot in waiting:
+                if not slot.poller.poll(left):
+                    break
+                left = 1e3 * max(0.0, end - time.monotonic())
+            left = 0.0
+        readable = {descriptor for descriptor, _ in self._poller.poll(left)}
         return [slot for slot in waiting if slot.worker.fileno() in readable]
 
     # -- lost workers ----------------------------------------------------------------------------------------------
@@ -253,16 +264,22 @@ class WorkerPool:
         slot.worker.open()
         if self._cores:
             slot.worker.pin(self._cores[slot.start.index])
-        poller = select.poll()
-        for descriptor in (worker.fileno() for worker in self.workers):
-            if descriptor is not None:
-                poller.register(descriptor, select.POLLIN)
-        self._poller = poller
+        slot.poller = _poller_of([slot.worker])
+        self._poller = _poller_of(self.workers)
         request, replay = self._request, self._replay
         again = [] if request is None or (replay and replay[-1] is request) else [request]
         slot.queue = [slot.start, *replay, *again]
         slot.error = None
         slot.phase = "waiting"
+
+
+def _poller_of(workers: list[Worker]) -> select.poll:
+    """Return a poll object of the results of some workers."""
+    poller = select.poll()
+    for descriptor in (worker.fileno() for worker in workers):
+        if descriptor is not None:
+            poller.register(descriptor, select.POLLIN)
+    return poller
 
 
 def is_refusal(error: Exception) -> bool:

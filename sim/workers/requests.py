@@ -7,7 +7,7 @@ import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass
-from operator import itemgetter, methodcaller
+from operator import methodcaller
 from typing import Any, Self
 
 import numpy as np
@@ -48,12 +48,12 @@ class Request(ABC):
         """Return a copy that later writes to the caller's arrays do not change."""
         return deepcopy(self)
 
-    def write(self, arrays: Arrays) -> None:  # noqa: B027  (most requests travel in the message)
-        """Write what travels in the shared arrays (ticks, envs, ...) of its envs."""
+    def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027  (most requests travel in the message)
+        """Write what travels in the shared arrays (ticks, envs, ...), the rows of some envs."""
 
-    def encode(self) -> bytes:
-        """Return the message from which :func:`decode` makes the request in a worker process."""
-        return pickle.dumps(self)
+    def encode(self, envs: slice) -> bytes:
+        """Return the message from which :func:`decode` makes the part of some envs in their worker."""
+        return pickle.dumps(self.for_envs(envs))
 
     @abstractmethod
     def apply(self, loop: Loop) -> Any:
@@ -124,24 +124,19 @@ class Run(Request):
     def observed_tick(self) -> int:
         return self.ticks - 1
 
-    def _with(self, command: Command) -> Self:
-        return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
-
     def limit(self, num_envs: int) -> float:
         return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
-    def for_envs(self, envs: slice) -> Self:
-        return self._with(self.command.map(itemgetter((slice(None), envs))))
-
     def copy(self) -> Self:
-        return self._with(self.command.map(methodcaller("copy")))
+        command = self.command.map(methodcaller("copy"))
+        return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
 
-    def write(self, arrays: Arrays) -> None:
+    def write(self, arrays: Arrays, envs: slice) -> None:
         for table, rows in zip(arrays.command, self.command, strict=True):
             if rows is not None:
-                table[: self.ticks] = rows
+                table[: self.ticks, envs] = rows[:, envs]
 
-    def encode(self) -> bytes:
+    def encode(self, envs: slice) -> bytes:
         return _RUN.pack(b"R", self.ticks, self.substeps, self.use_rate, self.use_feedforward)
 
     def apply(self, loop: Loop) -> float:

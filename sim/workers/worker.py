@@ -61,7 +61,7 @@ class Worker(ABC):
 
     @abstractmethod
     def send(self, request: Request) -> None:
-        """Start a request for the envs of this worker."""
+        """Start the part of a request for the envs of this worker."""
 
     @abstractmethod
     def receive(self) -> Any:
@@ -113,7 +113,7 @@ class LocalWorker(Worker):
 
     def send(self, request: Request) -> None:
         assert self._loop is not None
-        request.write(self._loop.arrays)
+        request.write(self._loop.arrays, self._start.envs)
         self._result = request.apply(self._loop)
 
     def receive(self) -> Any:
@@ -140,7 +140,7 @@ class ProcessWorker(Worker):
             ) from error
         self._name = f"worker {start.index} (envs {start.envs.start} to {start.envs.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
-        self._arrays = Arrays.from_fields(shared.arrays).at((slice(None), start.envs))
+        self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
         self._opening: Job[None] | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -173,10 +173,10 @@ class ProcessWorker(Worker):
         return self._channel.fileno()
 
     def send(self, request: Request) -> None:
-        request.write(self._arrays)
+        request.write(self._arrays, self._envs)
         self._liveness.begin()
         try:
-            self._channel.send(request.encode())
+            self._channel.send(request.encode(self._envs))
         except OSError as error:
             raise self._death() from error
 

@@ -59,6 +59,7 @@ class InterruptAt:
         self.where = ""
 
     def __call__(self, act: Callable[[], object]) -> None:
+        gc.disable()  # an exception is lost, too, in the __del__ of a runner that a test before has left
         try:
             sys.setprofile(self._on_event)
             undisturbed(act)
@@ -66,6 +67,7 @@ class InterruptAt:
             self.happened = True
         finally:
             sys.setprofile(None)
+            gc.enable()
 
     def _on_event(self, frame: Any, event: str, argument: Any) -> None:
         code = frame.f_code  # an exception in a generator that is being freed is lost

@@ -10,7 +10,7 @@ import pytest
 from identical import assert_identical
 
 from sim import RecoveryWarning, Runner
-from sim.loop.arrays import Command
+from sim.loop.arrays import Arrays, Command
 from sim.workers.requests import ReadPoses, Reset, Run, SetParams, decode
 
 N, DOF = 4, 9
@@ -29,11 +29,16 @@ def test_the_part_of_a_reset_has_the_rows_of_its_envs():
     np.testing.assert_array_equal(part.qvel, -rows[1:3])
 
 
-def test_the_part_of_a_run_has_the_rows_of_its_envs():
-    part = Run.under(command(), substeps=20).for_envs(ENVS)
-    np.testing.assert_array_equal(part.command.setpoint, command().setpoint[:, 1:3])
-    assert part.command.setpoint_rate is None
-    assert (part.ticks, part.substeps, part.observed_tick) == (3, 20, 2)
+def test_a_run_writes_the_commands_of_some_envs_and_no_others():
+    layout = Arrays.layout(4, N, DOF)
+    arrays = Arrays.from_fields({name: np.full(shape, 7, dtype) for name, (shape, dtype) in layout.items()})
+    run = Run.under(command(ticks=3), substeps=20)
+    run.write(arrays, ENVS)
+    expected = np.full((4, N, DOF), 7.0)
+    expected[:3, ENVS] = command().setpoint[:, ENVS]
+    np.testing.assert_array_equal(arrays.command.setpoint, expected)
+    assert (arrays.command.setpoint_rate == 7).all()
+    assert (run.ticks, run.substeps, run.observed_tick) == (3, 20, 2)
 
 
 def test_the_part_of_params_has_the_rows_of_its_envs(panda):
@@ -45,7 +50,7 @@ def test_the_part_of_params_has_the_rows_of_its_envs(panda):
 @pytest.mark.parametrize("rate", [None, command().setpoint])
 def test_the_message_of_a_run_is_short_and_holds_all_but_the_commands(rate):
     request = Run.under(command()._replace(setpoint_rate=rate), substeps=7)
-    message = request.encode()
+    message = request.encode(ENVS)
     assert len(message) < 20
     received = decode(message)
     for name in ("ticks", "substeps", "use_rate", "use_feedforward"):
@@ -54,9 +59,9 @@ def test_the_message_of_a_run_is_short_and_holds_all_but_the_commands(rate):
 
 def test_other_messages_hold_the_whole_request():
     request = Reset(np.ones(N, bool), np.zeros((N, DOF)), np.ones((N, DOF)))
-    received = decode(request.encode())
+    received = decode(request.encode(slice(None)))
     np.testing.assert_array_equal(received.qvel, request.qvel)
-    assert decode(ReadPoses().encode()) == ReadPoses()
+    assert decode(ReadPoses().encode(ENVS)) == ReadPoses()
 
 
 def test_requests_that_only_read_are_not_replayed():
