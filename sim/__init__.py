@@ -15,6 +15,7 @@ for _name in ("batchpid", "assets"):
         raise ImportError(f"{_origin} hides the package {_name!r} that sim needs; rename it or run in another folder")
 
 import batchpid.startup  # noqa: F401 - checks the import path before NumPy is imported
+from sim.loop.contact_log import MissedContact, MissedContactWarning
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo
@@ -37,6 +38,8 @@ __all__ = [
     "Fault",
     "FaultWarning",
     "Finding",
+    "MissedContact",
+    "MissedContactWarning",
     "Observation",
     "Physics",
     "Recorder",

@@ -100,7 +100,9 @@ class RunInfo:
     compensate: str | None = None
     """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or "none"."""
     physics: str | None = None
-    """Solver settings: "accurate", "fast", or the text of a :class:`sim.Physics`."""
+    """Solver settings: "accurate", "fast", "free", or the text of a :class:`sim.Physics`."""
+    collisions: bool | None = None
+    """False if the robots had no collision shapes."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     start: NDArray[Any] | None = None

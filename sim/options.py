@@ -51,9 +51,11 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-PhysicsPreset = Literal["accurate", "fast"]
+PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
+PACK_SIZE = {True: 4, False: 64}
+"""Default of ``pack_size``, with collisions and without, where packs need no isolation (docs/performance.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +87,22 @@ class RunnerOptions:
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
     "effort" friction is not compensated."""
     physics: PhysicsPreset | Physics = "accurate"
-    """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, or a :class:`sim.Physics`."""
+    """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
+    :class:`sim.Physics`."""
     ground: bool | None = None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose."""
+    collisions: bool = True
+    """With False robots have no collision shapes, and there is no ground: for free motion only. Masses, inertias and
+    joint limits stay. A :class:`sim.MissedContactWarning` says which robots would have touched something."""
     build: Callable[[Any, int], Any] | None = None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`sim.Runner.poses` reports. A
     reset puts the content back to where ``build`` left it."""
-    pack_size: int = 4
-    """Largest number of scenes that share a PhysX system; affects speed alone. A robot gets its own system before
-    something touches it, so that results do not depend on the other envs (docs/reliability.md)."""
+    pack_size: int | None = None
+    """Largest number of scenes that share a PhysX system; affects speed alone. Default: 4, or 64 without collisions.
+    A robot gets its own system before something touches it, so that results do not depend on the other envs
+    (docs/reliability.md)."""
     on_fault: FaultAction = "hold"
     """``"hold"`` an env that fails at rest in its last valid state, with ``ok`` False until it is reset; or ``"reset"``
     it to its last start, with ``ok`` False for that tick. An env fails when its state is no longer finite, or by
@@ -133,8 +140,11 @@ class RunnerOptions:
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "control": _control(self.control),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
-            "ground": robot.has_ground if self.ground is None else flag("ground", self.ground),
-            "pack_size": integer("pack_size", self.pack_size, 1, 65535),
+            "collisions": flag("collisions", self.collisions),
+            "ground": self.collisions and robot.has_ground if self.ground is None else flag("ground", self.ground),
+            "pack_size": PACK_SIZE[bool(self.collisions)]
+            if self.pack_size is None
+            else integer("pack_size", self.pack_size, 1, 65535),
             "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
             "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
             "recover": flag("recover", self.recover),
@@ -162,6 +172,18 @@ class RunnerOptions:
         vars(self).update(checked)
         if self.actuators is not None:
             vars(self)["actuators"] = self.check_actuators(self.actuators)
+        self._check_collisions()
+
+    def _check_collisions(self) -> None:
+        """Raise InvalidArgumentError for options that have no meaning without collisions."""
+        if self.collisions:
+            return
+        if self.ground:
+            problem, remedy = "is True, and collisions are False", "leave it out: nothing can touch a ground"
+            raise InvalidArgumentError("ground", problem, remedy=remedy)
+        if not self.robot.fixed_base:
+            problem = f"are False, and nothing holds the floating base of {self.robot.name!r}"
+            raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
 
     @property
     def solver(self) -> Physics:
@@ -185,9 +207,11 @@ class RunnerOptions:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
         Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`sim.engine.contact_prediction` missed a contact.
+        where :mod:`sim.engine.contact_prediction` missed a contact. Without collisions there is none to miss: any
+        number of workers get equal shares, and pack these.
         """
-        return min(self.pack_size, max(1, self.num_envs // 8))
+        assert self.pack_size is not None
+        return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -247,6 +271,7 @@ class RunnerOptions:
             "compensate": self.compensate,
             "physics": list(astuple(self.solver)),
             "dissipation": robot.dissipation,
+            "collisions": self.collisions,
             "ground": self.ground,
             "ignored_pairs": hashlib.sha256(repr(robot.ignored_pairs).encode()).hexdigest(),
             "fixed_base": robot.fixed_base,

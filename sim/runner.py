@@ -22,8 +22,10 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
+from sim.engine.dynamics import robot_dynamics
 from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
+from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
 from sim.loop.custom import initial_state
 from sim.loop.faults import Fault, FaultLog, FaultWarning
 from sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
@@ -85,6 +87,8 @@ class _Books(NamedTuple):
     unrecorded: tuple[tuple[float, NDArray[Any], Observation], ...] = ()
     """Ticks for the recorder: arguments of :meth:`TickRecorder.append`."""
     actuators: bp.Actuators | None = None
+    contacts: MissedContactLog | None = None
+    """None with collisions."""
 
 
 class Runner:
@@ -120,8 +124,9 @@ class Runner:
         compensate: Compensation = "gravity+coriolis+friction",
         physics: PhysicsPreset | Physics = "accurate",
         ground: bool | None = None,
+        collisions: bool = True,
         build: Callable[[Any, int], Any] | None = None,
-        pack_size: int = 4,
+        pack_size: int | None = None,
         on_fault: FaultAction = "hold",
         speed_limit: ArrayLike | None = None,
         actuators: bp.Actuators | None = None,
@@ -142,6 +147,7 @@ class Runner:
             compensate=compensate,
             physics=physics,
             ground=ground,
+            collisions=collisions,
             build=build,
             pack_size=pack_size,
             on_fault=on_fault,
@@ -163,10 +169,15 @@ class Runner:
         self._limits = SetpointCheck(robot)
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
-        self._has_warned = False
+        self._has_warned = self._has_warned_of_contact = False
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
+        contacts = None
+        if not options.collisions:
+            contacts = MissedContactLog(
+                self.num_envs, self.timestep, lambda qpos: robot_dynamics(robot).nearest_links(qpos)
+            )
         self._pool = WorkerPool(options, params)
-        self._ledger = Ledger(self._pool, _Books(params, faults, actuators=options.actuators))
+        self._ledger = Ledger(self._pool, _Books(params, faults, actuators=options.actuators, contacts=contacts))
         try:
             self._pool.open()
             self.reset()
@@ -177,9 +188,10 @@ class Runner:
     def __repr__(self) -> str:
         options, workers = self.options, len(self.pids)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
+        collisions = "collisions" if options.collisions else "no collisions"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
-            f"{options.compensate!r},\n       physics {options.physics!r}, timestep {self.timestep:g} s, "
+            f"{options.compensate!r},\n       physics {options.physics!r}, {collisions}, timestep {self.timestep:g} s, "
             f"{self.substeps} substeps, at {self.time:g} s)"
         )
 
@@ -422,6 +434,7 @@ class Runner:
             control=self.options.control_name,
             compensate=self.options.compensate,
             physics=str(self.options.physics),
+            collisions=self.options.collisions,
             params=self.params,
             start=self.observe().qpos,
             versions=self._versions,
@@ -437,6 +450,12 @@ class Runner:
     def faults(self) -> deque[Fault]:
         """Envs that failed, latest last: the last ten thousand."""
         return self._books.faults.faults
+
+    @property
+    def missed_contacts(self) -> tuple[MissedContact, ...]:
+        """First contact that each robot would have had since it was placed, without collisions; latest last."""
+        contacts = self._books.contacts
+        return () if contacts is None else tuple(contacts.contacts)
 
     @property
     def backend(self) -> str:
@@ -501,6 +520,10 @@ class Runner:
                 FaultWarning,
                 stacklevel=stacklevel,
             )
+        contacts = self._ledger.books.contacts
+        if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
+            self._has_warned_of_contact = True
+            warnings.warn(contacts.message(), MissedContactWarning, stacklevel=stacklevel)
         return result
 
     def _run(self, command: Command, substeps: int) -> None:
@@ -513,9 +536,11 @@ class Runner:
         request = Run.under(command, substeps)
 
         def commit(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
-            faults, unrecorded = books.faults, books.unrecorded
+            faults, contacts, unrecorded = books.faults, books.contacts, books.unrecorded
             for done, arrays in enumerate(pool.ticks.first(ticks), start=1):
                 faults = faults.noting(arrays)
+                if contacts is not None:
+                    contacts = contacts.noting(arrays)
                 if self.recorder is not None:
                     time = (books.steps + done * substeps) * self.timestep
                     unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
@@ -523,7 +548,7 @@ class Runner:
             since = books.steps_since_checkpoint + steps
             spent = tuple([each / ticks for each in seconds])
             books = books._replace(faults=faults, steps=books.steps + steps, steps_since_checkpoint=since)
-            return books._replace(work_seconds=spent, unrecorded=unrecorded), None
+            return books._replace(work_seconds=spent, unrecorded=unrecorded, contacts=contacts), None
 
         self._execute(request, commit, stacklevel=4)
 

@@ -25,6 +25,7 @@ class CompareCommand:
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
     physics: flags.Physics = "accurate"
+    collisions: flags.Collisions = True
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
@@ -53,6 +54,7 @@ class CompareCommand:
             seconds=self.seconds,
             workers=self.workers,
             physics=self.physics,
+            collisions=self.collisions,
         )
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
         print(evaluation_table(robot, evaluations))

@@ -53,7 +53,11 @@ GainSets = Annotated[
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
-Physics = Annotated[Literal["accurate", "fast"], _flag("Solver settings: SAPIEN's, or fewer iterations.")]
+Physics = Annotated[
+    Literal["accurate", "fast", "free"],
+    _flag("Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact."),
+]
+Collisions = Annotated[bool, _flag("Simulate contacts. Without, robots have no shapes: faster, for free motion only.")]
 Compensate = Annotated[
     Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
     _flag("Passive force and known friction, added at every sim step."),

@@ -38,6 +38,7 @@ class RolloutCommand:
     """Largest distance of a start pose from the robot's own [rad or m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
     physics: flags.Physics = "accurate"
+    collisions: flags.Collisions = True
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     workers: flags.Workers = None
@@ -73,6 +74,7 @@ class RolloutCommand:
             substeps=self.substeps,
             compensate=self.compensate,
             physics=self.physics,
+            collisions=self.collisions,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():

@@ -41,6 +41,7 @@ class TuneCommand:
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
     physics: flags.Physics = "accurate"
+    collisions: flags.Collisions = True
     workers: flags.Workers = None
     time_limit: flags.TimeLimit = None
     missing_meshes: flags.MissingMeshes = "skip"
@@ -85,11 +86,19 @@ class TuneCommand:
             history=history,
             progress=bar("tuning", unit="generation"),
             physics=self.physics,
+            collisions=self.collisions,
         )
         print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
         evaluations = evaluate_sets(
-            robot, sets, moves=20, seed=self.seed, variation=variation, workers=self.workers, physics=self.physics
+            robot,
+            sets,
+            moves=20,
+            seed=self.seed,
+            variation=variation,
+            workers=self.workers,
+            physics=self.physics,
+            collisions=self.collisions,
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)

@@ -33,6 +33,7 @@ class SceneSpec:
     ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
     ``joints`` are the degrees of freedom in SAPIEN's order. With ``merge_fixed`` each rigid body is one link
     (:mod:`sim.robot.merging`).
+    Without ``collisions`` the robot has no shapes and there is no ground; masses and inertias stay.
     Specs that differ in ``build`` alone are equal.
     """
 
@@ -45,6 +46,7 @@ class SceneSpec:
     ground: bool = True
     fixed_base: bool = True
     merge_fixed: bool = True
+    collisions: bool = True
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
@@ -58,7 +60,14 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     RobotError
         SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
-    return _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
+    builder = _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
+    if not spec.collisions:
+        for link in builder.link_builders:
+            if link._auto_inertial:  # a link without <inertial> has the inertia of its shapes
+                shaped = link.build_physx_component()
+                link.set_mass_and_inertia(shaped.mass, shaped.cmass_local_pose, shaped.inertia)
+            link.collision_records = []
+    return builder
 
 
 @lru_cache(maxsize=8)
@@ -121,6 +130,8 @@ def link_groups(spec: SceneSpec) -> CollisionGroups:
 
 def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
     """Return the link of the URDF that owns each collision shape of each simulated link, in the engine's order."""
+    if not spec.collisions:
+        return {link.name: [] for link in parse(spec).link_builders}
     if spec.merge_fixed:
         return merged(spec).owners
     return {link.name: [link.name] * len(link.collision_records) for link in parse(spec).link_builders}
@@ -207,7 +218,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     with engine_settings(spec):
         robot = builder.set_scene(scene).build()
         builder.set_scene(None)  # the scene can be freed
-        if spec.ground:
+        if spec.ground and spec.collisions:
             scene.add_ground(0.0, render=False)
     asked = {link.name: link.collision_records for link in builder.link_builders}
     for link in robot.links:

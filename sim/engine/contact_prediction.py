@@ -102,6 +102,10 @@ class ContactPredictor:
         rows = np.append(np.cumsum(counts > 0) - 1, np.count_nonzero(counts))
         self._first_row, self._second_row = rows[self._first], rows[self._second]
 
+    def index(self, pair: NearPair) -> int:
+        """Return the row of ``arms`` that is of this pair, -1 if no joint moves its links apart."""
+        return int(self._index[pair.first, pair.second])
+
     def predicts_contact(self, pairs: Iterable[NearPair], qvel: NDArray[np.floating]) -> bool:
         """Return whether contact may act within LOOKAHEAD_STEPS, at joint velocities ``qvel`` (dof,).
 
@@ -143,7 +147,7 @@ class ContactPredictor:
         # Distances are listed of the step before.
         slack = np.full(len(closing), LISTED_DISTANCE - from_rest) - closing
         for number, pair in enumerate(pairs):
-            index = self._index[pair.first, pair.second]
+            index = self.index(pair)
             if index < 0:  # links that no joint moves apart
                 return None
             # The nearest pair may touch first: one contact has no order.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 from xml.etree import ElementTree
 
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies, shape_owners
 from sim.engine.collision_groups import Pair
-from sim.engine.contact_prediction import WORLD, NearPair
+from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
+from sim.engine.extents import link_extents, touching_pairs
 from sim.engine.physics import PHYSICS
 from sim.robot.description import RobotDescription
 from sim.robot.mimics import coupling_of
@@ -91,17 +93,35 @@ class Dynamics:
     def link_distances(self, qpos: NDArray[Any]) -> dict[Pair, float]:
         """Return the distances [m] of the pairs of links of the URDF that are near each other, at one pose (dof,).
 
-        Links joined by fixed joints do not count.
+        Links joined by fixed joints do not count. The ground counts as the base.
         """
-        self.near_pairs(qpos)
         distances: dict[Pair, float] = {}
+        for names, distance in self._near_links(qpos):
+            pair = frozenset([*names, self._bodies[WORLD]][:2])
+            distances[pair] = min(distance, distances.get(pair, np.inf))
+        return distances
+
+    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
+
+        One if the other is the ground; none if no links are near each other.
+        """
+        return min(self._near_links(qpos), key=lambda near: near[1], default=((), np.inf))[0]
+
+    def _near_links(self, qpos: NDArray[Any]) -> Iterator[tuple[tuple[str, ...], float]]:
+        """Yield the links of the URDF, one or two, and the distance [m] of each pair of shapes near each other."""
+        self.near_pairs(qpos)
         for contact in self._system.get_contacts():
             first, second = (self._bodies[self._links.get(body, WORLD)] for body in contact.bodies)
             if first != second:
-                pair = frozenset(self._owners.get(shape, second) for shape in contact.shapes)
-                distance = min(point.separation for point in contact.points)
-                distances[pair] = min(distance, distances.get(pair, np.inf))
-        return distances
+                names = tuple(self._owners[shape] for shape in contact.shapes if shape in self._owners)
+                yield names, min(point.separation for point in contact.points)
+
+    @cached_property
+    def contact_predictor(self) -> ContactPredictor:
+        """Predictor of contacts, for the spec's time step."""
+        pairs = touching_pairs(self._robot, self._spec.ground)
+        return ContactPredictor(link_extents(self._robot), pairs, self._robot.dof, self._spec.timestep)
 
     def height(self, qpos: NDArray[Any]) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""

@@ -24,7 +24,7 @@ from sim.engine.coupling import ConstraintEfforts
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.native import engine_calls
 from sim.engine.root_state import read_root, write_root
-from sim.engine.user_content import SceneContent
+from sim.engine.user_content import SceneContent, refuse_shapes
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.mimics import coupling_of
 
@@ -56,7 +56,7 @@ class Pack:
         self.spec = spec
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
-        shared, self._isolates = system_size if shares else 1, shares and isolates
+        shared, self._isolates = system_size if shares else 1, shares and isolates and spec.collisions
         systems = [new_system(spec) for _ in range(-(-size // shared))]
         self._shared_systems = [systems[row // shared] for row in range(size)]
         self.systems = list(self._shared_systems)
@@ -69,6 +69,9 @@ class Pack:
                 envs = enumerate(self._scenes, start=first_env)
                 frames = [link_frames(spec, robot) for robot in self.robots]
                 self._contents = [SceneContent(spec.build, scene, env, frames[env - first_env]) for env, scene in envs]
+                if not spec.collisions:
+                    for env, scene in enumerate(self._scenes, start=first_env):
+                        refuse_shapes(scene, env)
         for row, scene in enumerate(self._scenes):
             set_collision_group(scene, row + 1)
         self.size, self.dof = size, self.robots[0].dof

@@ -124,6 +124,19 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
+def refuse_shapes(scene: Any, env: int) -> None:
+    """Raise InvalidArgumentError if an entity of ``scene``, that of env ``env``, has a collision shape."""
+    for entity in scene.entities:
+        for component in entity.components:
+            if getattr(component, "collision_shapes", ()):
+                raise InvalidArgumentError(
+                    "build",
+                    f"added collision shapes (to {entity.name!r}), and collisions are False",
+                    env=env,
+                    remedy="leave them out, or use collisions=True",
+                )
+
+
 def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
     """Return the entities and frames that ``build`` returns; its errors become an InvalidArgumentError."""
     try:

@@ -31,11 +31,15 @@ class Command(NamedTuple):
 
 
 class FaultArrays(NamedTuple):
-    """Last fault of each env (envs,): sim step (-1: none), joint, and index into :data:`sim.loop.faults.CAUSES`."""
+    """Last fault of each env (envs,): sim step (-1: none), joint, and index into :data:`sim.loop.faults.CAUSES`.
+
+    Without collisions, ``missed_contact`` is the sim step of its first missed contact (0: none).
+    """
 
     step: NDArray[np.int64]
     joint: NDArray[np.int64]
     cause: NDArray[np.int64]
+    missed_contact: NDArray[np.int64]
 
 
 class Arrays(NamedTuple):

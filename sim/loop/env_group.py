@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from sim.engine.missed_contact import MissedContacts
 from sim.engine.pack import Pack
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
@@ -43,6 +44,8 @@ class EnvGroup:
         self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
         self._steps = 0
         self._actuators: JointActuators | None = None
+        collides, ground = options.collisions, options.robot.has_ground
+        self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
@@ -87,6 +90,8 @@ class EnvGroup:
             self._run_substeps(substeps, command)
             if not finite(self._qpos, self.pack.read_qvel()):
                 self._contain(self._qpos, substeps)
+        if self._contacts is not None:
+            self._contacts.look(self._qpos, steps + substeps)
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
@@ -96,8 +101,10 @@ class EnvGroup:
         observation.effort[...] = self._motor
         observation.saturated[...] = self._control.saturated
         observation.ok[...] = ~containment.failed
-        for table, last in zip(rows.fault, (containment.step, containment.joint, containment.cause), strict=True):
-            table[...] = last
+        fault = rows.fault
+        fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
+        if self._contacts is not None:
+            fault.missed_contact[...] = self._contacts.first
         if containment.suspended.any():
             envs = containment.suspended
             observation.qpos[envs] = containment.suspended_qpos[envs]
@@ -138,6 +145,8 @@ class EnvGroup:
         self._friction.write(states.friction)
         self._motor[...] = states.effort
         self._qpos = pack.read_qpos()
+        if self._contacts is not None:
+            self._contacts.place(np.ones(pack.size, bool))
 
     # -- the closed loop ---------------------------------------------------------------------------------------
 
@@ -238,6 +247,8 @@ class EnvGroup:
         self.pack.suspend(self._containment.suspended)
         self._motor[mask] = 0.0
         self._qpos = self.pack.read_qpos()
+        if self._contacts is not None:
+            self._contacts.place(mask)
         qpos = self._qpos
         if self._actuators is not None:
             holding = self.pack.passive_force(self._gravity, self._coriolis) if self._gravity else None

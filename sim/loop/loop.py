@@ -56,6 +56,7 @@ class Loop:
             ground=bool(options.ground),
             fixed_base=robot.fixed_base,
             merge_fixed=robot.merge_fixed,
+            collisions=options.collisions,
             build=options.build,
         )
         self._steps = 0

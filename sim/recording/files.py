@@ -248,7 +248,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         **dict.fromkeys(("lower", "upper", "effort_limit", "start"), _numbers),
         "timestep": float,
         "substeps": int,
-        **dict.fromkeys(("complete", "merge_fixed"), bool),
+        **dict.fromkeys(("complete", "merge_fixed", "collisions"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
         "versions": lambda text: dict(json.loads(str(text))),

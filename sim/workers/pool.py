@@ -69,7 +69,7 @@ class WorkerPool:
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
         self.is_local, self._make_worker = not count, ProcessWorker if count else LocalWorker
         """True if the loop runs in this process."""
-        self._slices = split_envs(options.num_envs, count, options.scenes_per_system)
+        self._slices = split_envs(options.num_envs, count, options.scenes_per_system if options.collisions else 1)
         self._cores = pinned_cores(len(self._slices))
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
