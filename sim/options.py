@@ -1,4 +1,7 @@
-"""Options of a runner: one definition for :class:`sim.Runner`, its loops, snapshots, recordings and commands."""
+"""Options of a runner: one definition for :class:`sim.Runner`, its loops, snapshots, recordings and commands.
+
+Longer than 300 lines because every option is documented here.
+"""
 
 from __future__ import annotations
 

@@ -16,10 +16,10 @@ P = TypeVar("P", bound=Path | None)
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
-    """Return tyro's options of a flag; its help leaves out the defaults None, False and ()."""
+    """Return tyro's options of a flag; its help leaves out the defaults None, False, True and ()."""
 
     def hint(default: str) -> str:
-        return "" if default in ("None", "False", "") else f"(default: {default})"
+        return "" if default in ("None", "False", "True", "") else f"(default: {default})"
 
     return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
 
@@ -57,7 +57,7 @@ Physics = Annotated[
     Literal["accurate", "fast", "free"],
     _flag("Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact."),
 ]
-Collisions = Annotated[bool, _flag("Simulate contacts. Without, robots have no shapes: faster, for free motion only.")]
+Collisions = Annotated[bool, _flag("Robots have no collision shapes: faster, for free motion only.")]
 Compensate = Annotated[
     Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
     _flag("Passive force and known friction, added at every sim step."),

@@ -93,7 +93,19 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["workers", "physics", "compensate", "missing_meshes", "seed", "seconds", "substeps", "variation", "fps"]
+    "name",
+    [
+        "workers",
+        "physics",
+        "collisions",
+        "compensate",
+        "missing_meshes",
+        "seed",
+        "seconds",
+        "substeps",
+        "variation",
+        "fps",
+    ],
 )
 def test_a_flag_has_the_same_type_and_default_in_every_command(name):
     fields = [fields_of(command)[name] for command in cli.COMMANDS if name in fields_of(command)]
