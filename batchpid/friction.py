@@ -23,6 +23,8 @@ models", IROS 2005)::
   2002). The yield by clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
   (1998), section 1.4.
 
+With a static friction F_s > F the bound is F_s until the joint yields, and F until it holds again.
+
 With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled joints share it: with
 the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 / (A_jj sum_i |C_ij|) keeps the eigenvalues
 of A J within [0, 1], by Gershgorin's theorem. SHARE of K is left for inertias that change between two refreshes.
@@ -48,6 +50,8 @@ class Friction(NamedTuple):
     """F >= 0 [N m or N]."""
     viscous: Any = None
     """B >= 0 [N m s/rad or N s/m]."""
+    static: Any = None
+    """F_s >= F, which holds the joint at rest; 0: F [N m or N]."""
 
 
 class FrictionState(NamedTuple):
@@ -61,6 +65,8 @@ class FrictionState(NamedTuple):
     """K (1 + w - dt^2 k / J), with the stiffness k of an implicit drive; the factor of v [N m s/rad or N s/m]."""
     memory: Any = None
     """K w: the factor of v' [N m s/rad or N s/m]."""
+    sliding: Any = None
+    """1.0 where the friction had yielded in the last step, else 0.0."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
@@ -82,7 +88,7 @@ def init(
         return FrictionState()
     xp = namespace(velocity, load, mass_matrix, *friction)
     zero = xp.zeros_like(velocity)
-    state = FrictionState(load + zero, velocity + zero, zero, zero)
+    state = FrictionState(load + zero, velocity + zero, zero, zero, zero)
     return refresh(friction, state, mass_matrix, dt, damping, stiffness)
 
 
@@ -118,8 +124,12 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
     total = effort
     if friction.coulomb is not None:
         xp = namespace(effort, velocity, *state)
-        total = state.effort - state.gain * velocity + state.memory * state.velocity
-        total = xp.minimum(xp.maximum(total, effort - friction.coulomb), effort + friction.coulomb)
+        held, bound = state.effort - state.gain * velocity + state.memory * state.velocity, friction.coulomb
+        if friction.static is not None:
+            bound = xp.where(state.sliding > 0, bound, xp.maximum(bound, friction.static))
+        total = xp.minimum(xp.maximum(held, effort - bound), effort + bound)
+        if friction.static is not None:
+            state = state._replace(sliding=(total != held).astype(total.dtype))
         state = state._replace(effort=total, velocity=velocity)
     if friction.viscous is not None:
         total = total - friction.viscous * velocity

@@ -218,7 +218,7 @@ class RunnerOptions:
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
-        added = actuators is not None and actuators.coulomb is not None
+        added = actuators is not None and (actuators.coulomb is not None or actuators.static is not None)
         return bool(self.robot.friction.any()) or added or self.variation is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:

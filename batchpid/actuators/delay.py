@@ -27,12 +27,10 @@ _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding 
 class Delay(NamedTuple):
     """A delay at one time step, for histories (envs, samples, joints)."""
 
-    later: Any
-    """Flat index of x_{k-n} in a history (envs, joints)."""
-    earlier: Any
-    """Flat index of x_{k-n-1}."""
+    index: Any
+    """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
     fraction: Any
-    """f (envs, joints)."""
+    """f (envs, joints); None: 0 everywhere."""
 
 
 def samples_of(name: str, delay: Any, dt: float) -> int:
@@ -61,9 +59,12 @@ def discretise(delay: Any, dt: Any, history: Any) -> Delay:
     steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
     steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
     floor = xp.minimum(xp.floor(steps), samples - 2)
+    fraction = steps - floor
     first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)
     later = first + floor.astype(int) * joints
-    return Delay(later, later + joints, steps - floor)
+    if not is_traced(fraction) and not fraction.any():
+        return Delay(later[None], None)
+    return Delay(xp.stack((later, later + joints)), fraction)
 
 
 def start(value: Any, samples: int) -> Any:
@@ -79,6 +80,7 @@ def push(history: Any, value: Any, xp: Any) -> Any:
 
 def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
     """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
-    flat = history.reshape(-1)
-    later, earlier = flat.take(k.later), flat.take(k.earlier)
-    return later + k.fraction * wrap(earlier - later, turns, xp)
+    values = history.reshape(-1).take(k.index)
+    if k.fraction is None:
+        return values[0]
+    return values[0] + k.fraction * wrap(values[1] - values[0], turns, xp)

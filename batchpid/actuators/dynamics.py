@@ -1,28 +1,36 @@
 r"""From the effort asked for to the effort delivered, and from the joint's state to its measurement.
 
-Pure functions on (envs, joints), for NumPy and JAX. At each step, with the effort u of the controller, the joint's
-position q and velocity v::
+Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and velocity v, and the
+effort u that the controller asks for::
 
-    y, y' = q(t - d_s), v(t - d_s)                          sensor delay
-    y     = r rint(y / r)                                   resolution, of y' likewise
-    m     = s u(t - d_c) + b                                command delay, strength, bias
-    e     = m                                               off: lag
-    e     = e' + (1 - exp(-dt / T)) (m - e')                lag, m within the envelope; exact for a constant m
-    e     = min(max(e, low(v)), high(v))                    envelope
+    x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
+    v_x    = v, 0 within the play
+    y, v_y = x(t - d_s), v_x(t - d_s)                      sensor delay
+    y      = r rint((y + sigma z) / r)                     noise, resolution; of v_y likewise
 
-A prime at e is the value of the step before. Friction and armature are the simulator's: see :mod:`batchpid.friction`.
+    m      = s u(t - d_c) + b                              command delay, strength, bias
+    e      = min(max(m, low(q, v)), high(q, v))            envelope: batchpid.actuators.envelope
+    e      = e' + (1 - exp(-dt / T)) (e - e')              lag, again within the envelope; exact for a constant e
+
+A prime is the value of the step before. The play is the backlash hysteresis (G. Tao and P. Kokotovic, Adaptive Control
+of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
+see :mod:`batchpid.friction`.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from batchpid.actuators import delay
-from batchpid.actuators.envelope import narrow
+import numpy as np
+
+from batchpid.actuators import delay, noise
+from batchpid.actuators.envelope import Envelope, envelope, limits
 from batchpid.actuators.model import Actuators
 from batchpid.actuators.state import ActuatorState
 from batchpid.display import array_summary
-from batchpid.elementwise import TURN, namespace
+from batchpid.elementwise import TURN, clip, namespace, wrap
+
+_ONE = np.uint32(1)
 
 
 class Coefficients(NamedTuple):
@@ -30,27 +38,34 @@ class Coefficients(NamedTuple):
 
     command: delay.Delay | None = None
     sensor: delay.Delay | None = None
+    envelope: Any = Envelope()
     intake: Any = None
     """1 - exp(-dt / T)."""
     strength: Any = None
     bias: Any = None
-    stall: Any = None
-    """S."""
-    slope: Any = None
-    """S / v0."""
-    limit: Any = None
-    """L."""
+    play: Any = None
+    """B / 2."""
     position_resolution: Any = None
     velocity_resolution: Any = None
+    position_noise: Any = None
+    velocity_noise: Any = None
     turns: Any = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(command=None, sensor=None), "envs", "joints")
+        return array_summary(self._replace(command=None, sensor=None, envelope=None), "envs", "joints")
 
 
 def init(
-    actuators: Actuators, qpos: Any, dt: float, *, qvel: Any = None, effort: Any = None, samples: int | None = None
+    actuators: Actuators,
+    qpos: Any,
+    dt: float,
+    *,
+    qvel: Any = None,
+    effort: Any = None,
+    envs: Any = None,
+    episode: Any = 0,
+    samples: int | None = None,
 ) -> ActuatorState:
     """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort`` asked so far.
 
@@ -60,6 +75,8 @@ def init(
         Position [rad or m], velocity and effort [N m or N] (envs, joints) so far; velocity and effort are 0 by default.
     dt
         Time step [s].
+    envs, episode
+        Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on both.
     samples
         Length of the histories, at least 2; None: as long as the delays need. Needed where delays are traced by JAX.
 
@@ -70,38 +87,57 @@ def init(
     """
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
+    position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
     asked = zeros if effort is None else zeros + effort
-    velocity = zeros if qvel is None else zeros + qvel
-    command = position = rate = None
+    command = positions = velocities = encoder = key = step = None
     if actuators.command_delay is not None:
         command = delay.start(asked, samples or delay.samples_of("command_delay", actuators.command_delay, dt))
     if actuators.sensor_delay is not None:
         count = samples or delay.samples_of("sensor_delay", actuators.sensor_delay, dt)
-        position, rate = delay.start(zeros + qpos, count), delay.start(velocity, count)
-    state = ActuatorState(command=command, position=position, velocity=rate)
+        positions, velocities = delay.start(position, count), delay.start(velocity, count)
+    if actuators.backlash is not None:
+        encoder = position
+    if actuators.seed is not None:
+        numbers = xp.arange(len(zeros)) if envs is None else envs
+        key = noise.keys(actuators.seed, numbers, xp.zeros(len(zeros), xp.uint32) + xp.asarray(episode), xp)
+        step = xp.zeros(len(zeros), xp.uint32)
+    state = ActuatorState(command, None, positions, velocities, encoder, key, step)
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
-    return state._replace(effort=narrow(_motor(k, asked), k.stall, k.slope, k.limit, velocity, xp) + zeros)
+    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros)
 
 
-def discretise(actuators: Actuators, state: ActuatorState, dt: Any) -> Coefficients:
-    """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`."""
-    xp = namespace(*actuators)
-    a = actuators
-    return Coefficients(
+def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: int | None = None) -> Coefficients:
+    """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
+
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster.
+    """
+    a, xp = actuators, namespace(*actuators)
+    k = Coefficients(
         command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
         sensor=None if a.sensor_delay is None else delay.discretise(a.sensor_delay, dt, state.position),
-        intake=None if a.lag is None else -xp.expm1(-dt / xp.where(a.lag > 0, a.lag, 1e-3 * dt)),
+        envelope=envelope(a),
+        intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
         strength=a.strength,
         bias=a.bias,
-        stall=a.saturation_effort,
-        slope=None if a.saturation_effort is None else _slope(a.saturation_effort, a.no_load_speed, xp),
-        limit=a.effort_limit,
-        position_resolution=a.position_resolution,
-        velocity_resolution=a.velocity_resolution,
+        play=None if a.backlash is None else 0.5 * a.backlash,
+        position_resolution=_step(a.position_resolution, xp),
+        velocity_resolution=_step(a.velocity_resolution, xp),
+        position_noise=a.position_noise,
+        velocity_noise=a.velocity_noise,
         turns=None if a.continuous is None else a.continuous / TURN,
     )
+    if num_envs is None:
+        return k
+
+    def spread(leaf: Any) -> Any:
+        if leaf is None or (leaf.ndim == 3 and leaf.shape[1] == num_envs):
+            return leaf
+        return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
+
+    flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
+    return k._replace(**flat, envelope=Envelope(*map(spread, k.envelope)))
 
 
 def deliver(
@@ -129,25 +165,45 @@ def advance_effort(
     k: Coefficients, state: ActuatorState, effort: Any, qpos: Any, qvel: Any
 ) -> tuple[ActuatorState, Any]:
     """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
-    xp = namespace(effort, qvel, *k)
+    xp = namespace(effort, qpos, qvel)
+    command, behind = state.command, state.effort
     if k.command is not None:
-        history = delay.push(state.command, effort, xp)
-        state, effort = state._replace(command=history), delay.read(history, k.command, None, xp)
-    motor = narrow(_motor(k, effort), k.stall, k.slope, k.limit, qvel, xp)
+        command = delay.push(command, effort, xp)
+        effort = delay.read(command, k.command, None, xp)
+    low, high = limits(k.envelope, qpos, qvel)
+    motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
-        motor = narrow(state.effort + k.intake * (motor - state.effort), k.stall, k.slope, k.limit, qvel, xp)
-        state = state._replace(effort=motor)
-    return state, motor
+        behind = motor = clip(behind + k.intake * (motor - behind), low, high, xp)
+    return ActuatorState(command, behind, *state[2:]), motor
 
 
-def advance_measurement(k: Coefficients, state: ActuatorState, qpos: Any, qvel: Any) -> tuple[ActuatorState, Any, Any]:
-    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`."""
-    xp = namespace(qpos, qvel, *k)
+def advance_measurement(
+    k: Coefficients, state: ActuatorState, qpos: Any, qvel: Any, normals: tuple[Any, Any] | None = None
+) -> tuple[ActuatorState, Any, Any]:
+    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
+
+    ``normals`` are those of :func:`batchpid.actuators.noise.normals` at ``state.step``, if they are known already.
+    """
+    xp = namespace(qpos, qvel)
+    command, effort, positions, velocities, encoder, key, step = state
+    if k.play is not None:
+        behind = wrap(encoder - qpos, k.turns, xp)
+        offset = clip(behind, -k.play, k.play, xp)
+        encoder, qvel = qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
+        qpos = encoder
     if k.sensor is not None:
-        positions, velocities = delay.push(state.position, qpos, xp), delay.push(state.velocity, qvel, xp)
-        state = state._replace(position=positions, velocity=velocities)
+        positions, velocities = delay.push(positions, qpos, xp), delay.push(velocities, qvel, xp)
         qpos, qvel = delay.read(positions, k.sensor, k.turns, xp), delay.read(velocities, k.sensor, None, xp)
-    return state, _quantised(qpos, k.position_resolution, xp), _quantised(qvel, k.velocity_resolution, xp)
+    if key is not None:
+        both = noise.normals(key, step, qpos.shape[1], qpos.dtype, xp) if normals is None else normals
+        qpos = qpos if k.position_noise is None else qpos + k.position_noise * both[0]
+        qvel = qvel if k.velocity_noise is None else qvel + k.velocity_noise * both[1]
+        step = step + _ONE
+    if k.position_resolution is not None:
+        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
+    if k.velocity_resolution is not None:
+        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
+    return ActuatorState(command, effort, positions, velocities, encoder, key, step), qpos, qvel
 
 
 def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorState:
@@ -161,21 +217,12 @@ def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorStat
     return ActuatorState(*(choose(new, old) for new, old in zip(fresh, state, strict=True)))
 
 
-def _slope(stall: Any, speed: Any, xp: Any) -> Any:
-    """Return S / v0, 0 where there is no envelope."""
-    finite = xp.isfinite(stall)
-    return xp.where(finite, xp.where(finite, stall, 0.0) / speed, 0.0)
-
-
 def _motor(k: Coefficients, effort: Any) -> Any:
     """Return s u + b."""
     effort = effort if k.strength is None else k.strength * effort
     return effort if k.bias is None else effort + k.bias
 
 
-def _quantised(value: Any, resolution: Any, xp: Any) -> Any:
-    """Return r rint(x / r), x where r is 0."""
-    if resolution is None:
-        return value
-    step = xp.where(resolution > 0, resolution, 1.0)
-    return xp.where(resolution > 0, step * xp.rint(value / step), value)
+def _step(resolution: Any, xp: Any) -> Any:
+    """Return the step of a sensor; 2^-60, which is below the last bit that matters, where there is none."""
+    return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)

@@ -15,7 +15,7 @@ import numpy as np
 from batchpid.display import span, summary
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import LeafBuilder
-from batchpid.validate import at_least, is_traced
+from batchpid.validate import at_least, entries, integer, is_traced, read_array
 
 NEUTRAL: dict[str, float] = {
     "command_delay": 0.0,
@@ -27,14 +27,39 @@ NEUTRAL: dict[str, float] = {
     "no_load_speed": math.inf,
     "effort_limit": math.inf,
     "coulomb": 0.0,
+    "static": 0.0,
     "viscous": 0.0,
     "armature": 0.0,
+    "backlash": 0.0,
     "position_resolution": 0.0,
     "velocity_resolution": 0.0,
+    "position_noise": 0.0,
+    "velocity_noise": 0.0,
 }
 """Numbers of a joint, with the value that is off."""
-JOINT_SIDE = ("coulomb", "viscous", "armature")
+JOINT_SIDE = ("coulomb", "static", "viscous", "armature")
 """Fields that act on the joint and not on the signals: :class:`sim.Runner` gives them to the simulator."""
+SENSOR_SIDE = (
+    "sensor_delay",
+    "backlash",
+    "position_resolution",
+    "velocity_resolution",
+    "position_noise",
+    "velocity_noise",
+)
+"""Fields between the joint's state and its measurement."""
+MOTOR_SIDE = (
+    "command_delay",
+    "lag",
+    "strength",
+    "bias",
+    "saturation_effort",
+    "no_load_speed",
+    "effort_limit",
+    "limit_positions",
+    "limit_efforts",
+)
+"""Fields between the effort asked for and the effort delivered."""
 MAX_DELAY = 1.0
 """Longest delay [s]."""
 
@@ -54,18 +79,28 @@ class Actuators(NamedTuple):
     saturation_effort: Any = None
     no_load_speed: Any = None
     effort_limit: Any = None
+    limit_positions: Any = None
+    """x_k of the limit that depends on the position (1, joints, points)."""
+    limit_efforts: Any = None
+    """L_k (1, joints, points)."""
     coulomb: Any = None
+    static: Any = None
     viscous: Any = None
     armature: Any = None
+    backlash: Any = None
     position_resolution: Any = None
     velocity_resolution: Any = None
+    position_noise: Any = None
+    velocity_noise: Any = None
     continuous: Any = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    seed: Any = None
+    """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
 
     @property
     def num_joints(self) -> int | None:
         """Number of joints; None where every effect is off."""
-        return next((int(leaf.shape[1]) for leaf in self if leaf is not None), None)
+        return next((int(leaf.shape[1]) for leaf in self[:-1] if leaf is not None), None)
 
     @property
     def num_envs(self) -> int:
@@ -75,15 +110,12 @@ class Actuators(NamedTuple):
     @property
     def measures(self) -> bool:
         """True if measurements differ from the joints' true positions or velocities."""
-        return any(leaf is not None for leaf in (self.sensor_delay, self.position_resolution, self.velocity_resolution))
+        return any(getattr(self, name) is not None for name in SENSOR_SIDE)
 
     @property
     def delivers(self) -> bool:
         """True if the efforts delivered differ from those asked for."""
-        return any(
-            leaf is not None
-            for leaf in (self.command_delay, self.lag, self.strength, self.bias, self.effort_limit, self.no_load_speed)
-        )
+        return any(getattr(self, name) is not None for name in MOTOR_SIDE)
 
     def for_envs(self, envs: slice | Any) -> Actuators:
         """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
@@ -94,6 +126,10 @@ class Actuators(NamedTuple):
         options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
         if self.continuous is not None:
             options["continuous"] = self.continuous > 0
+        if self.limit_positions is not None:
+            options["position_limit"] = options.pop("limit_positions")[0], options.pop("limit_efforts")[0]
+        if self.seed is not None:
+            options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
         if options:
             options["dtype"] = next(leaf.dtype for leaf in self if leaf is not None)
         return options
@@ -109,7 +145,7 @@ class Actuators(NamedTuple):
         return make_actuators(**{"joints": self.num_joints, **known, **options})
 
     def __repr__(self) -> str:
-        on = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+        on = {name: leaf for name, leaf in self._asdict().items() if leaf is not None and name != "seed"}
         sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [f"{self.num_joints} joints"] * bool(on)
         return summary("Actuators", [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())])
 
@@ -125,11 +161,17 @@ def make_actuators(
     saturation_effort: Any = None,
     no_load_speed: Any = None,
     effort_limit: Any = None,
+    position_limit: tuple[Any, Any] | None = None,
     coulomb: Any = None,
+    static: Any = None,
     viscous: Any = None,
     armature: Any = None,
+    backlash: Any = None,
     position_resolution: Any = None,
     velocity_resolution: Any = None,
+    position_noise: Any = None,
+    velocity_noise: Any = None,
+    seed: int = 0,
     continuous: Any = None,
     joint_names: Sequence[str] | None = None,
     dtype: Any = None,
@@ -157,13 +199,25 @@ def make_actuators(
         torque-speed envelope (:mod:`batchpid.actuators.envelope`). Given together.
     effort_limit
         Largest effort that the motor delivers, >= 0 [N m or N].
+    position_limit
+        Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there [N m or N], both
+        (points,) or (joints, points). Linear between the points, constant outside.
     coulomb, viscous
         Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to that of the robot's description, by
         the model of :mod:`batchpid.friction`.
+    static
+        Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >= ``coulomb``, also
+        in addition to the description's. 0: as much as while it moves.
     armature
         Reflected inertia of the motor >= 0 [kg m^2 or kg].
+    backlash
+        Play >= 0 between the joint and its sensor, from one end to the other [rad or m].
     position_resolution, velocity_resolution
         Step >= 0 of measured positions [rad or m] and velocities [rad/s or m/s].
+    position_noise, velocity_noise
+        Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
+    seed
+        Of the noise, from 0 to 2^64 - 1.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
@@ -189,20 +243,55 @@ def make_actuators(
     if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
         missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
         raise InvalidArgumentError(missing, "is missing", remedy="give both ends of the torque-speed line, or none")
-    return Actuators(**leaves, continuous=build.mask("continuous", continuous))
+    if (static := leaves["static"]) is not None and not is_traced(static):
+        coulomb = 0.0 if leaves["coulomb"] is None else leaves["coulomb"]
+        good = is_traced(coulomb) or (static >= coulomb) | (static == 0)
+        entries("static", static, good, "is less than coulomb", joint_names, remedy="give at least coulomb, or 0")
+    points, efforts = _table(build, position_limit)
+    noisy = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
+    words = integer("seed", seed, 0, 2**64 - 1)
+    return Actuators(
+        **leaves,
+        limit_positions=points,
+        limit_efforts=efforts,
+        continuous=build.mask("continuous", continuous),
+        seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if noisy else None,
+    )
+
+
+def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Any, Any]:
+    """Return the positions and efforts of a limit that depends on the position (1, joints, points)."""
+    if table is None:
+        return None, None
+    remedy = "give positions and efforts, both (points,) or (joints, points), with two points or more"
+    if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
+        raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
+    rows = [read_array("position_limit", each).astype(build.dtype) for each in table]
+    for each in rows:
+        if each.ndim not in (1, 2) or each.shape[-1] < 2 or (each.ndim == 2 and len(each) != build.joints):
+            raise InvalidArgumentError("position_limit", f"has shape {each.shape}", remedy=remedy)
+    if rows[0].shape[-1] != rows[1].shape[-1]:
+        problem = f"has {rows[0].shape[-1]} positions and {rows[1].shape[-1]} efforts"
+        raise InvalidArgumentError("position_limit", problem, remedy=remedy)
+    positions, efforts = (np.broadcast_to(each, (build.joints, each.shape[-1])) for each in rows)
+    rising = np.isfinite(positions).all(1) & (np.diff(positions) >= 0).all(1)
+    entries("position_limit", positions[:, 0], rising, "has positions that do not ascend", build.names)
+    good = (efforts >= 0).all(1) & (np.isfinite(efforts).all(1) | np.isinf(efforts).all(1))
+    entries("position_limit", efforts[:, 0], good, "has an effort < 0 or not finite", build.names)
+    return (None, None) if np.isinf(efforts).all() else (build.freeze(positions[None]), build.freeze(efforts[None]))
 
 
 def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
     """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
     shapes = (1, len(joint_names)), (num_envs, len(joint_names))
     for name, leaf in actuators._asdict().items():
-        if leaf is None:
+        if leaf is None or name == "seed":
             continue
-        if leaf.shape not in shapes:
+        if (leaf.shape if leaf.ndim == 2 else leaf.shape[:2]) not in shapes:
             raise InvalidArgumentError(
                 f"actuators.{name}",
                 f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
                 remedy=f"give one row, or one row per env, of {', '.join(joint_names)}",
             )
-        low = -math.inf if name == "bias" else 0.0
+        low = -math.inf if name in ("bias", "limit_positions") else 0.0
         at_least(f"actuators.{name}", np.asarray(leaf), low, joint_names, infinite=True)

@@ -15,12 +15,18 @@ class ActuatorState(NamedTuple):
     effort: Any = None
     """Effort behind the lag (envs, joints) [N m or N]."""
     position: Any = None
-    """Positions, latest first (envs, samples, joints) [rad or m]."""
+    """Positions that the sensor was at, latest first (envs, samples, joints) [rad or m]."""
     velocity: Any = None
-    """Velocities, latest first (envs, samples, joints) [rad/s or m/s]."""
+    """Velocities of the sensor, latest first (envs, samples, joints) [rad/s or m/s]."""
+    encoder: Any = None
+    """Position of the sensor's side of the play (envs, joints) [rad or m]."""
+    key: Any = None
+    """Key of the noise, a hash of seed, env and episode (envs, 2) uint32."""
+    step: Any = None
+    """Measurements since the reset (envs,) uint32."""
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self._replace(key=None, step=None), "envs", "joints")
 
     def leaves(self) -> dict[str, Any]:
         """Return the arrays by name."""
@@ -29,13 +35,15 @@ class ActuatorState(NamedTuple):
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped.
 
-        A history that is longer there is continued by its oldest sample.
+        A history that is longer there is continued by its oldest sample. The key is that of ``fresh``.
         """
         both = zip(self, fresh, strict=True)
-        return ActuatorState(*(new if new is None or old is None else _resized(old, new) for old, new in both))
+        matched = (new if new is None or old is None else _resized(old, new) for old, new in both)
+        return ActuatorState(*matched)._replace(key=fresh.key)
 
 
 def _resized(old: Any, new: Any) -> Any:
+    """Return a history of the length of another; other arrays as they are."""
     if old.ndim < 3 or old.shape == new.shape:
         return old
     xp, samples = old.__array_namespace__(), new.shape[1]

@@ -53,7 +53,7 @@ class Pack:
     def __init__(
         self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
     ) -> None:
-        self.spec = spec
+        self.spec, self.first_env = spec, first_env
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates and spec.collisions
@@ -259,12 +259,15 @@ class Pack:
     def write_joints(self, actuators: Actuators | None) -> None:
         """Add the friction, damping and reflected inertia of ``actuators`` to those of the robot's description."""
         added = Actuators() if actuators is None else actuators
-        own = self._friction()
-        both = zip(own, (added.coulomb, added.viscous), strict=True)
-        self.friction = Friction(*(one if more is None else more if one is None else one + more for one, more in both))
+        own, static = self._friction(), added.static
+        both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
+        coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
+        if static is not None:
+            static = static if own.coulomb is None else static + own.coulomb
+            coulomb = np.zeros_like(static) if coulomb is None else coulomb
+        self.friction = Friction(coulomb, viscous, static)
         self.armature = np.zeros((1, self.dof)) if added.armature is None else added.armature
-        viscous = 0.0 if self.friction.viscous is None else self.friction.viscous
-        self._implicit = self.armature + self.spec.timestep * viscous
+        self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
         values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
         for joint, value in zip(self._joints, values.reshape(-1, 1), strict=True):
             joint.set_armature(value)

@@ -45,11 +45,14 @@ class Control:
         Joints whose effort was limited in the last sim step of the last tick (M, dof).
     reads_qpos_each_step
         Whether :meth:`effort` needs qpos at every sim step; otherwise it is ignored.
+    limits
+        Least and largest effort that the motors can deliver, within those of the params; None for no limit.
     drive
         Damping and stiffness of the engine's drives [N m s/rad, N m/rad].
     """
 
     reads_qpos_each_step = True
+    limits: tuple[Any, Any] = None, None
     drive: tuple[Any, Any] = 0.0, 0.0
 
     def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
@@ -91,6 +94,10 @@ class Control:
         A ``qvel`` that is known need not be read.
         """
         raise NotImplementedError
+
+    def _saturate(self, effort: Float64) -> Float64:
+        """Return ``effort`` within the limits of motors and params."""
+        return clip(clip(effort, *self.limits, np), self.params.effort_min, self.params.effort_max, np)
 
     def read(self) -> dict[str, NDArray[Any]]:
         """Return the state of the law by name, for :meth:`write`."""
@@ -138,11 +145,15 @@ class PIDControl(Control):
         setpoint, setpoint_rate, _ = self._command
         last = step + 1 == self._substeps
         inputs = (qvel if self._measures_rate else None, setpoint_rate, feedforward)
+        k = self._coefficients if self._whole else self._scaled
+        if self.limits[1] is not None:  # saturation and anti-windup are those of the motors
+            low, high = (clip(end, k.effort_min, k.effort_max, np) for end in self.limits)
+            k = k._replace(effort_min=low, effort_max=high)
         if self._whole:
             at = (self._state, setpoint, qpos, self._matrix)
-            new = advance_with_mass_matrix(self._coefficients, *at, *inputs, terms=last)
+            new = advance_with_mass_matrix(k, *at, *inputs, terms=last)
         else:
-            new = bp.advance(self._scaled, self._state, setpoint, qpos, *inputs, terms=last)
+            new = bp.advance(k, self._state, setpoint, qpos, *inputs, terms=last)
         if last:
             self.saturated = new[2].saturated
         self._state, effort = new[:2]
@@ -224,7 +235,7 @@ class EffortControl(Control):
         if self._coupling is not None:
             setpoint = self._coupling.efforts(setpoint)
         total = setpoint if feedforward is None else setpoint + feedforward
-        effort = clip(total, self.params.effort_min, self.params.effort_max, np)
+        effort = self._saturate(total)
         if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort

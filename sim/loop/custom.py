@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.elementwise import clip
 from batchpid.errors import InvalidArgumentError
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
@@ -61,7 +60,7 @@ class CustomControl(Control):
             raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
         if self._coupling is not None:
             total = self._coupling.efforts(total)
-        effort = clip(total, self.params.effort_min, self.params.effort_max, np)
+        effort = self._saturate(total)
         if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort

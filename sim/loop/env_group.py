@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from sim.engine.missed_contact import MissedContacts
 from sim.engine.pack import Pack
-from sim.loop.actuators import JointActuators
+from sim.loop.actuators import JointActuators, model_force
 from sim.loop.arrays import Arrays, Command
 from sim.loop.custom import make_control
 from sim.loop.faults import FaultContainment, finite
@@ -56,9 +56,9 @@ class EnvGroup:
         """Change the actuators in flight; their state carries on."""
         ours = self._actuators
         if actuators is None:
-            self._actuators = None
+            self._actuators, self._control.limits = None, (None, None)
         elif ours is None:
-            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep)
+            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep, self.pack.first_env)
         else:
             ours.set_actuators(actuators, self._qpos)
         if actuators is not None or ours is not None:
@@ -157,17 +157,20 @@ class EnvGroup:
         actuators = self._actuators
         reads_qpos = control.reads_qpos_each_step or self._compensates or actuators is not None
         for step in range(substeps):
-            forward = self._feedforward(command)
-            if not reads_qpos and not self._sound(forward):
-                # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
-                self._contain(pack.read_qpos(), step)
-                forward = self._feedforward(command)
-            qvel: Any = pack.read_qvel() if friction.acts or actuators is not None else None
-            seen = (self._qpos, qvel) if actuators is None else actuators.measure(self._qpos, qvel)
-            effort = control.effort(seen[0], forward, step, seen[1])
+            qvel: Any = None
+            if actuators is None:
+                forward = self._feedforward(command, self._qpos)
+                if not reads_qpos and not self._sound(forward):
+                    # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
+                    self._contain(pack.read_qpos(), step)
+                    forward = self._feedforward(command, self._qpos)
+                if friction.acts:
+                    qvel = pack.read_qvel()
+                effort = control.effort(self._qpos, forward, step, qvel)
+            else:
+                qvel = pack.read_qvel()
+                effort = self._actuated(actuators, command, step, qvel)
             if effort is not None:
-                if actuators is not None:
-                    effort = actuators.deliver(effort, self._qpos, qvel)
                 self._motor[...] = effort = pack.delivered(effort)
             if friction.acts:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
@@ -184,16 +187,31 @@ class EnvGroup:
         if not reads_qpos:
             self._qpos = pack.read_qpos()
 
-    def _feedforward(self, command: Command) -> Float64 | None:
-        """Return the compensation plus the caller's feedforward, those of followers on their leaders; None for zero."""
+    def _actuated(
+        self, actuators: JointActuators, command: Command, step: int, qvel: NDArray[Any]
+    ) -> NDArray[Any] | None:
+        """Return the efforts that real motors deliver under a control that sees what real sensors measure."""
+        seen = actuators.measure(self._qpos, qvel)
+        self._control.limits = actuators.limits(*seen)
+        forward = self._feedforward(command, *(seen if actuators.measures else (self._qpos,)))
+        effort = self._control.effort(seen[0], forward, step, seen[1])
+        return None if effort is None else actuators.deliver(effort, self._qpos, qvel)
+
+    def _feedforward(self, command: Command, qpos: Float64, qvel: Float64 | None = None) -> Float64 | None:
+        """Return the compensation plus the caller's feedforward, those of followers on their leaders; None for zero.
+
+        The passive force is the engine's, or with ``qvel`` that of the model at ``qpos`` and ``qvel``.
+        """
         forward = command.feedforward
         if self._gravity:
-            passive = self.pack.passive_force(self._gravity, self._coriolis)
+            which = self._gravity, self._coriolis
+            pack = self.pack
+            passive = pack.passive_force(*which) if qvel is None else model_force(pack.spec, qpos, qvel, *which)
             forward = passive if forward is None else passive + forward
         if forward is not None and self._coupling is not None:
             forward = self._coupling.efforts(forward)
         if self._compensates:
-            friction = self._friction.feedforward(command, self._qpos)
+            friction = self._friction.feedforward(command, qpos)
             forward = friction if forward is None else friction + forward
         return forward
 

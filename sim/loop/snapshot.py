@@ -27,6 +27,8 @@ from batchpid.npz import read_npz
 from batchpid.validate import file_path, integer, names
 from sim.loop.faults import CAUSES, FaultContainment
 
+EPISODE = "episode"
+"""Name of the resets of each env with actuators (envs,)."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
 _FORMAT = 5
@@ -55,7 +57,7 @@ class EnvStates:
     friction: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
     actuators: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.actuators.ActuatorState`; none without actuators."""
+    """Leaves of :class:`batchpid.actuators.ActuatorState`, and :data:`EPISODE`; none without actuators."""
     containment: dict[str, NDArray[Any]]
     """See :class:`sim.loop.faults.FaultContainment`."""
 
@@ -249,6 +251,7 @@ def initial_actuators(
         return {}
     longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))
     state = bp.actuators.init(longest, np.zeros((1, dof)), timestep).leaves()
+    state[EPISODE] = np.zeros(1, np.int64)
     return {name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()}
 
 

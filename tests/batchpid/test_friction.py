@@ -98,7 +98,7 @@ def test_envs_do_not_affect_each_other_and_are_reset_alone():
     together, _ = simulate(mass, model, efforts)
     for env in range(3):
         part = slice(env, env + 1)
-        alone, _ = simulate(mass[part], Friction(*(leaf[part] for leaf in model)), efforts[:, part])
+        alone, _ = simulate(mass[part], Friction(*(leaf[part] for leaf in model[:2])), efforts[:, part])
         np.testing.assert_array_equal(alone, together[:, part])
     fresh = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
     old = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
@@ -134,7 +134,7 @@ def test_jax_gives_the_same():
     v, load, effort = rng.normal(size=(3, 4, mass.shape[1]))
     expected = friction.init(model, v, load, mass, DT)
     with jax.enable_x64(True):
-        theirs = Friction(*map(jax.numpy.asarray, model))
+        theirs = Friction(*map(jax.numpy.asarray, model[:2]))
         state = jax.jit(friction.init)(theirs, *map(jax.numpy.asarray, (v, load, mass)), DT)
         advance = jax.jit(friction.advance)
         for _ in range(5):

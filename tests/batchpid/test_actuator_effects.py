@@ -1,0 +1,306 @@
+"""Each effect of the actuators against its closed form, and against independent statements of its peers' formulas."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from law_cases import read_only
+
+import batchpid as bp
+from batchpid import actuators, friction
+from batchpid.actuators import noise
+
+DT = 1 / 2000
+positive = st.floats(1e-3, 1e3)
+
+
+def run_motor(chosen, efforts, qpos=0.0, qvel=0.0, before=0.0):
+    """Return the efforts (steps, 1, joints) that are delivered for ``efforts`` (steps, joints)."""
+    rows = np.asarray(efforts, float).reshape(len(efforts), 1, -1)
+    at, speed = np.zeros_like(rows[0]) + qpos, np.zeros_like(rows[0]) + qvel
+    state = actuators.init(chosen, at, DT, qvel=speed, effort=np.zeros_like(rows[0]) + before)
+    delivered = []
+    for row in rows:
+        state, effort = actuators.deliver(chosen, state, read_only(row, float), at, speed, DT)
+        delivered.append(effort)
+    return np.array(delivered)
+
+
+def run_sensor(chosen, positions, velocities=None):
+    """Return the positions and velocities (steps, envs, joints) as measured."""
+    speeds = np.gradient(positions, DT, axis=0) if velocities is None else velocities
+    state, seen = actuators.init(chosen, positions[0], DT, qvel=speeds[0]), []
+    for qpos, qvel in zip(positions, speeds, strict=True):
+        state, *measured = actuators.measure(chosen, state, read_only(qpos, float), read_only(qvel, float), DT)
+        seen.append(measured)
+    return tuple(map(np.array, zip(*seen, strict=True)))
+
+
+@given(delay=st.floats(0, 0.02), frequency=st.floats(1, 100))
+@settings(max_examples=30)
+def test_a_sine_comes_late_by_the_delay(delay, frequency):
+    """To within the bound of linear interpolation, (w dt)^2 / 8, and exactly at whole steps."""
+    chosen, w = bp.make_actuators(1, command_delay=delay), 2 * np.pi * frequency
+    time = DT * np.arange(200)
+    late = run_motor(chosen, np.sin(w * time))[:, 0, 0]
+    warm = slice(int(delay / DT) + 2, None)
+    error = np.abs(late - np.sin(w * (time - delay)))[warm].max()
+    assert error <= (w * DT) ** 2 / 8 + 1e-6
+    whole = bp.make_actuators(1, command_delay=round(delay / DT) * DT)
+    steps, same = round(delay / DT), np.sin(w * time)
+    np.testing.assert_array_equal(run_motor(whole, same)[steps:, 0, 0], same[: len(same) - steps])
+
+
+def test_joints_have_their_own_delays_and_begin_with_the_effort_before():
+    chosen = bp.make_actuators(3, command_delay=[0.0, 2 * DT, 2.5 * DT])
+    late = run_motor(chosen, np.arange(1.0, 7.0)[:, None] * np.ones(3), before=7.0)[:, 0]
+    np.testing.assert_allclose(late[:, 0], [1, 2, 3, 4, 5, 6])
+    np.testing.assert_allclose(late[:, 1], [7, 7, 1, 2, 3, 4])
+    np.testing.assert_allclose(late[:, 2], [7, 7, 4, 1.5, 2.5, 3.5])
+
+
+@given(lag=st.floats(0, 0.05), effort=st.floats(-100, 100))
+def test_the_lag_answers_a_step_by_an_exponential(lag, effort):
+    time = DT * np.arange(1, 101)
+    expected = effort * -np.expm1(-time / lag) if lag > 1e-6 else np.full(100, effort)
+    delivered = run_motor(bp.make_actuators(1, lag=lag), np.full(100, effort))[:, 0, 0]
+    np.testing.assert_allclose(delivered, expected, rtol=1e-9, atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
+    """Their formulas stated again: of DCMotor with its clip of the speed, and of ClampingDCMotor."""
+    rng = np.random.default_rng(seed)
+    stall, speed, limit = (10.0 ** rng.uniform(-1, 2, 50) for _ in range(3))
+    effort, v = 3 * stall * rng.normal(size=50), 2 * speed * rng.normal(size=50)
+    chosen = bp.make_actuators(50, saturation_effort=stall, no_load_speed=speed, effort_limit=limit)
+    ours = run_motor(chosen, effort[None], qvel=v)[0, 0]
+
+    corner = speed * (1 + limit / stall)
+    u = np.clip(v, -corner, corner)
+    high, low = np.minimum(stall * (1 - u / speed), limit), np.maximum(stall * (-1 - u / speed), -limit)
+    np.testing.assert_allclose(ours, np.clip(effort, low, high), rtol=1e-12, atol=1e-12 * stall.max())
+
+    most, least = np.minimum(stall * (1 - v / speed), limit), np.maximum(stall * (-1 - v / speed), -limit)
+    newton = np.minimum(np.maximum(effort, least), most)
+    within = np.abs(v) <= corner
+    np.testing.assert_allclose(ours[within], newton[within], rtol=1e-12, atol=1e-12 * stall.max())
+
+
+@pytest.mark.parametrize(
+    ("velocity", "low", "high"),
+    [
+        (0.0, -8.0, 8.0),  # the limit, below the stall effort of 10
+        (2.5, -8.0, 5.0),  # first quadrant: on the line
+        (5.0, -8.0, 0.0),  # no-load speed
+        (7.0, -8.0, -4.0),  # driven faster: it brakes
+        (20.0, -8.0, -8.0),  # and no more than the limit
+        (-2.5, -5.0, 8.0),  # second quadrant and third
+        (-7.0, 4.0, 8.0),
+    ],
+)
+def test_the_envelope_in_every_quadrant(velocity, low, high):
+    chosen = bp.make_actuators(1, saturation_effort=10.0, no_load_speed=5.0, effort_limit=8.0)
+    delivered = run_motor(chosen, [-100.0, 100.0], qvel=velocity)
+    np.testing.assert_allclose(delivered.ravel(), [low, high])
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_limit_by_position_is_linear_between_its_points(seed):
+    rng = np.random.default_rng(seed)
+    points, efforts = np.sort(rng.uniform(-3, 3, (4, 5))), rng.uniform(0, 20, (4, 5))
+    at, chosen = rng.uniform(-4, 4, 4), bp.make_actuators(4, position_limit=(points, efforts), effort_limit=15.0)
+    expected = [min(np.interp(q, x, y), 15.0) for q, x, y in zip(at, points, efforts, strict=True)]
+    np.testing.assert_allclose(run_motor(chosen, np.full((1, 4), 100.0), qpos=at)[0, 0], expected, rtol=1e-9)
+    np.testing.assert_allclose(run_motor(chosen, np.full((1, 4), -100.0), qpos=at)[0, 0], np.negative(expected))
+
+
+@given(strength=st.floats(0, 2), bias=st.floats(-5, 5), effort=st.floats(-100, 100))
+def test_strength_and_bias(strength, bias, effort):
+    chosen = bp.make_actuators(1, strength=strength, bias=bias)
+    assert run_motor(chosen, [effort]) == pytest.approx(strength * effort + bias)
+
+
+@given(ratio=st.floats(0.05, 0.95))
+@settings(max_examples=10)
+def test_backlash_has_the_describing_function_of_the_play(ratio):
+    """J.-J. Slotine and W. Li, Applied Nonlinear Control (1991), section 5.2.3, with half width b and amplitude A."""
+    amplitude, count = 1.0, 2000
+    b = ratio * amplitude
+    phase = 2 * np.pi * np.arange(2 * count) / count
+    seen, _ = run_sensor(bp.make_actuators(1, backlash=2 * b), (amplitude * np.sin(phase))[:, None, None])
+    period = seen[count:, 0, 0]
+    in_phase, quadrature = (2 / count * (period * wave(phase[count:])).sum() for wave in (np.sin, np.cos))
+    x = 2 * b / amplitude - 1
+    assert in_phase == pytest.approx(amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=1e-3)
+    assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=1e-3)
+
+
+def test_the_sensor_stands_still_within_the_play():
+    positions = np.array([0.0, 0.4, 0.6, 1.0, 0.8, 0.1, -0.1])[:, None, None]
+    seen, rate = run_sensor(bp.make_actuators(1, backlash=1.0), positions, np.ones_like(positions))
+    np.testing.assert_allclose(seen.ravel(), [0, 0, 0.1, 0.5, 0.5, 0.5, 0.4])
+    np.testing.assert_allclose(rate.ravel(), [0, 0, 1, 1, 0, 0, 1])
+
+
+@given(resolution=st.floats(1e-6, 0.5), value=st.floats(-100, 100))
+def test_resolution_rounds_to_the_nearest_step(resolution, value):
+    both = np.full((1, 1, 1), value)
+    chosen = bp.make_actuators(1, position_resolution=resolution, velocity_resolution=resolution)
+    for seen in run_sensor(chosen, both, both):
+        assert abs(seen.item() - value) <= resolution / 2 * (1 + 1e-9)
+        assert seen.item() / resolution == pytest.approx(round(seen.item() / resolution), abs=1e-6)
+
+
+def test_a_continuous_joint_is_interpolated_and_dragged_the_short_way_round():
+    turning = np.array([6.1, 6.2, 6.3 - 4 * np.pi, 6.4 - 4 * np.pi, 6.5 - 4 * np.pi])[:, None, None]
+    late, _ = run_sensor(bp.make_actuators(1, sensor_delay=0.5 * DT, continuous=True), turning)
+    dragged, _ = run_sensor(bp.make_actuators(1, backlash=0.1, continuous=True), turning)
+    for seen, behind in ((late, 0.05), (dragged, 0.05)):
+        away = (seen - (turning - behind))[1:]
+        np.testing.assert_allclose(away - 2 * np.pi * np.rint(away / (2 * np.pi)), 0.0, atol=1e-12)
+
+
+def test_noise_has_the_moments_of_a_normal_distribution():
+    key = noise.keys(np.array([[1, 2]], np.uint32), np.arange(50), np.zeros(50), np)
+    both = noise.normals(key, np.arange(1000, dtype=np.uint32)[:, None] + np.zeros(50, np.uint32), 7, np.float64, np)
+    count = both[0].size
+    for z in both:
+        assert abs(z.mean()) < 4 / np.sqrt(count)
+        assert z.var() == pytest.approx(1, abs=4 * np.sqrt(2 / count))
+        assert (z**4).mean() == pytest.approx(3, abs=4 * np.sqrt(96 / count))
+        for shifted in (np.roll(z, 1, axis) for axis in range(3)):  # steps, envs and joints
+            assert abs((z * shifted).mean()) < 4 / np.sqrt(count)
+    assert abs((both[0] * both[1]).mean()) < 4 / np.sqrt(count)
+
+
+def test_the_table_of_the_noise_is_normal():
+    z = noise.quantiles(float)
+    assert (np.diff(z) > 0).all()
+    np.testing.assert_array_equal(z, -z[::-1])
+    assert (z**2).mean() == pytest.approx(1, abs=1e-12)
+    assert (z**4).mean() == pytest.approx(3, abs=3e-3)
+
+
+def test_noise_depends_on_seed_env_episode_and_step_alone():
+    q = np.zeros((4, 3))
+    chosen = bp.make_actuators(3, position_noise=0.1, velocity_noise=0.2, seed=5)
+
+    def measure(envs, episode=0, chosen=chosen):
+        state, rows = actuators.init(chosen, q[: len(envs)], DT, envs=np.array(envs), episode=episode), []
+        for _ in range(5):
+            state, *seen = actuators.measure(chosen, state, q[: len(envs)], q[: len(envs)], DT)
+            rows.append(seen)
+        return np.array(rows)
+
+    all_four = measure([0, 1, 2, 3])
+    np.testing.assert_array_equal(measure([2]), all_four[:, :, 2:3])
+    assert len(np.unique(all_four)) > 0.98 * all_four.size
+    others = measure([2], episode=1), *(measure([2], chosen=chosen.replace(seed=seed)) for seed in (6, 5 + 2**32))
+    for other in others:
+        assert np.isin(other, all_four).mean() < 0.1
+    np.testing.assert_allclose(all_four.std((0, 2, 3)), [0.1, 0.2], rtol=0.3)
+
+
+def test_a_joint_sticks_up_to_its_static_friction_and_slides_under_coulombs():
+    inertia, model = 0.1, friction.Friction(np.array([[1.0]]), None, np.array([[2.0]]))
+    mass, v = np.array([[[inertia]]]), np.zeros((1, 1))
+    state, rows = friction.init(model, v, v, mass, DT), []
+    efforts = np.concatenate((np.linspace(0, 1.95, 2000), np.full(400, 2.2), np.full(2000, 1.5), np.full(600, 0.9)))
+    for effort in efforts:
+        state, total = friction.advance(model, state, np.full((1, 1), effort), v)
+        v = v + DT * total / inertia
+        rows.append(v.item())
+    speed = np.array(rows)
+    assert np.abs(speed[:2000]).max() < 1e-3, "it sticks"
+    np.testing.assert_allclose(np.diff(speed[2010:2400]) / DT, (2.2 - 1.0) / inertia, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(speed[2410:4400]) / DT, (1.5 - 1.0) / inertia, rtol=1e-9)
+    assert speed[-1] < speed[4400], "it is braked, and does not stick at once"
+
+
+ALL = {
+    "command_delay": 0.0017,
+    "sensor_delay": [[0.0008, 0.002, 0.0, 0.0013]],
+    "lag": 0.003,
+    "strength": 0.9,
+    "bias": 0.1,
+    "saturation_effort": 8.0,
+    "no_load_speed": 4.0,
+    "effort_limit": 6.0,
+    "position_limit": ([-1.0, 0.0, 1.0], [4.0, 7.0, 5.0]),
+    "backlash": 0.01,
+    "position_noise": 1e-3,
+    "velocity_noise": 1e-2,
+    "continuous": [True, False, False, True],
+    "seed": 3,
+}
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-5)])
+def test_jax_agrees_with_numpy(dtype, tolerance, request):
+    """Compiled, with every effect on but the resolution, whose steps rounding can move by one."""
+    if dtype == np.float64:
+        request.getfixturevalue("x64")
+    chosen, rng = bp.make_actuators(4, **ALL, dtype=dtype), np.random.default_rng(0)
+    efforts = rng.normal(0, 8, (40, 5, 4)).astype(dtype)
+    positions = np.cumsum(rng.normal(0, 0.05, (40, 5, 4)), axis=0).astype(dtype)
+    velocities = rng.normal(0, 2, (40, 5, 4)).astype(dtype)
+
+    samples = max(
+        leaf.shape[1] for leaf in actuators.init(chosen, positions[0], DT) if leaf is not None and leaf.ndim == 3
+    )
+
+    def step(chosen, state, inputs):
+        u, q, v = inputs
+        state, *seen = actuators.measure(chosen, state, q, v, DT)
+        state, effort = actuators.deliver(chosen, state, u, q, v, DT)
+        return state, (*seen, effort)
+
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in 2/3 of the time
+    def compiled(chosen, *inputs):
+        state = actuators.init(chosen, inputs[1][0], DT, samples=samples)
+        return jax.lax.scan(lambda state, now: step(chosen, state, now), state, inputs)[1]
+
+    state, ours = actuators.init(chosen, positions[0], DT), []
+    spread = actuators.discretise(chosen, state, DT, 5)
+    for now in zip(efforts, positions, velocities, strict=True):
+        _, *measured = actuators.advance_measurement(spread, state, *now[1:])
+        state, seen = step(chosen, state, now)
+        np.testing.assert_array_equal(measured, seen[:2])
+        ours.append(seen)
+    theirs = compiled(jax.tree.map(jnp.asarray, chosen), *map(jnp.asarray, (efforts, positions, velocities)))
+    for mine, other in zip(zip(*ours, strict=True), theirs, strict=True):
+        assert other.dtype == mine[0].dtype == dtype
+        np.testing.assert_allclose(other, mine, rtol=tolerance, atol=10 * tolerance)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_random_actuators_deliver_finite_efforts_within_the_limits(seed):
+    rng = np.random.default_rng(seed)
+    chosen = bp.make_actuators(3, **random_options(rng, 2, 3))
+    state, dt = actuators.init(chosen, np.zeros((2, 3)), 0.001), 0.001
+    for _ in range(30):
+        q, v, u = (10.0 ** rng.uniform(-3, 4) * rng.normal(size=(2, 3)) for _ in range(3))
+        state, *seen = actuators.measure(chosen, state, q, v, dt)
+        state, effort = actuators.deliver(chosen, state, u, q, v, dt)
+        assert np.isfinite([*seen, effort]).all()
+        if chosen.effort_limit is not None:
+            assert (np.abs(effort) <= chosen.effort_limit).all()
+
+
+def random_options(rng, envs, joints):
+    """Return arguments of make_actuators for some random effects, over many decades."""
+    scales = {"command_delay": 0.01, "sensor_delay": 0.01, "lag": 0.01, "strength": 1, "bias": 1, "effort_limit": 30}
+    scales |= {"saturation_effort": 50, "no_load_speed": 3, "backlash": 0.01, "coulomb": 0.3, "viscous": 1}
+    scales |= {"armature": 0.1, "position_resolution": 1e-3, "velocity_resolution": 1e-2, "position_noise": 1e-3}
+    scales |= {"velocity_noise": 1e-2}
+    chosen = {name for name in scales if rng.random() < 0.5}
+    chosen |= {"saturation_effort", "no_load_speed"} if "no_load_speed" in chosen else set()
+    chosen -= {"saturation_effort"} if "no_load_speed" not in chosen else set()
+    shapes = [(), (joints,), (envs, joints)]
+    return {name: scales[name] * 10.0 ** rng.uniform(-2, 0.5, shapes[rng.integers(3)]) for name in sorted(chosen)}
