@@ -20,7 +20,8 @@ from batchpid.actuators.dynamics import (
     measure,
     reset,
 )
-from batchpid.actuators.model import JOINT_SIDE, Actuators, check_actuators, make_actuators
+from batchpid.actuators.fields import JOINT_SIDE
+from batchpid.actuators.model import Actuators, check_actuators, make_actuators
 from batchpid.actuators.state import ActuatorState
 
 __all__ = [

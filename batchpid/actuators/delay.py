@@ -14,8 +14,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from batchpid.elementwise import namespace, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import is_traced
@@ -33,20 +31,20 @@ class Delay(NamedTuple):
     """f (envs, joints); None: 0 everywhere."""
 
 
-def samples_of(name: str, delay: Any, dt: float) -> int:
-    """Return the samples that a history needs for the largest of ``delay`` [s].
+def samples_of(longest: Any, dt: float) -> int:
+    """Return the samples that a history needs for delays up to ``longest`` (1, 1) [s].
 
     Raises
     ------
     InvalidArgumentError
-        The delay is traced by JAX, so that its size is not known, or it needs too many samples.
+        It is traced by JAX, so that its size is not known, or it needs too many samples.
     """
-    if is_traced(delay) or is_traced(dt):
-        raise InvalidArgumentError(name, "is traced, its size is not known", remedy="pass samples= to init")
-    count = math.floor(float(np.max(delay)) / dt + _NEAR) + 2
+    if is_traced(longest) or is_traced(dt):
+        raise InvalidArgumentError("max_delay", "is traced, so that it is not known", remedy="pass samples= to init")
+    count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
     if count > MOST_SAMPLES:
-        remedy = f"use a longer time step, or at most {(MOST_SAMPLES - 2) * dt:g} s"
-        raise InvalidArgumentError(name, f"needs {count} samples", value=float(np.max(delay)), remedy=remedy)
+        remedy = f"use a longer time step, or delays of at most {(MOST_SAMPLES - 2) * dt:g} s"
+        raise InvalidArgumentError("max_delay", f"needs {count} samples", value=float(longest[0, 0]), remedy=remedy)
     return count
 
 

@@ -78,23 +78,24 @@ def init(
     envs, episode
         Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on both.
     samples
-        Length of the histories, at least 2; None: as long as the delays need. Needed where delays are traced by JAX.
+        Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that is traced by JAX.
 
     Raises
     ------
     InvalidArgumentError
-        A delay is traced and ``samples`` is missing, or a delay needs too many samples.
+        ``max_delay`` is traced and ``samples`` is missing, or it needs too many samples.
     """
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
     asked = zeros if effort is None else zeros + effort
     command = positions = velocities = encoder = key = step = None
-    if actuators.command_delay is not None:
-        command = delay.start(asked, samples or delay.samples_of("command_delay", actuators.command_delay, dt))
-    if actuators.sensor_delay is not None:
-        count = samples or delay.samples_of("sensor_delay", actuators.sensor_delay, dt)
-        positions, velocities = delay.start(position, count), delay.start(velocity, count)
+    if actuators.max_delay is not None:
+        samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
+        if actuators.command_delay is not None:
+            command = delay.start(asked, samples)
+        if actuators.sensor_delay is not None:
+            positions, velocities = delay.start(position, samples), delay.start(velocity, samples)
     if actuators.backlash is not None:
         encoder = position
     if actuators.seed is not None:

@@ -12,56 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.actuators.fields import MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
 from batchpid.display import span, summary
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import LeafBuilder
-from batchpid.validate import at_least, entries, integer, is_traced, read_array
-
-NEUTRAL: dict[str, float] = {
-    "command_delay": 0.0,
-    "sensor_delay": 0.0,
-    "lag": 0.0,
-    "strength": 1.0,
-    "bias": 0.0,
-    "saturation_effort": math.inf,
-    "no_load_speed": math.inf,
-    "effort_limit": math.inf,
-    "coulomb": 0.0,
-    "static": 0.0,
-    "viscous": 0.0,
-    "armature": 0.0,
-    "backlash": 0.0,
-    "position_resolution": 0.0,
-    "velocity_resolution": 0.0,
-    "position_noise": 0.0,
-    "velocity_noise": 0.0,
-}
-"""Numbers of a joint, with the value that is off."""
-JOINT_SIDE = ("coulomb", "static", "viscous", "armature")
-"""Fields that act on the joint and not on the signals: :class:`sim.Runner` gives them to the simulator."""
-SENSOR_SIDE = (
-    "sensor_delay",
-    "backlash",
-    "position_resolution",
-    "velocity_resolution",
-    "position_noise",
-    "velocity_noise",
-)
-"""Fields between the joint's state and its measurement."""
-MOTOR_SIDE = (
-    "command_delay",
-    "lag",
-    "strength",
-    "bias",
-    "saturation_effort",
-    "no_load_speed",
-    "effort_limit",
-    "limit_positions",
-    "limit_efforts",
-)
-"""Fields between the effort asked for and the effort delivered."""
-MAX_DELAY = 1.0
-"""Longest delay [s]."""
+from batchpid.validate import at_least, entries, integer, is_traced, number, read_array
 
 
 class Actuators(NamedTuple):
@@ -94,13 +49,15 @@ class Actuators(NamedTuple):
     velocity_noise: Any = None
     continuous: Any = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    max_delay: Any = None
+    """Length of the histories of delayed signals (1, 1) [s]; None without delays."""
     seed: Any = None
     """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
 
     @property
     def num_joints(self) -> int | None:
         """Number of joints; None where every effect is off."""
-        return next((int(leaf.shape[1]) for leaf in self[:-1] if leaf is not None), None)
+        return next((int(leaf.shape[1]) for leaf in self[:-2] if leaf is not None), None)
 
     @property
     def num_envs(self) -> int:
@@ -130,13 +87,20 @@ class Actuators(NamedTuple):
             options["position_limit"] = options.pop("limit_positions")[0], options.pop("limit_efforts")[0]
         if self.seed is not None:
             options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
+        if self.max_delay is not None and not is_traced(self.max_delay):
+            options["max_delay"] = float(self.max_delay[0, 0])
         if options:
             options["dtype"] = next(leaf.dtype for leaf in self if leaf is not None)
         return options
 
     def replace(self, **options: Any) -> Actuators:
-        """Return actuators with some options of :func:`make_actuators` changed, checked as there."""
+        """Return actuators with some options of :func:`make_actuators` changed, checked as there.
+
+        With other delays max_delay is theirs, unless it is given too.
+        """
         known = self.options()
+        if not options.keys().isdisjoint(("command_delay", "sensor_delay")):
+            known.pop("max_delay", None)
         if any(is_traced(value) for value in options.values()):
             known.pop("dtype", None)
         if self.num_joints is None and "joints" not in options:
@@ -172,6 +136,7 @@ def make_actuators(
     position_noise: Any = None,
     velocity_noise: Any = None,
     seed: int = 0,
+    max_delay: float | None = None,
     continuous: Any = None,
     joint_names: Sequence[str] | None = None,
     dtype: Any = None,
@@ -218,6 +183,9 @@ def make_actuators(
         Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
     seed
         Of the noise, from 0 to 2^64 - 1.
+    max_delay
+        Length of the histories that delayed signals have [s]; None: the largest delay of all envs. A longer one is
+        needed where delays are to grow in flight: what is older than the history is its oldest sample.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
@@ -236,10 +204,14 @@ def make_actuators(
     for name, neutral in NEUTRAL.items():
         above, low = name in ("saturation_effort", "no_load_speed"), -math.inf if name == "bias" else 0.0
         leaves[name] = build.option(name, given[name], neutral=neutral, above=above, low=low)
-    for name in ("command_delay", "sensor_delay"):
-        if (delay := leaves[name]) is not None and not is_traced(delay) and (delay > MAX_DELAY).any():
-            remedy = f"use a number from 0 to {MAX_DELAY:g} (seconds)"
+    longest = MAX_DELAY if max_delay is None else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+    delays = [(name, delay) for name in ("command_delay", "sensor_delay") if (delay := leaves[name]) is not None]
+    for name, delay in delays:
+        if not is_traced(delay) and (delay > longest).any():
+            remedy = f"use a number from 0 to {longest:g} (seconds)"
             raise InvalidArgumentError(name, "out of range", value=float(delay.max()), remedy=remedy)
+    if max_delay is None and not any(is_traced(delay) for _, delay in delays):
+        longest = max((float(delay.max()) for _, delay in delays), default=0.0)
     if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
         missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
         raise InvalidArgumentError(missing, "is missing", remedy="give both ends of the torque-speed line, or none")
@@ -255,6 +227,7 @@ def make_actuators(
         limit_positions=points,
         limit_efforts=efforts,
         continuous=build.mask("continuous", continuous),
+        max_delay=build.freeze(np.array([[longest]])) if delays else None,
         seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if noisy else None,
     )
 
@@ -285,7 +258,7 @@ def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[s
     """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
     shapes = (1, len(joint_names)), (num_envs, len(joint_names))
     for name, leaf in actuators._asdict().items():
-        if leaf is None or name == "seed":
+        if leaf is None or name in ("max_delay", "seed"):
             continue
         if (leaf.shape if leaf.ndim == 2 else leaf.shape[:2]) not in shapes:
             raise InvalidArgumentError(

@@ -217,7 +217,8 @@ class Snapshot:
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
         groups = _nest(tables)
         motors = groups.pop(_ACTUATORS, None)
-        actuators = None if motors is None else bp.make_actuators(dof, **motors)
+        motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
+        actuators = bp.make_actuators(dof, **motors) if motors else None
         kinds = {name: {type(one).__name__: one for one in _CHOICES[name]} for name in choices}
         chosen = {name: kinds[name][kind] for name, kind in choices.items()}
         params, states = bp.PIDParams(**groups.pop("params"), **chosen), EnvStates(**groups)

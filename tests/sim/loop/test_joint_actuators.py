@@ -66,6 +66,28 @@ def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
         assert_identical(first.for_envs(slice(2)), runner.rollout(table[:8, :2]))
 
 
+def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_packs(panda):
+    """In flight too: a history is as long as the largest delay of all envs, in every group."""
+    envs, table = 20, np.tile(panda.settings.target, (4, 1))
+    delays = np.zeros((envs, panda.dof))
+    delays[10:], delays[-1] = 0.001, 0.003
+    short = bp.make_actuators(panda.dof, command_delay=delays, sensor_delay=delays / 2)
+    long = short.replace(command_delay=3 * delays[::-1])
+
+    def run(**options):
+        with Runner(panda, envs, actuators=short, **options) as runner:
+            rollouts = [runner.rollout(table)]
+            snapshot = runner.snapshot()
+            runner.actuators = long
+            rollouts.append(runner.rollout(table))
+            runner.restore(snapshot)
+            assert runner.actuators.command_delay.max() == 0.003
+            return [*rollouts, runner.rollout(table)]
+
+    for ours, theirs in zip(run(workers=0), run(workers=2, pack_size=1), strict=True):
+        assert_identical(ours, theirs)
+
+
 def test_a_lost_worker_leaves_no_trace(panda):
     chosen, table = actuators(panda), commands(panda, 12)
     other = actuators(panda, seed=1, command_delay=0.006, lag=None)
