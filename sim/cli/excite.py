@@ -11,14 +11,15 @@ from sim.cli import flags
 
 @dataclass(frozen=True)
 class ExciteCommand:
-    """Make the motion to record for `batchpid identify`: a chirp of every joint within limits, free of contact.
+    """Make the motion to record for identification: a chirp of every joint.
 
-    Writes setpoints as CSV with the header "time, setpoint:JOINT, ...". Move the robot to the first row before it
-    starts, and add the measured positions to the log as qpos:JOINT.
+    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints as CSV with the
+    header "time, setpoint:JOINT, ...". Move the robot to the first row before it starts, and add the measured positions
+    to the log as qpos:JOINT.
     """
 
     robot: flags.RobotName = "panda"
-    seconds: float = 10.0
+    duration: float = 10.0
     """Duration of the motion [s]."""
     rate: float = 500.0
     """Rows per second [Hz]."""
@@ -43,7 +44,7 @@ class ExciteCommand:
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = flags.output_path("out", self.out or Path(f"out/{robot.path.stem}.excite.csv"), (".csv",))
-        motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
+        motion = excite(robot, self.duration, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))
         rows = [
