@@ -1,11 +1,13 @@
 r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
 
-Each env runs one move of one candidate, so that a generation is one rollout. A share of the effort limits is reserved
-for moves that are harder than those searched; :mod:`sim.tuning.candidates` defines the cost. The search itself is the
-package ``cmaes`` (N. Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772).
+Each env runs one move of one candidate, so that a generation is one rollout. The moves touch nothing, so that robots
+have no collision shapes in the search. A share of the effort limits is reserved for moves that are harder than those
+searched; :mod:`sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
+evolution strategy: a tutorial", arXiv:1604.00772).
 
-The best of the candidates and the designed gains then run a final on more moves, at the full effort limits, and the
-cheapest there is the result: what suits the few moves of the search need not suit others.
+The best of the candidates and the designed gains then run a final on more moves, with collisions, under the caller's
+solver, at the full effort limits. The cheapest there is the result: what suits the few moves of the search need not
+suit others.
 
 A search is a function of its seed and does not depend on the number of workers. To resume, a fresh search of the same
 seed is given the costs in the history, and continues as if it had never stopped.
@@ -16,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +31,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.files import write_atomically
 from batchpid.validate import integer, number
 from batchpid.versions import package_versions
+from sim.loop.contact_log import MissedContactWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
 from sim.tuning.candidates import HEADROOM, Candidates
@@ -41,6 +45,8 @@ INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Candidates of the final, besides the designed gains, and its moves."""
+SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
+"""Options of the runner in the search, on moves of our own: these touch nothing."""
 _FINAL_SEED = 1_000_003
 """Distance of the seed of these moves from that of the search."""
 
@@ -96,7 +102,7 @@ def tune(
         Of the terms of the cost.
     moves
         Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Moves that are
-        given are the final as well.
+        given are the final as well, and are searched on with the physics of the final, since they may touch something.
     variation
         Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: the robot of each move has its
         own payload and friction, the same for all candidates. None: no variation.
@@ -109,7 +115,8 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`sim.Runner`, e.g. ``physics="fast"``.
+        More options of :class:`sim.Runner`, e.g. ``physics="fast"``. With ``build``, and on a floating base, the search
+        has collisions, too.
 
     Raises
     ------
@@ -130,6 +137,7 @@ def tune(
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     moves = search_moves(robot, seed) if moves is None else moves
     count = len(moves.start)
+    is_free = final is not None and robot.fixed_base and runner_options.get("build") is None
     settings: dict[str, Any] = {
         "robot": robot.name,
         "seed": seed,
@@ -142,6 +150,7 @@ def tune(
         "headroom": HEADROOM,
         "variation": None if variation is None else dict(variation),
         **{name: str(value) for name, value in runner_options.items()},
+        "search_physics": SEARCH_PHYSICS if is_free else None,
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
     record = _History(history, settings)
@@ -154,7 +163,9 @@ def tune(
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
     points: list[Float64] = []
     began = time.monotonic()
-    with Runner(robot, population * count, **options) as runner:
+    search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
+    with Runner(robot, population * count, **search_options) as runner, warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave its line
         bar = (progress or (lambda items: items))(range(generations))
         for generation in bar:
             points += [optimizer.ask() for _ in range(population)]

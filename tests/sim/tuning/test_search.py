@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
+from sim import Runner
 from sim.tuning.moves import random_moves
 from sim.tuning.search import tune
 from sim.tuning.weights import Weights
@@ -17,16 +18,37 @@ pytest.importorskip("cmaes")
 SMALL = {"generations": 2, "population": 4, "seconds": 0.2}
 
 
-def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda):
-    moves = random_moves(panda, 2, 0)
-    found = [tune(panda, moves=moves, workers=workers, seed=5, **SMALL) for workers in (0, 1, 2)]
+@pytest.fixture
+def few_moves(monkeypatch):
+    """Search on two moves, with a final on one other."""
+    monkeypatch.setattr("sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed))
+    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 1)
+
+
+def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda, few_moves):
+    found = [tune(panda, workers=workers, seed=5, **SMALL) for workers in (0, 1, 2)]
     for other in found[1:]:
         assert other.history == found[0].history
         for name in ("kp", "ki", "kd", "setpoint_weight", "derivative_filter_time"):
             assert getattr(other.params, name).tobytes() == getattr(found[0].params, name).tobytes()
     assert len({cost for row in found[0].history for cost in row}) > 3
-    assert tune(panda, moves=moves, workers=0, seed=6, **SMALL).history != found[0].history
+    assert tune(panda, workers=0, seed=6, **SMALL).history != found[0].history
     assert found[0].cost <= found[0].start_cost
+
+
+def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, few_moves, monkeypatch):
+    options = []
+
+    def runner(*args, **kwargs):
+        options.append((kwargs.get("collisions", True), kwargs.get("physics")))
+        return Runner(*args, **kwargs)
+
+    monkeypatch.setattr("sim.tuning.search.Runner", runner)
+    tune(panda, workers=0, physics="fast", **SMALL)
+    assert options == [(False, "free"), (True, "fast")]
+    options.clear()
+    tune(panda, moves=random_moves(panda, 1, 0), workers=0, physics="fast", **SMALL)
+    assert options == [(True, "fast")]
 
 
 def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
