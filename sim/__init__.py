@@ -15,6 +15,7 @@ for _name in ("batchpid", "assets"):
         raise ImportError(f"{_origin} hides the package {_name!r} that sim needs; rename it or run in another folder")
 
 import batchpid.startup  # noqa: F401 - checks the import path before NumPy is imported
+from sim.cluster import ClusterWarning, Ray
 from sim.loop.contact_log import MissedContact, MissedContactWarning
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from sim.workers.pool import RecoveryWarning
 
 __all__ = [
+    "ClusterWarning",
     "Controller",
     "Fault",
     "FaultWarning",
@@ -42,6 +44,7 @@ __all__ = [
     "MissedContactWarning",
     "Observation",
     "Physics",
+    "Ray",
     "Recorder",
     "RecordingError",
     "RecoveryWarning",

@@ -16,6 +16,7 @@ import batchpid as bp
 from batchpid.computed_torque import check_gain_units
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
+from sim.cluster import Ray
 from sim.robot.actuators import fit_actuators
 from sim.robot.robot import Robot
 
@@ -132,6 +133,10 @@ class RunnerOptions:
     """Seconds, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A worker that is
     stopped or asleep within a tick counts as stuck within a second."""
 
+    cluster: Literal["ray"] | Ray | None = None
+    """``"ray"`` or :class:`sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical results
+    (docs/cluster.md)."""
+
     def __post_init__(self) -> None:
         from sim.engine.physics import Physics
         from sim.engine.variation import Variation
@@ -153,6 +158,13 @@ class RunnerOptions:
             "recover": flag("recover", self.recover),
             "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
         }
+        if self.cluster is not None:
+            checked["cluster"] = Ray() if self.cluster == "ray" else self.cluster
+            instance("cluster", checked["cluster"], Ray, "pass 'ray' or Ray(...)")
+            if self.workers is not None:
+                raise InvalidArgumentError(
+                    "workers", "is not for a cluster", value=self.workers, remedy="pass cluster=Ray(cpus_per_node=...)"
+                )
         if self.workers is not None:
             checked["workers"] = integer("workers", self.workers, 0, 1024)
         if not isinstance(self.physics, Physics):
@@ -215,6 +227,11 @@ class RunnerOptions:
         """
         assert self.pack_size is not None
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
+
+    @property
+    def inseparable_envs(self) -> int:
+        """Number of successive envs that one worker has: those of a pack, if they can touch anything."""
+        return self.scenes_per_system if self.collisions else 1
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""

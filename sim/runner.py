@@ -13,7 +13,7 @@ from functools import cached_property
 from operator import methodcaller
 from pathlib import Path
 from time import strftime
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,7 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
+from sim.cluster import Ray
 from sim.engine.dynamics import robot_dynamics
 from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
@@ -43,7 +44,8 @@ from sim.options import (
 from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
 from sim.workers.ledger import Commit, Ledger
-from sim.workers.pool import RecoveryWarning, WorkerPool
+from sim.workers.node import NodeInfo
+from sim.workers.pool import WorkerPool
 from sim.workers.requests import (
     ReadContentSizes,
     ReadPoses,
@@ -135,6 +137,7 @@ class Runner:
         recover: bool = True,
         checkpoint_steps: int | None = 8000,
         timeout: float = 60.0,
+        cluster: Literal["ray"] | Ray | None = None,
     ) -> None:
         self._ledger: Ledger[_Books] | None = None
         self.options = RunnerOptions(
@@ -158,6 +161,7 @@ class Runner:
             recover=recover,
             checkpoint_steps=checkpoint_steps,
             timeout=timeout,
+            cluster=cluster,
         )
         """Options, checked."""
         options = self.options
@@ -186,9 +190,10 @@ class Runner:
             raise
 
     def __repr__(self) -> str:
-        options, workers = self.options, len(self.pids)
+        options, workers, nodes = self.options, len(self.pids), len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
         collisions = "collisions" if options.collisions else "no collisions"
+        where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
             f"{options.compensate!r},\n       physics {options.physics!r}, {collisions}, timestep {self.timestep:g} s, "
@@ -483,6 +488,11 @@ class Runner:
         workers = [] if self._ledger is None else self._pool.workers
         return tuple(worker.pid for worker in workers if worker.pid is not None)
 
+    @property
+    def nodes(self) -> tuple[NodeInfo, ...]:
+        """Machines of a cluster, in the order of their envs; empty without ``cluster``."""
+        return () if self._ledger is None else self._pool.nodes
+
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         if self._ledger is not None:
@@ -509,9 +519,9 @@ class Runner:
         """Execute a command, then warn of what it brought; return its result."""
         assert self._ledger is not None
         result = self._ledger.execute(request, commit, self._record)
-        if self._pool.recovery is not None:
-            message, self._pool.recovery = self._pool.recovery, None
-            warnings.warn(message, RecoveryWarning, stacklevel=stacklevel)
+        while self._pool.messages:
+            category, message = self._pool.messages.popitem()
+            warnings.warn(message, category, stacklevel=stacklevel)
         faults = self._ledger.books.faults.faults
         if faults and not self._has_warned:
             self._has_warned = True

@@ -37,6 +37,10 @@ RecordedRobot = Annotated[
 MissingMeshes = Annotated[Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
 Workers = Annotated[int | None, _flag("Processes that step the scenes; 0: this one. Default: one per available core.")]
+Cluster = Annotated[
+    Literal["ray"] | None,
+    _flag("Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`; docs/cluster.md)."),
+]
 Gains = Annotated[
     str | None,
     _flag(

@@ -42,6 +42,7 @@ class RolloutCommand:
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     workers: flags.Workers = None
+    cluster: flags.Cluster = None
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
@@ -70,6 +71,7 @@ class RolloutCommand:
             params=gains.params,
             control="drive" if gains.control == "drive" else self.control,
             workers=self.workers,
+            cluster=self.cluster,
             timestep=self.timestep,
             substeps=self.substeps,
             compensate=self.compensate,

@@ -43,6 +43,7 @@ class TuneCommand:
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None
+    cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
     missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False
@@ -82,6 +83,7 @@ class TuneCommand:
             weights=self.weights,
             variation=variation,
             workers=self.workers,
+            cluster=self.cluster,
             time_limit=self.time_limit,
             history=history,
             progress=bar("tuning", unit="generation"),
@@ -97,6 +99,7 @@ class TuneCommand:
             seed=self.seed,
             variation=variation,
             workers=self.workers,
+            cluster=self.cluster,
             physics=self.physics,
             collisions=self.collisions,
         )

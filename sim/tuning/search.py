@@ -21,7 +21,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.files import write_atomically
 from batchpid.validate import integer, number
 from batchpid.versions import package_versions
+from sim.cluster import Ray
 from sim.loop.contact_log import MissedContactWarning
 from sim.robot.robot import Robot
 from sim.runner import Runner
@@ -79,6 +80,7 @@ def tune(
     moves: Moves | None = None,
     variation: Mapping[str, Any] | None = None,
     workers: int | None = None,
+    cluster: Literal["ray"] | Ray | None = None,
     time_limit: float | None = None,
     history: Path | str | None = None,
     progress: Callable[[Any], Any] | None = None,
@@ -106,8 +108,8 @@ def tune(
     variation
         Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: the robot of each move has its
         own payload and friction, the same for all candidates. None: no variation.
-    workers
-        Number of processes; the result does not depend on it.
+    workers, cluster
+        Number of processes, or a cluster: as for :class:`sim.Runner`. The result does not depend on them.
     time_limit
         Stop after the generation in which this many seconds have passed; None: run all generations.
     history
@@ -160,7 +162,8 @@ def tune(
     search = Candidates(robot, gain_units, per_joint, moves, seconds, weights)
     optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
     start = search.params(np.zeros((1, search.dimension)))
-    options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, "workers": workers} | runner_options
+    where = {"workers": workers, "cluster": cluster}
+    options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     points: list[Float64] = []
     began = time.monotonic()
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options

@@ -27,20 +27,20 @@ def estimate_memory(options: RunnerOptions, num_envs: int) -> int:
     return round(num_envs * (ENV_BYTES + JOINT_BYTES * options.robot.dof) + systems * SYSTEM_BYTES)
 
 
-def check_memory(options: RunnerOptions, workers: int, is_local: bool) -> None:
-    """Check that the memory of this machine, and the limits of this process, leave room for all envs.
+def check_memory(options: RunnerOptions, num_envs: int, workers: int, is_local: bool) -> None:
+    """Check that the memory of this machine, and the limits of this process, leave room for ``num_envs`` of the envs.
 
     Raises
     ------
     InvalidArgumentError
         They do not.
     """
-    envs, count = estimate_memory(options, options.num_envs), 0 if is_local else workers
+    envs, count = estimate_memory(options, num_envs), 0 if is_local else workers
     needs = [(envs + count * WORKER_BYTES, available) for available in (_free_memory(), *_cgroup_memory())]
     space = _address_space()
     if space is not None:
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        largest = -(-options.num_envs // workers)
+        largest = -(-num_envs // workers)
         needs.append((used + envs if is_local else WORKER_ADDRESS_SPACE + estimate_memory(options, largest), space))
     for needed, available in needs:
         if needed > available:
@@ -48,14 +48,14 @@ def check_memory(options: RunnerOptions, workers: int, is_local: bool) -> None:
                 "num_envs",
                 f"needs {needed / 1e9:.2g} GB of memory or more, of which {max(available, 0) / 1e9:.2g} GB are "
                 "available",
-                value=options.num_envs,
-                remedy=f"pass a smaller one, such as {_fitting(options, available * envs // needed):,}",
+                value=num_envs,
+                remedy=f"pass a smaller one, such as {_fitting(options, num_envs, available * envs // needed):,}",
             )
 
 
-def _fitting(options: RunnerOptions, available: int) -> int:
+def _fitting(options: RunnerOptions, num_envs: int, available: int) -> int:
     """Return a round number of envs that take half of ``available`` bytes or less."""
-    count = max(1, options.num_envs * max(available, 0) // (2 * estimate_memory(options, options.num_envs)))
+    count = max(1, num_envs * max(available, 0) // (2 * estimate_memory(options, num_envs)))
     digits = 10 ** (len(str(count)) - 1)
     return count // digits * digits
 

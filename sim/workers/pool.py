@@ -16,6 +16,7 @@ import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import batchpid as bp
@@ -23,7 +24,10 @@ from batchpid.errors import BatchPIDError, ClosedError, WorkerError
 from sim.loop.arrays import Arrays, Ticks
 from sim.options import RunnerOptions
 from sim.workers.background import BACKGROUND
+from sim.workers.cluster import NODE_STEPS, Cluster
 from sim.workers.memory import check_memory
+from sim.workers.node import NodeInfo
+from sim.workers.node_worker import NodeWorker
 from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
 from sim.workers.shared_memory import SharedArrays
@@ -61,16 +65,32 @@ class _Slot:
 class WorkerPool:
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    ``params`` are those that the loops start with. The workers start with :meth:`open`.
+    ``params`` are those that the loops start with. The workers start with :meth:`open`. The pool of a node has some of
+    the envs, from ``first_env`` on, and that of the caller has nodes for workers, with ``options.cluster``.
     """
 
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
-        self._options, self._params = options, params
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, first_env: int = 0, num_envs: int | None = None
+    ) -> None:
+        self._options, self._params, self._first_env = options, params, first_env
+        self.messages: dict[type[Warning], str] = {}
+        """Latest message of each category, for warnings."""
+        self.num_envs = options.num_envs if num_envs is None else num_envs
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
-        self.is_local, self._make_worker = not count, ProcessWorker if count else LocalWorker
+        self.is_local = not count
         """True if the loop runs in this process."""
-        self._slices = split_envs(options.num_envs, count, options.scenes_per_system if options.collisions else 1)
+        self._make_worker: Callable[[Start, SharedArrays], Worker] = ProcessWorker if count else LocalWorker
+        self._slices = split_envs(self.num_envs, count, options.inseparable_envs)
         self._cores = pinned_cores(len(self._slices))
+        widest, most_steps = max(envs.stop - envs.start for envs in self._slices), _MAX_STEPS
+        self.cluster: Cluster | None = None
+        """Machines whose pools execute the requests; None: this one's processes do."""
+        if options.cluster is not None:
+            self.cluster = cluster = Cluster(options, params, WorkerPool, self.messages)
+            self._slices, self._make_worker, self._cores = cluster.slices, partial(NodeWorker, cluster), []
+            widest, most_steps = cluster.widest, NODE_STEPS
+        else:
+            check_memory(options, self.num_envs, len(self._slices), self.is_local)
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
         self._poller = select.poll()
@@ -79,14 +99,10 @@ class WorkerPool:
         """True if the running call is to end, and no other to begin."""
         self.error: Exception | None = None
         """Error that a loop raised in the last request; of several, one that left its state undefined."""
-        self.recovery: str | None = None
-        """Message about the last worker that was replaced, for a warning."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
-        check_memory(options, len(self._slices), self.is_local)
-        widest = max(envs.stop - envs.start for envs in self._slices)
-        ticks = max(1, _MAX_STEPS // (options.substeps * widest))
-        layout = Arrays.layout(ticks, options.num_envs, options.robot.dof)
+        ticks = max(1, most_steps // (options.substeps * widest))
+        layout = Arrays.layout(ticks, self.num_envs, options.robot.dof)
         self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
@@ -98,7 +114,7 @@ class WorkerPool:
     def open(self) -> None:
         """Start the workers and wait until all are ready."""
         for index, envs in enumerate(self._slices):
-            start = Start(index, envs, self._options, self._params.for_envs(envs))
+            start = Start(index, envs, self._options, self._params.for_envs(envs), self._first_env)
             self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
             self._start(self._slots[-1])
         self._serve()
@@ -109,6 +125,12 @@ class WorkerPool:
     def workers(self) -> list[Worker]:
         """Workers in the order of their envs."""
         return [slot.worker for slot in self._slots]
+
+    @property
+    def nodes(self) -> tuple[NodeInfo, ...]:
+        """Machines of a cluster, in the order of their envs."""
+        infos = (worker.info for worker in self.workers if isinstance(worker, NodeWorker))
+        return tuple(info for info in infos if info is not None)
 
     def run(self, request: Request) -> list[Any]:
         """Let every worker execute its part of ``request``; return their results, if there is no :attr:`error`.
@@ -209,7 +231,8 @@ class WorkerPool:
         if not slot.queue and slot.losses:
             self.recoveries += 1
             if slot.cause:
-                self.recovery = f"{slot.cause}; replaced and replayed in {time.monotonic() - slot.lost_at:.1f} s"
+                seconds = time.monotonic() - slot.lost_at
+                self.messages[RecoveryWarning] = f"{slot.cause}; replaced and replayed in {seconds:.1f} s"
             slot.losses = 0
         slot.phase = "idle"
 

@@ -7,7 +7,7 @@ import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass
-from operator import methodcaller
+from operator import itemgetter, methodcaller
 from typing import Any, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from sim.loop.arrays import Arrays, Command
+from sim.loop.canonical import canonical_digest
 from sim.loop.loop import Loop
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.options import RunnerOptions
@@ -59,6 +60,10 @@ class Request(ABC):
     def apply(self, loop: Loop) -> Any:
         """Execute it and return its result."""
 
+    def join(self, results: list[Any]) -> Any:
+        """Return the result for all envs from the results of their parts."""
+        return None
+
 
 def decode(message: bytes) -> Request:
     """Return the request of a message from :meth:`Request.encode`."""
@@ -78,6 +83,13 @@ class Start(Request):
     options: RunnerOptions
     params: bp.PIDParams
     """Of these envs."""
+    first_env: int = 0
+    """Env of the runner that is the pool's first one: a node of a cluster has a pool for some of the envs."""
+
+    @property
+    def numbers(self) -> slice:
+        """Numbers of ``envs`` in the runner."""
+        return slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
 
     def limit(self, num_envs: int) -> float:
         return 60.0 + super().limit(num_envs)  # mostly imports, from a disk that may be slow
@@ -86,8 +98,8 @@ class Start(Request):
         pass
 
     def build(self, arrays: Arrays) -> Loop:
-        """Return the loop, with the shared arrays (ticks, envs, ...) of all envs."""
-        return Loop(self.options, self.params, self.envs, arrays.at((slice(None), self.envs)))
+        """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
+        return Loop(self.options, self.params, self.numbers, arrays.at((slice(None), self.envs)))
 
 
 @dataclass(frozen=True)
@@ -127,8 +139,13 @@ class Run(Request):
     def limit(self, num_envs: int) -> float:
         return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
+    def for_envs(self, envs: slice) -> Self:
+        return self._with(self.command.map(itemgetter((slice(None), envs))))
+
     def copy(self) -> Self:
-        command = self.command.map(methodcaller("copy"))
+        return self._with(self.command.map(methodcaller("copy")))
+
+    def _with(self, command: Command) -> Self:
         return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
 
     def write(self, arrays: Arrays, envs: slice) -> None:
@@ -141,6 +158,9 @@ class Run(Request):
 
     def apply(self, loop: Loop) -> float:
         return loop.run(self.ticks, self.substeps, self.use_rate, self.use_feedforward)
+
+    def join(self, results: list[float]) -> float:
+        return max(results)
 
 
 @dataclass(frozen=True)
@@ -173,6 +193,9 @@ class TakeSnapshot(Request):
     def apply(self, loop: Loop) -> EnvStates:
         return loop.snapshot()
 
+    def join(self, results: list[EnvStates]) -> EnvStates:
+        return EnvStates.join(results)
+
 
 @dataclass(frozen=True)
 class Restore(Request):
@@ -194,6 +217,9 @@ class ReadContentSizes(Request):
     def apply(self, loop: Loop) -> list[int]:
         return loop.content_sizes()
 
+    def join(self, results: list[list[int]]) -> list[int]:
+        return [size for sizes in results for size in sizes]
+
 
 @dataclass(frozen=True)
 class ReadPoses(Request):
@@ -203,3 +229,23 @@ class ReadPoses(Request):
 
     def apply(self, loop: Loop) -> list[NDArray[np.float32]]:
         return loop.poses()
+
+    def join(self, results: list[list[NDArray[np.float32]]]) -> list[NDArray[np.float32]]:
+        return [rows for poses in results for rows in poses]
+
+
+@dataclass(frozen=True)
+class ReadDigest(Request):
+    """Run the canonical episode, under ``params`` of one env, and read its digest."""
+
+    params: bp.PIDParams
+    is_replayed = False
+
+    def for_envs(self, envs: slice) -> Self:
+        return self
+
+    def apply(self, loop: Loop) -> str:
+        return canonical_digest(loop.options, self.params)
+
+    def join(self, results: list[str]) -> str:
+        return " ".join(sorted(set(results)))

@@ -130,15 +130,8 @@ class ProcessWorker(Worker):
     pid: int | None = None
 
     def __init__(self, start: Start, shared: SharedArrays) -> None:
-        try:
-            self._message = cloudpickle.dumps((start, shared.layout))  # it includes a ``build`` that cannot be imported
-        except Exception as error:
-            raise InvalidArgumentError(
-                "build",
-                f"cannot be sent to a worker process: {error}",
-                remedy="let the function use nothing that cannot be pickled, or pass workers=0",
-            ) from error
-        self._name = f"worker {start.index} (envs {start.envs.start} to {start.envs.stop - 1})"
+        self._message = pickled((start, shared.layout))
+        self._name = f"worker {start.index} (envs {start.numbers.start} to {start.numbers.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
         self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
         self._opening: Job[None] | None = None
@@ -237,6 +230,24 @@ class ProcessWorker(Worker):
         text = os.pread(self._trace.fileno(), 4000, 0).decode(errors="replace")
         trace = text.partition("\nExtension modules:")[0].strip()  # a long list, of no use here
         return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+def pickled(start: Any) -> bytes:
+    """Return what starts a worker as bytes, with a ``build`` that cannot be imported there.
+
+    Raises
+    ------
+    InvalidArgumentError
+        It cannot be pickled.
+    """
+    try:
+        return cloudpickle.dumps(start)
+    except Exception as error:
+        raise InvalidArgumentError(
+            "build",
+            f"cannot be sent to a worker process: {error}",
+            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
+        ) from error
 
 
 def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:

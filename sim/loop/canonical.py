@@ -1,0 +1,41 @@
+"""Canonical episode: a short run whose digest is equal on machines that round alike."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.versions import package_versions
+from sim.loop.arrays import Arrays
+from sim.loop.loop import Loop
+from sim.options import RunnerOptions
+
+_TICKS, _SUBSTEPS, _STEP = 5, 20, 0.1  # rad, m, N m or N: small enough for any robot
+
+
+def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
+    """Return a digest of batchpid's version and of every bit of an episode of one robot, without the user's content.
+
+    ``params`` are of one env. The episode runs the law, the physics and the robot that the runner with ``options``
+    runs, with the instructions that NumPy, OpenBLAS and XLA choose on this machine.
+    """
+    robot = options.robot
+    options = replace(options, num_envs=1, build=None, variation=None, actuators=None)
+    layout = Arrays.layout(_TICKS, 1, robot.dof)
+    fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
+    arrays = Arrays.from_fields(fields)
+    start = robot.start[None]
+    arrays.command.setpoint[:] = robot.coupled(start + _STEP) if options.sets_positions else _STEP
+    loop = Loop(options, params, slice(0, 1), arrays)
+    try:
+        loop.reset(np.ones(1, bool), start, np.zeros_like(start))
+        loop.run(_TICKS, _SUBSTEPS, use_rate=False, use_feedforward=False)
+    finally:
+        loop.close()
+    digest = hashlib.sha256(str(package_versions(("batchpid",)).get("batchpid")).encode())
+    for rows in arrays.observation:
+        digest.update(rows.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,209 @@
+"""Machines of a Ray cluster as workers of a pool.
+
+Ray finds the machines, starts a process on each and carries the messages. That process holds a pool of workers for a
+slice of the envs (:mod:`sim.workers.node`). It is lost with its machine, with any of its workers, or when it does not
+answer; the caller's pool then replaces it, here or on another machine, as it replaces a worker process.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections import Counter
+from collections.abc import Sequence
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
+from sim.cluster import ClusterWarning, Ray
+from sim.options import RunnerOptions
+from sim.workers.background import BACKGROUND
+from sim.workers.node import NodeInfo
+
+NODE_STEPS = 25_000
+"""Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
+_PROBE_LIMIT = 2.0  # seconds for a connection to a machine
+_LATENCY_RUNS = 50  # requests over which time and work are compared
+_QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+
+
+class Machine(NamedTuple):
+    """Machine of a cluster, and the workers that it can have."""
+
+    node_id: str
+    address: str
+    port: int
+    workers: int
+
+
+class Cluster:
+    """Machines of a runner's envs.
+
+    Parameters
+    ----------
+    options, params
+        Of the runner.
+    pool_type
+        Type of the pools of the machines.
+    messages
+        Warnings for the caller of the runner, by category.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such cluster, or it has no machine with enough CPUs.
+    MissingDependencyError
+        The package ``ray`` is missing.
+    """
+
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, pool_type: Any, messages: dict[type[Warning], str]
+    ) -> None:
+        assert isinstance(options.cluster, Ray)
+        self.options, self.messages, self.pool_type = options.cluster, messages, pool_type
+        self.canonical = params.for_envs(slice(0, 1))
+        """Params of the canonical episode."""
+        self.ray = BACKGROUND.call(lambda: _connect(self.options))
+        """The module."""
+        machines = self._machines()[: self.options.nodes]
+        if not machines:
+            least = self.options.cpus_per_node or 1
+            raise InvalidArgumentError(
+                "cluster", f"has no machine of {least} CPUs", remedy="pass a smaller cpus_per_node, or start more of it"
+            )
+        packs = -(-options.num_envs // options.inseparable_envs)
+        if self.options.placement == "PACK":
+            enough = [sum(machine.workers for machine in machines[:count]) >= packs for count in range(len(machines))]
+            machines = machines[: max(1, enough.index(True))] if True in enough else machines
+        parts = _split(options.num_envs, [machine.workers for machine in machines], options.inseparable_envs)
+        used = [(envs, machine) for envs, machine in zip(parts, machines, strict=True) if envs.stop > envs.start]
+        self.slices = [envs for envs, _ in used]
+        """Envs of each node."""
+        self.widest = max(-(-(envs.stop - envs.start) // machine.workers) for envs, machine in used)
+        """Most envs of one worker."""
+        self._homes = dict(enumerate(machine for _, machine in used))
+        self._has_started: set[int] = set()
+        self._failures: Counter[str] = Counter()
+        self._unlike: set[str] = set()
+        self._reference: NodeInfo | None = None
+        self._runs, self._seconds, self._work = 0, 0.0, 0.0
+
+    def place(self, index: int) -> tuple[Machine, int]:
+        """Return the machine for the envs of a node, and the CPUs to reserve: none for a replacement.
+
+        Raises
+        ------
+        WorkerError
+            No machine is left.
+        """
+        if index not in self._has_started:
+            self._has_started.add(index)
+            return self._homes[index], self._homes[index].workers
+        left = [one for one in self._machines() if one.node_id not in self._unlike and _answers(one.address, one.port)]
+        if not left:
+            raise WorkerError(f"the cluster has no machine left for node {index}; restore a snapshot in a new Runner")
+        others = Counter(machine.node_id for node, machine in self._homes.items() if node != index)
+        machine = min(left, key=lambda one: (self._failures[one.node_id], others[one.node_id], -one.workers))
+        self._homes[index] = machine
+        return machine, 0
+
+    def note_failure(self, machine: Machine) -> None:
+        """Prefer other machines: a node has not started on this one."""
+        self._failures[machine.node_id] += 1
+
+    def admit(self, info: NodeInfo, machine: Machine) -> None:
+        """Check that a new node rounds as the first one does.
+
+        Raises
+        ------
+        InvalidArgumentError
+            It does not.
+        """
+        if self._reference is None:
+            self._reference = info
+        first = self._reference
+        if info.digest == first.digest:
+            return
+        problem = (
+            f"has machines that do not round alike: {first.address} ({first.processor}) and {info.address} "
+            f"({info.processor})"
+        )
+        if not self.options.accept_differences:
+            self._unlike.add(machine.node_id)
+            raise InvalidArgumentError(
+                "cluster",
+                problem,
+                remedy="choose machines with equal processors and packages, or pass Ray(accept_differences=True)",
+            )
+        self.messages[ClusterWarning] = f"the cluster {problem}; results depend on the machine that runs an env"
+
+    def note_time(self, seconds: float, work: float) -> None:
+        """Note how long a request took, and its work on the machine."""
+        self._runs, self._seconds, self._work = self._runs + 1, self._seconds + seconds, self._work + work
+        if self._runs == _LATENCY_RUNS and self._seconds > 2 * self._work:
+            each, part = 1e3 * self._seconds / self._runs, 100 * self._work / self._seconds
+            self.messages[ClusterWarning] = (
+                f"a request to the cluster takes {each:.1f} ms, of which {part:.0f} % are simulation and the rest "
+                "messages; use rollout(), more envs or more substeps, or cluster=None"
+            )
+
+    def _machines(self) -> list[Machine]:
+        """Return the machines that Ray has, those with most CPUs first."""
+        wanted, found = self.options.cpus_per_node, []
+        for node in BACKGROUND.call(self.ray.nodes):
+            cpus = int(node["Resources"].get("CPU", 0))
+            if node["Alive"] and cpus >= (wanted or 1):
+                workers = wanted or cpus
+                found.append(Machine(node["NodeID"], node["NodeManagerAddress"], node["NodeManagerPort"], workers))
+        return sorted(found, key=lambda machine: (-machine.workers, machine.address, machine.node_id))
+
+
+def _connect(options: Ray) -> Any:
+    """Return the module ray, connected to the cluster."""
+    for name, value in _QUIET.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+    except ImportError:
+        raise MissingDependencyError("ray", "cluster='ray'", "ray") from None
+    if ray.is_initialized():
+        return ray
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
+    address = options.address or os.environ.get("RAY_ADDRESS") or "auto"
+    host, _, port = address.rpartition(":")
+    if host and not (port.isdecimal() and _answers(host, int(port))):
+        raise InvalidArgumentError(
+            "cluster",
+            f"does not answer at {address}",
+            remedy="start it with ray start --head, or leave the address out",
+        )
+    try:
+        ray.init(address, **quiet)
+    except ConnectionError as error:
+        if address != "auto":
+            raise InvalidArgumentError(
+                "cluster",
+                f"at {address} cannot be joined: {error}",
+                remedy="run ray start --address=... on this machine first",
+            ) from error
+        ray.init("local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **quiet)
+    return ray
+
+
+def _answers(host: str, port: int) -> bool:
+    """Return True if a process listens there."""
+    try:
+        socket.create_connection((host, port), _PROBE_LIMIT).close()
+    except OSError:
+        return False
+    return True
+
+
+def _split(num_envs: int, shares: Sequence[int], pack_size: int) -> list[slice]:
+    """Return contiguous slices of envs in proportion to ``shares`` that do not split a pack; some can be empty."""
+    packs, total = -(-num_envs // pack_size), sum(shares)
+    cuts = [min(num_envs, pack_size * (packs * part // total)) for part in accumulate(shares, initial=0)]
+    return [slice(low, high) for low, high in pairwise(cuts)]

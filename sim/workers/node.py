@@ -1,0 +1,105 @@
+"""Node of a cluster: a pool of workers on one machine, in a process that Ray starts there."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import batchpid as bp
+from batchpid.errors import BatchPIDError, WorkerError
+from sim.loop.arrays import Arrays
+from sim.workers.requests import ReadDigest, Request, Start
+from sim.workers.worker import WorkerLost
+
+
+class NodeInfo(NamedTuple):
+    """Machine of a cluster, and the processes that run some of a runner's envs there."""
+
+    address: str
+    """Address of the machine."""
+    envs: slice
+    """Envs of the runner."""
+    pid: int
+    """Process that holds the pool of workers."""
+    pids: tuple[int, ...]
+    """Worker processes."""
+    processor: str
+    """Model of the processor."""
+    digest: str
+    """Digest of the canonical episode (:mod:`sim.loop.canonical`)."""
+
+
+class Answer(NamedTuple):
+    """Answer of a node to a request."""
+
+    result: Any
+    """Result of the request."""
+    failure: BatchPIDError | None = None
+    """Error to raise in place of the result."""
+    arrays: Arrays | None = None
+    """Output (ticks, envs, ...), if the request changes the observation."""
+
+
+class Node:
+    """Pool of the envs of one machine. Ray makes it an actor, which is called by one thread at a time, and beats."""
+
+    def __init__(self) -> None:
+        self._pool: Any = None
+
+    def start(self, message: bytes, workers: int, address: str) -> Answer:
+        """Start the pool; return a :class:`NodeInfo`.
+
+        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs and the params of the canonical
+        episode.
+        """
+        return _answer(lambda: Answer(self._start(pickle.loads(message), workers, address)))
+
+    def _start(self, message: tuple[Any, Start, bp.PIDParams], workers: int, address: str) -> NodeInfo:
+        pool_type, start, canonical = message
+        # The caller replaces a node that has lost a worker: it keeps the requests to replay.
+        options = replace(start.options, workers=workers, cluster=None, recover=False)
+        envs = start.envs
+        self._pool = pool_type(options, start.params, envs.start, envs.stop - envs.start)
+        self._pool.open()
+        digest = self._run(ReadDigest(canonical))
+        pids = tuple(worker.pid for worker in self._pool.workers)
+        return NodeInfo(address, envs, os.getpid(), pids, _processor(), digest)
+
+    def execute(self, request: Request) -> Answer:
+        """Execute a request, which has the part of this node's envs."""
+
+        def act() -> Answer:
+            result, tick = self._run(request), request.observed_tick
+            return Answer(result, None, None if tick is None else self._pool.arrays.at(slice(tick + 1)))
+
+        return _answer(act)
+
+    def beat(self) -> None:
+        """Answer, also during a request."""
+
+    def _run(self, request: Request) -> Any:
+        results = self._pool.run(request)
+        if self._pool.error is not None:
+            raise self._pool.error
+        return request.join(results)
+
+
+def _answer(act: Callable[[], Answer]) -> Answer:
+    try:
+        return act()
+    except WorkerLost as error:  # without the advice to turn recovery on
+        return Answer(None, WorkerLost(str(error.__cause__ or error)))
+    except BatchPIDError as error:
+        return Answer(None, error)
+    except Exception:
+        return Answer(None, WorkerError(f"raised:\n{traceback.format_exc()}"))
+
+
+def _processor() -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
