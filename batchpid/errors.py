@@ -72,5 +72,9 @@ class ClosedError(BatchPIDError, RuntimeError):
     """The object was closed before this call."""
 
 
+class CallOrderError(BatchPIDError, RuntimeError):
+    """Calls in an order without meaning, such as ``recv`` without ``send``."""
+
+
 class InUseError(BatchPIDError, RuntimeError):
     """The object is in use: by another thread, a signal handler, or the process from which this one was forked."""

@@ -163,6 +163,17 @@ class ReachVectorEnv(VectorEnv):
 
     def step(self, actions: ArrayLike) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
         """Apply an action (envs, joints) for one step; return observation, reward, terminated, truncated and info."""
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: ArrayLike) -> None:
+        """Begin a step, which the workers make while the caller computes something else, and return.
+
+        Raises
+        ------
+        CallOrderError
+            The last step that was begun has not been waited for.
+        """
         action = np.clip(array("actions", actions, self._goal.shape, self.joint_names), -1.0, 1.0)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -171,8 +182,20 @@ class ReachVectorEnv(VectorEnv):
             setpoint = self.low + (action + 1) / 2 * (self.high - self.low)
         else:
             setpoint = np.clip(self._setpoint + action * self.max_increment, self.low, self.high)
-        self._setpoint = np.where(begins[:, None], self._setpoint, setpoint)
-        self._observe(self.runner.step(self._of_robot(self._setpoint)))
+        setpoint = np.where(begins[:, None], self._setpoint, setpoint)
+        self.runner.send(self._of_robot(setpoint))
+        self._setpoint = setpoint
+
+    def step_wait(self) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
+        """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
+
+        Raises
+        ------
+        CallOrderError
+            No step was begun.
+        """
+        self._observe(self.runner.recv())
+        begins = self._done.copy()
         self._steps += 1
 
         reward = 1.0 * self._success - (self._error / (self.high - self.low)).mean(1)

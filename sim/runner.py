@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError, ClosedError, InvalidArgumentError
+from batchpid.errors import BatchPIDError, CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.cluster import Ray
@@ -91,6 +91,8 @@ class _Books(NamedTuple):
     actuators: bp.Actuators | None = None
     contacts: MissedContactLog | None = None
     """None with collisions."""
+    received: Observation | None = None
+    """Observation of the tick that was sent, until :meth:`Runner.recv` returns it."""
 
 
 class Runner:
@@ -254,17 +256,53 @@ class Runner:
             Sim steps of this tick; default the runner's.
         """
         self._settle()
-        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
-        command = Command(
-            self._rows("setpoint", setpoint),
-            None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate),
-            None if feedforward is None else self._rows("feedforward", feedforward),
-        )
-        command = self._coupled(command)
-        if self.options.sets_positions:
-            self._limits.check("setpoint", command.setpoint)
-        self._run(command.map(lambda rows: rows[None]), count)
+        self._run(*self._tick(setpoint, setpoint_rate, feedforward, substeps))
         return _copy(self._pool.present)
+
+    def send(
+        self,
+        setpoint: ArrayLike,
+        *,
+        setpoint_rate: ArrayLike | None = None,
+        feedforward: ArrayLike | None = None,
+        substeps: int | None = None,
+    ) -> None:
+        """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
+
+        The two are bit-identical to one :meth:`step`, and take its arguments. Any other call in between, of attributes
+        such as :attr:`time` too, first waits for the tick to end. With ``workers=0`` the tick runs in this call.
+
+        Raises
+        ------
+        CallOrderError
+            The observation of the last tick that was sent has not been received.
+        """
+        if self._settle().received is not None:
+            raise CallOrderError("send: the last tick's observation has not been received; call recv() first")
+        request, commit = self._ticks(*self._tick(setpoint, setpoint_rate, feedforward, substeps))
+
+        def commit_sent(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
+            books, _ = commit(books, seconds)
+            return books._replace(received=_copy(self._pool.present)), None
+
+        assert self._ledger is not None
+        self._ledger.begin(request, commit_sent, self._record)
+
+    def recv(self) -> Observation:
+        """Wait for the end of the tick that :meth:`send` began; return its observation.
+
+        Raises
+        ------
+        CallOrderError
+            No tick was sent since the last call.
+        """
+        books = self._settle(refusals=True)
+        if books.received is None:
+            raise CallOrderError("recv: no tick is under way; call send(setpoint) first")
+        assert self._ledger is not None
+        self._ledger.books = books._replace(received=None)
+        self._warn(stacklevel=3)
+        return books.received
 
     def rollout(
         self,
@@ -519,6 +557,12 @@ class Runner:
         """Execute a command, then warn of what it brought; return its result."""
         assert self._ledger is not None
         result = self._ledger.execute(request, commit, self._record)
+        self._warn(stacklevel + 1)
+        return result
+
+    def _warn(self, stacklevel: int) -> None:
+        """Warn of what the last commands brought: lost workers, faults, missed contacts."""
+        assert self._ledger is not None
         while self._pool.messages:
             category, message = self._pool.messages.popitem()
             warnings.warn(message, category, stacklevel=stacklevel)
@@ -534,10 +578,32 @@ class Runner:
         if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
             warnings.warn(contacts.message(), MissedContactWarning, stacklevel=stacklevel)
-        return result
+
+    def _tick(
+        self,
+        setpoint: ArrayLike,
+        setpoint_rate: ArrayLike | None,
+        feedforward: ArrayLike | None,
+        substeps: int | None,
+    ) -> tuple[Command, int]:
+        """Return the command (1, envs, dof) and the sim steps of one tick, checked."""
+        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        command = Command(
+            self._rows("setpoint", setpoint),
+            None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate),
+            None if feedforward is None else self._rows("feedforward", feedforward),
+        )
+        command = self._coupled(command)
+        if self.options.sets_positions:
+            self._limits.check("setpoint", command.setpoint)
+        return command.map(lambda rows: rows[None]), count
 
     def _run(self, command: Command, substeps: int) -> None:
         """Run ticks under ``command`` (ticks, envs, dof)."""
+        self._execute(*self._ticks(command, substeps), stacklevel=4)
+
+    def _ticks(self, command: Command, substeps: int) -> tuple[Run, Commit[_Books]]:
+        """Return the request for ticks under ``command`` (ticks, envs, dof), after a checkpoint if one is due."""
         every, pool, ledger = self.options.checkpoint_steps, self._pool, self._ledger
         assert ledger is not None
         if every is not None and ledger.books.steps_since_checkpoint >= every:
@@ -560,7 +626,7 @@ class Runner:
             books = books._replace(faults=faults, steps=books.steps + steps, steps_since_checkpoint=since)
             return books._replace(work_seconds=spent, unrecorded=unrecorded, contacts=contacts), None
 
-        self._execute(request, commit, stacklevel=4)
+        return request, commit
 
     def _record(self) -> None:
         """Pass on the ticks that are not recorded yet."""
@@ -589,13 +655,13 @@ class Runner:
                 "variation", "is not part of snapshots", remedy="make the runner without variation="
             )
 
-    def _settle(self) -> _Books:
-        """Complete an interrupted command; return the books."""
+    def _settle(self, *, refusals: bool = False) -> _Books:
+        """Complete a command that was sent or interrupted; return the books."""
         if self._ledger is None or self._pool.closed:
             raise ClosedError("this Runner is closed; make a new one")
         ledger = self._ledger
         if not ledger.is_settled or ledger.books.unrecorded:
-            ledger.settle(self._record)
+            ledger.settle(self._record, refusals=refusals)
         return ledger.books
 
     @property

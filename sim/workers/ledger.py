@@ -68,9 +68,16 @@ class Ledger(Generic[Books]):
         """
         return self._exclusive(lambda: self._execute(request, commit, publish))
 
-    def settle(self, publish: Callable[[], None]) -> None:
-        """Complete a command whose call was interrupted; raises as :meth:`execute` does."""
-        self._exclusive(lambda: self._settle(publish))
+    def begin(self, request: Request, commit: Commit[Books], publish: Callable[[], None]) -> None:
+        """Send every worker its part of ``request``, as a pending command; raises as :meth:`execute` does."""
+        self._exclusive(lambda: self._begin(request, commit, publish))
+
+    def settle(self, publish: Callable[[], None], *, refusals: bool = False) -> None:
+        """Complete a command that was begun, or whose call was interrupted; raises as :meth:`execute` does.
+
+        An error that a loop raised before it changed anything is raised with ``refusals`` only.
+        """
+        self._exclusive(lambda: self._settle(publish, refusals))
 
     def close(self) -> None:
         """End all workers; a loop in this process ends after the running call. May be called again."""
@@ -86,21 +93,23 @@ class Ledger(Generic[Books]):
         publish()
         return result
 
-    def _settle(self, publish: Callable[[], None]) -> None:
+    def _begin(self, request: Request, commit: Commit[Books], publish: Callable[[], None]) -> None:
+        if self._pending is not None:
+            self._settle(publish)
+        self._pending = request.copy(), self.books, commit
+        self._guarded(self._pool.begin, self._pending[0])
+
+    def _settle(self, publish: Callable[[], None], refusals: bool = False) -> None:
         if self._pending is not None and not self._pool.closed:
             try:
                 self._complete(*self._pending)
             except BatchPIDError:
-                if self._pending is not None:
+                if refusals or self._pending is not None:
                     raise  # otherwise the command was refused and has changed nothing
         publish()
 
     def _complete(self, request: Request, before: Books, commit: Commit[Books]) -> Any:
-        try:
-            results = self._pool.run(request)
-        except WorkerError:
-            self.close()
-            raise
+        results = self._guarded(self._pool.run, request)
         error = self._pool.error
         if error is not None:
             if is_refusal(error):
@@ -111,6 +120,14 @@ class Ledger(Generic[Books]):
         self.books, result = commit(before, results)
         self._pending = None
         return result
+
+    def _guarded(self, function: Callable[[Request], Any], request: Request) -> Any:
+        """Return ``function(request)``; close the pool if a worker was lost for good."""
+        try:
+            return function(request)
+        except WorkerError:
+            self.close()
+            raise
 
     def _exclusive(self, call: Callable[[], Any]) -> Any:
         """Return ``call()``; raise InUseError if another call is in progress."""

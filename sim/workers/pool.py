@@ -132,10 +132,25 @@ class WorkerPool:
         infos = (worker.info for worker in self.workers if isinstance(worker, NodeWorker))
         return tuple(info for info in infos if info is not None)
 
+    def begin(self, request: Request) -> None:
+        """Send every worker its part of ``request``; :meth:`run` completes it.
+
+        A loop in this process executes it at once.
+
+        Raises
+        ------
+        WorkerError
+            A worker was lost for good.
+        """
+        self._enqueue(request)
+        for slot in self._slots:
+            if slot.queue and slot.phase == "idle":
+                self._attempt(slot, self._send)
+
     def run(self, request: Request) -> list[Any]:
         """Let every worker execute its part of ``request``; return their results, if there is no :attr:`error`.
 
-        After an interrupt, a call with the same request continues it.
+        A call with a request that :meth:`begin` sent, or whose call was interrupted, continues it.
 
         Raises
         ------
@@ -144,10 +159,7 @@ class WorkerPool:
         ClosedError
             The pool was closed meanwhile.
         """
-        if self._request is not request:
-            for slot in self._slots:
-                slot.queue, slot.error = [request], None
-            self._request = request  # nothing is sent before
+        self._enqueue(request)
         self._serve()
         if self.error is None:
             if request.is_replayed and self._options.recover and not (self._replay and self._replay[-1] is request):
@@ -182,6 +194,13 @@ class WorkerPool:
             self.close()
 
     # -- one request, until every worker has executed it -----------------------------------------------------------
+
+    def _enqueue(self, request: Request) -> None:
+        """Make ``request`` the one that every worker is to execute, unless it is that already."""
+        if self._request is not request:
+            for slot in self._slots:
+                slot.queue, slot.error = [request], None
+            self._request = request  # nothing is sent before
 
     def _serve(self) -> None:
         """Serve the queues until all are empty."""

@@ -62,6 +62,10 @@ class DisturbedRunner(RuleBasedStateMachine):
         self.twin.step(self.setpoints(seed, 1)[0], self.disturbance(kind, seed))
 
     @rule(kind=disturbances, seed=seeds)
+    def exchange(self, kind, seed):
+        self.twin.exchange(self.setpoints(seed, 1)[0], self.disturbance(kind, seed))
+
+    @rule(kind=disturbances, seed=seeds)
     def rollout(self, kind, seed):
         self.twin.rollout(self.setpoints(seed, 1 + seed % 20), self.disturbance(kind, seed))
 

@@ -10,7 +10,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E402
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
-from batchpid.errors import InvalidArgumentError  # noqa: E402
+from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from sim import FaultWarning, Robot, Runner  # noqa: E402
 from sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
@@ -85,6 +85,21 @@ def test_results_depend_on_the_seed_and_not_on_the_workers():
     other, _ = run(0, 4)
     np.testing.assert_array_equal(first[1:], other[:-1])  # env k has seed + k
     assert (first[0] != other[0]).any()
+
+
+def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
+    ours, theirs = (ReachVectorEnv(2, workers=workers, max_episode_steps=3) for workers in (1, 0))
+    assert same(ours.reset(seed=2), theirs.reset(seed=2))
+    for number in range(5):
+        action = np.full((2, 9), 0.1 * number, np.float32)
+        ours.step_async(action)
+        with pytest.raises(CallOrderError, match="recv"):
+            ours.step_async(action)
+        assert same(ours.step_wait(), theirs.step(action))
+    with pytest.raises(CallOrderError, match="send"):
+        ours.step_wait()
+    ours.close()
+    theirs.close()
 
 
 def test_a_setpoint_at_the_goal_reaches_it_and_raises_the_reward():

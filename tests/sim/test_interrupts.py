@@ -13,13 +13,14 @@ INTERRUPTS = int(os.environ.get("BATCHPID_SOAK_INTERRUPTS", "200"))
 NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
 SETPOINTS = np.tile(ROBOT.settings.target, (12, 1))
 FIRST = np.arange(N) == 0
-NAMES = ("step", "rollout", "set_params", "reset", "snapshot", "restore", "record", "reopen", "construct")
+NAMES = ("step", "exchange", "rollout", "set_params", "reset", "snapshot", "restore", "record", "reopen", "construct")
 
 
 def call(twin, name, disturb):
     """Let ``twin`` execute one command."""
     arguments = {
         "step": (SETPOINTS[0],),
+        "exchange": (SETPOINTS[0],),
         "rollout": (SETPOINTS,),
         "set_params": (ROBOT.params(kp=25.0 + twin.runner.time),),
         "reset": (NEAR, FIRST),

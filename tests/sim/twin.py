@@ -21,6 +21,7 @@ from processes import children, have_ended
 from robots import load_bundled
 
 import sim.runner
+from batchpid.errors import CallOrderError
 from sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
 from sim.workers.background import start_thread
 
@@ -133,6 +134,20 @@ class Twin:
 
     def step(self, setpoint: Any, disturb: Disturbance = undisturbed) -> None:
         disturb(lambda: self.runner.step(setpoint))
+        if self.runner.time != self._model.time:
+            self._model.step(setpoint)
+        self.compare()
+
+    def exchange(self, setpoint: Any, disturb: Disturbance = undisturbed) -> None:
+        """Send a tick and receive its observation."""
+
+        def act() -> None:
+            self.runner.send(setpoint)
+            self.runner.recv()
+
+        disturb(act)
+        with contextlib.suppress(CallOrderError):  # it was sent, but its observation was not received
+            self.runner.recv()
         if self.runner.time != self._model.time:
             self._model.step(setpoint)
         self.compare()
