@@ -27,7 +27,7 @@ from batchpid import startup
 startup.prepare()
 
 from batchpid import actuators, presets
-from batchpid.actuators import Actuators, make_actuators
+from batchpid.actuators import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.bumpless import track
 from batchpid.coefficients import Coefficients, discretise
 from batchpid.controller import BatchPID
@@ -58,12 +58,14 @@ __all__ = [
     "dumps_params",
     "init",
     "load_about",
+    "load_actuators",
     "load_params",
     "loads_params",
     "make_actuators",
     "make_params",
     "presets",
     "reset",
+    "save_actuators",
     "save_params",
     "spectral_radius",
     "stability_bound",

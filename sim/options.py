@@ -115,8 +115,8 @@ class RunnerOptions:
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     actuators: bp.Actuators | None = None
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
-    row per env. Default none. The control sees measured positions and velocities; observations hold the true ones, and
-    the effort that was delivered."""
+    row per env. Default those of the robot, under control "drive" their friction and armature. The control sees
+    measured positions and velocities; observations hold the true ones, and the effort that was delivered."""
     variation: Variation | None = None
     """Differences of each env's robot from the model: :func:`sim.tuning.randomization.draw_variation`. Snapshots do
     not hold it, so that it turns off recovery and checkpoints."""
@@ -185,8 +185,10 @@ class RunnerOptions:
                     "variation", f"is for {count} envs, not {checked['num_envs']}", remedy="draw one for each env"
                 )
         vars(self).update(checked)
-        if self.actuators is not None:
-            vars(self)["actuators"] = self.check_actuators(self.actuators)
+        actuators = robot.actuators if self.actuators is None else self.actuators
+        if self.actuators is None and actuators is not None and self.control == "drive":
+            actuators = actuators.joint_side()
+        vars(self)["actuators"] = self.check_actuators(actuators)
         self._check_collisions()
 
     def _check_collisions(self) -> None:

@@ -22,6 +22,7 @@ from batchpid.actuators.dynamics import (
 )
 from batchpid.actuators.fields import JOINT_SIDE
 from batchpid.actuators.model import Actuators, check_actuators, make_actuators
+from batchpid.actuators.serialization import dumps_actuators, load_actuators, save_actuators
 from batchpid.actuators.state import ActuatorState
 
 __all__ = [
@@ -34,8 +35,11 @@ __all__ = [
     "check_actuators",
     "deliver",
     "discretise",
+    "dumps_actuators",
     "init",
+    "load_actuators",
     "make_actuators",
     "measure",
     "reset",
+    "save_actuators",
 ]

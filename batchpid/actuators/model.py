@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.actuators.fields import MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
+from batchpid.actuators.fields import JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
 from batchpid.display import span, summary
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import LeafBuilder
@@ -77,6 +77,10 @@ class Actuators(NamedTuple):
     def for_envs(self, envs: slice | Any) -> Actuators:
         """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
         return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+
+    def joint_side(self) -> Actuators:
+        """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
+        return Actuators(**{name: getattr(self, name) for name in JOINT_SIDE})
 
     def options(self) -> dict[str, Any]:
         """Return the effects that are on, as arguments of :func:`make_actuators` that build these actuators again."""

@@ -27,6 +27,7 @@ class CompareCommand:
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None
+    actuators: flags.Actuators = None
     missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
     """First two sets on the first move, to draw: .png or .svg."""
@@ -40,7 +41,7 @@ class CompareCommand:
         from sim.cli.run import evaluate_sets
 
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]
         if picture is not None and len(sets) < 2:

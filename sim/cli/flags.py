@@ -49,6 +49,14 @@ Gains = Annotated[
         metavar="NAME|FILE",
     ),
 ]
+Actuators = Annotated[
+    Path | None,
+    _flag(
+        "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal ones. Of these, drives "
+        "have the friction and armature alone.",
+        metavar="FILE",
+    ),
+]
 GainSets = Annotated[
     tuple[str, ...],
     _flag(

@@ -43,6 +43,7 @@ class RolloutCommand:
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     workers: flags.Workers = None
     cluster: flags.Cluster = None
+    actuators: flags.Actuators = None
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
@@ -58,7 +59,9 @@ class RolloutCommand:
 
         out = flags.output_path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, dissipation=self.dissipation)
+        robot = Robot.load(
+            self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators, dissipation=self.dissipation
+        )
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         target = robot.start if robot.settings is None else robot.settings.target

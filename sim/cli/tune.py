@@ -45,6 +45,7 @@ class TuneCommand:
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
+    actuators: flags.Actuators = None
     missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False
     """Continue a search with the same options that was stopped."""
@@ -63,7 +64,7 @@ class TuneCommand:
         from sim.tuning.evaluation import arm_joints
         from sim.tuning.search import tune
 
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}.tuned.yaml")
         out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
         picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)

@@ -37,6 +37,7 @@ class ViewCommand:
     compensate: flags.Compensate = "gravity+coriolis+friction"
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
+    actuators: flags.Actuators = None
     missing_meshes: flags.MissingMeshes = "skip"
     play: flags.OptionalPath = None
     """Recorded run to show: .npz or .h5."""
@@ -73,7 +74,7 @@ class ViewCommand:
         """Return the running robots."""
         from sim.view import LiveSimulation
 
-        robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes, actuators=self.actuators)
         gains = None if self.gains is None else gain_set(robot, self.gains)
         if gains and gains.control != "pid":
             raise InvalidArgumentError("gains", "are those of the PID", value=self.gains, remedy="use --control drive")

@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import batchpid as bp
 from batchpid.actuators import JOINT_SIDE, check_actuators
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import instance
 from sim.robot.description import RobotDescription
+
+
+def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescription) -> bp.Actuators:
+    """Return actuators of ``robot``, given or in a file.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not fit the robot, or the file cannot be read.
+    FileNotFoundError
+        The file does not exist.
+    """
+    if isinstance(source, str | Path):
+        source, _ = bp.load_actuators(source, robot.joint_names)
+    return fit_actuators(source, robot, 1, "pid")
 
 
 def fit_actuators(actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object) -> bp.Actuators:

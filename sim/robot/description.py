@@ -65,7 +65,7 @@ class RobotDescription(Urdf):
     ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
     among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
     that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled.
+    unless the robot is bundled. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -78,6 +78,7 @@ class RobotDescription(Urdf):
     bodies: Mapping[str, Placement]
     settings: Settings | None
     coupling: Coupling | None = None
+    actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
         mass = sum(link.mass or 0.0 for link in self.links)

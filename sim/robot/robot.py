@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import batchpid as bp
 from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.validate import choice, file_path, flag
+from sim.robot.actuators import load_robot_actuators
 from sim.robot.description import RobotDescription
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.findings import Finding
@@ -48,6 +49,7 @@ class Robot(RobotDescription):
         fixed_base: bool = True,
         merge_fixed: bool = True,
         self_collision: str = "auto",
+        actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
     ) -> Robot:
         """Load a bundled robot by name (``Robot.bundled()``), or any URDF by path.
@@ -71,6 +73,9 @@ class Robot(RobotDescription):
             ``"auto"``: links that are neighbours, overlap at the start pose, or touch in nearly every sampled pose do
             not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
             name, disables and enables further pairs. ``"none"``: no link collides with another.
+        actuators
+            Motors and sensors that runners of this robot have by default: :class:`batchpid.Actuators` of one row, or a
+            file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones.
         strict
             True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
 
@@ -104,7 +109,7 @@ class Robot(RobotDescription):
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
         srdf = path.with_suffix(".srdf")
         bundled = path.parent == _ASSETS
-        return cls(
+        robot = cls(
             **vars(urdf),
             path=path,
             srdf=read_srdf(srdf, [link.name for link in urdf.links]) if os.path.isfile(srdf) else Srdf(),
@@ -117,6 +122,7 @@ class Robot(RobotDescription):
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
         )
+        return robot if actuators is None else replace(robot, actuators=load_robot_actuators(actuators, robot))
 
     @staticmethod
     def bundled() -> tuple[str, ...]:

@@ -144,6 +144,7 @@ def tune(
         "robot": robot.name,
         "seed": seed,
         "population": population,
+        "actuators": None if robot.actuators is None else str(robot.actuators),
         "gain_units": gain_units,
         "per_joint": per_joint,
         "moves": list(moves.names),

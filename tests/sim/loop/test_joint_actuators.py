@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 
@@ -11,7 +12,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Runner, Snapshot
+from sim import Robot, Runner, Snapshot
 from sim.workers.pool import RecoveryWarning
 
 N = 5
@@ -173,3 +174,22 @@ def test_drives_take_friction_and_armature_alone(panda):
         runner.reset()
         loaded = runner.rollout(np.tile(panda.settings.target, (5, 1)))
     assert np.abs(loaded.qvel[:, :, :7]).max() < 0.8 * np.abs(free.qvel[:, :, :7]).max()
+
+
+def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
+    path = tmp_path / "arm.yaml"
+    arm = {name: {"strength": 0.9, "command_delay": 0.001, "coulomb": 0.1} for name in panda.joint_names[:7]}
+    path.write_text(json.dumps({"format": "batchpid-actuators-1", "joints": arm}))
+    robot, table = Robot.load("panda", actuators=path), commands(panda, 3)
+    assert robot.actuators.strength.tolist() == [[0.9] * 7 + [1.0] * 2]
+    with Runner(robot, N, workers=0) as runner:
+        assert runner.actuators.command_delay is not None
+        by_default = runner.rollout(table)
+    with Runner(panda, N, workers=0, actuators=robot.actuators) as runner:
+        assert_identical(by_default, runner.rollout(table))
+    with Runner(robot, 1, workers=0, control="drive") as runner:
+        assert runner.actuators.command_delay is None
+        assert runner.actuators.coulomb.max() == 0.1
+    bp.save_actuators(path, bp.make_actuators(9, strength=np.full((2, 9), 0.5)), panda.joint_names)
+    with pytest.raises(InvalidArgumentError, match="one row"):
+        Robot.load("panda", actuators=path)

@@ -1,0 +1,80 @@
+"""Actuators survive a file exactly, joints are matched by name, and a malformed file is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_actuator_effects import ALL, random_options
+
+import batchpid as bp
+
+NAMES = ["shoulder", "elbow", "no", "wrist"]
+
+
+def same(first, second):
+    return all(
+        (x is y is None) or (x.dtype == y.dtype and x.shape == y.shape and np.array_equal(x, y))
+        for x, y in zip(first, second, strict=True)
+    )
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_every_effect_survives_a_file(suffix, dtype, tmp_path):
+    actuators = bp.make_actuators(4, **ALL, coulomb=[0.0, 0.1, 0.2, 0.3], static=0.4, armature=0.1, dtype=dtype)
+    bp.save_actuators(tmp_path / f"a{suffix}", actuators, NAMES, about={"log": "chirp.csv"})
+    loaded, names = bp.load_actuators(tmp_path / f"a{suffix}")
+    assert names == NAMES
+    assert same(loaded, actuators)
+
+
+@given(seed=st.integers(0, 2**32 - 1), suffix=st.sampled_from([".yaml", ".json"]))
+@settings(max_examples=10)
+def test_random_actuators_survive_a_file(tmp_path_factory, seed, suffix):
+    rng, path = np.random.default_rng(seed), tmp_path_factory.mktemp("files") / f"a{suffix}"
+    actuators = bp.make_actuators(4, **random_options(rng, 3, 4))
+    bp.save_actuators(path, actuators, NAMES)
+    assert same(bp.load_actuators(path, NAMES)[0], actuators)
+
+
+def test_a_file_written_by_hand(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        """
+format: batchpid-actuators-1
+joints:
+  elbow: {strength: 0.9, position_limit: [[0, 1, 2], [5, 6, 7]]}
+  shoulder: {coulomb: [0.1, 0.2], position_limit: [[0, 1], [3, 4]]}
+"""
+    )
+    actuators, names = bp.load_actuators(path, ["shoulder", "wrist", "elbow"])
+    assert names == ["shoulder", "wrist", "elbow"]
+    assert actuators.strength.tolist() == [[1.0, 1.0, 0.9]]
+    assert actuators.coulomb.tolist() == [[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]
+    assert actuators.limit_positions[0, ::2].tolist() == [[0, 1, 1], [0, 1, 2]]
+    assert actuators.limit_efforts[0].tolist() == [[3, 4, 4], [np.inf] * 3, [5, 6, 7]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("format: batchpid-params-1\njoints: {a: {kp: 1}}", "holds no actuators"),
+        ("format: batchpid-actuators-1\njoints: {a: {kp: 1}}", "kp, joint 'a': unknown option"),
+        ("format: batchpid-actuators-1\njoints: {a: {strength: strong}}", "strength, joint 'a': is 'strong'"),
+        ("format: batchpid-actuators-1\njoints: {a: {strength: -1}}", "strength, joint 'a': must be finite and >= 0"),
+        ("format: batchpid-actuators-1\njoints: {b: {}}", r"unknown joints \['b'\]"),
+        ("format: batchpid-actuators-1\njoints: {a: [1]}", "must map options"),
+        ("format: batchpid-actuators-1\nseed: soon\njoints: {a: {}}", "seed: must be a whole number"),
+        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [1, 2]}}", "two lists of as many numbers"),
+        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [[0], [1, 2]]}}", "two lists of as many numbers"),
+        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [[1, 0], [1, 2]]}}", "do not ascend"),
+        ("- 1", "holds no actuators"),
+        ("format: [", "cannot be read"),
+    ],
+)
+def test_bad_files_are_refused_by_file_joint_and_key(text, said, tmp_path):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(bp.InvalidArgumentError, match=said) as caught:
+        bp.load_actuators(path, ["a"])
+    assert str(path) in str(caught.value)
