@@ -7,6 +7,7 @@ setup(
         Extension(
             "sim.engine.native._gateway",
             ["sim/engine/native/gateway.cpp"],
+            depends=[f"sim/engine/native/{name}.h" for name in ("gateway", "rigid_body", "sim_step", "xla_call")],
             extra_compile_args=["-std=c++17", "-O2"],
             language="c++",
             define_macros=[("Py_LIMITED_API", "0x030B0000")],

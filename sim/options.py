@@ -55,6 +55,8 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
+Backend = Literal["numpy", "jax"]
+Precision = Literal["float64", "float32"]
 PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
@@ -87,6 +89,12 @@ class RunnerOptions:
     control: ControlMode | Controller = "pid"
     """``"pid"``; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and damping;
     ``"effort"``: the setpoint is the joint effort; or a :class:`Controller`."""
+    backend: Backend = "numpy"
+    """Library of the law: ``"numpy"``, or ``"jax"``, which runs law and sim steps of a tick as one program of XLA on
+    the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors, the last
+    bits of results differ."""
+    dtype: Precision = "float64"
+    """Floating-point type of the law under backend ``"jax"``."""
     compensate: Compensation = "gravity+coriolis+friction"
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
     "effort" friction is not compensated."""
@@ -147,6 +155,8 @@ class RunnerOptions:
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "control": _control(self.control),
+            "backend": choice("backend", self.backend, get_args(Backend)),
+            "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
             "collisions": flag("collisions", self.collisions),
             "ground": self.collisions and robot.has_ground if self.ground is None else flag("ground", self.ground),
@@ -165,6 +175,10 @@ class RunnerOptions:
                 raise InvalidArgumentError(
                     "workers", "is not for a cluster", value=self.workers, remedy="pass cluster=Ray(cpus_per_node=...)"
                 )
+        if self.backend == "numpy" and self.dtype != "float64":
+            raise InvalidArgumentError(
+                "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
+            )
         if self.workers is not None:
             checked["workers"] = integer("workers", self.workers, 0, 1024)
         if not isinstance(self.physics, Physics):
@@ -290,6 +304,8 @@ class RunnerOptions:
             "num_envs": self.num_envs,
             "timestep": self.timestep,
             "control": self.control_name,
+            "backend": self.backend,
+            "dtype": self.dtype,
             "compensate": self.compensate,
             "physics": list(astuple(self.solver)),
             "dissipation": robot.dissipation,

@@ -24,20 +24,22 @@ from batchpid.validate import array, env_mask, instance, integer, read_array, wi
 from batchpid.versions import package_versions
 from sim.cluster import Ray
 from sim.engine.dynamics import robot_dynamics
-from sim.engine.native import status as native_status
 from sim.loop.arrays import Arrays, Command
+from sim.loop.backend import describe
 from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
 from sim.loop.custom import initial_state
 from sim.loop.faults import Fault, FaultLog, FaultWarning
 from sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
+    Backend,
     Compensation,
     Controller,
     ControlMode,
     FaultAction,
     InvalidInputAction,
     PhysicsPreset,
+    Precision,
     RunnerOptions,
     default_params,
 )
@@ -125,6 +127,8 @@ class Runner:
         timestep: float = 1 / 2000,
         substeps: int = 20,
         control: ControlMode | Controller = "pid",
+        backend: Backend = "numpy",
+        dtype: Precision = "float64",
         compensate: Compensation = "gravity+coriolis+friction",
         physics: PhysicsPreset | Physics = "accurate",
         ground: bool | None = None,
@@ -149,6 +153,8 @@ class Runner:
             timestep=timestep,
             substeps=substeps,
             control=control,
+            backend=backend,
+            dtype=dtype,
             compensate=compensate,
             physics=physics,
             ground=ground,
@@ -503,7 +509,7 @@ class Runner:
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return f"law in NumPy, {native_status()}"
+        return describe(self.options, self.actuators)
 
     @property
     def time(self) -> float:

@@ -196,34 +196,46 @@ def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) ->
 class SafeRegions:
     """Regions of the joint positions of ``size`` robots, within which no contact is predicted; a robot may have none.
 
-    ``arms`` are those of :class:`ContactPredictor`. ``known`` is the mask (size,) of the robots with a region, ``any``
-    is True if there is one.
+    ``arms`` are those of :class:`ContactPredictor`.
+
+    Attributes
+    ----------
+    known
+        Robots with a region (size,), the same array all the time.
+    any
+        Whether there is one.
+    arms
+        Weights of the movements of the last sim step and since the center of the region (2 dof, pairs).
+    places
+        Positions before the last sim step and at the center (size, 2, dof), the same array all the time.
+    sizes
+        Sizes of the regions (size, pairs), the same array all the time; inf without a region.
     """
 
     def __init__(self, size: int, arms: Float64) -> None:
         self.known, self.any = np.zeros(size, bool), False
-        self._arms = np.concatenate([STEP_FACTOR * arms.T, arms.T])
-        self._places = np.zeros((size, 2, arms.shape[1]))  # of the step before, and at the center of the region
-        self._moved, self._used = np.zeros_like(self._places), np.zeros((size, 1, len(arms)))
-        self._sizes = np.full_like(self._used, np.inf)
+        self.arms = np.concatenate([STEP_FACTOR * arms.T, arms.T])
+        self.places = np.zeros((size, 2, arms.shape[1]))  # of the step before, and at the center of the region
+        self._moved, self._used = np.zeros_like(self.places), np.zeros((size, 1, len(arms)))
+        self.sizes = np.full((size, len(arms)), np.inf)
 
     def enter(self, row: int, qpos: NDArray[np.floating], sizes: Float64) -> None:
         """Give a robot the region around ``qpos`` (dof,) with the ``sizes`` of :meth:`ContactPredictor.region`."""
-        self._places[row] = qpos
-        self._sizes[row] = sizes
+        self.places[row] = qpos
+        self.sizes[row] = sizes
         self.known[row] = self.any = True
 
     def drop(self, rows: int | list[int] | NDArray[np.bool_]) -> None:
         """Take the regions of some robots (rows or a mask) away."""
         self.known[rows] = False
-        self._sizes[rows] = np.inf
+        self.sizes[rows] = np.inf
         self.any = bool(self.known.any())
 
     def left(self, qpos: Float64) -> list[int]:
         """Return the robots that are outside of their regions, one sim step after the last call, at ``qpos``."""
-        moved = np.subtract(qpos[:, None], self._places, self._moved)
+        moved = np.subtract(qpos[:, None], self.places, self._moved)
         np.abs(moved, moved)
-        self._places[:, 0] = qpos
+        self.places[:, 0] = qpos
         # Robot by robot, so that no result depends on how many there are.
-        outside = np.matmul(moved.reshape(len(moved), 1, -1), self._arms, self._used) >= self._sizes
+        outside = np.matmul(moved.reshape(len(moved), 1, -1), self.arms, self._used) >= self.sizes[:, None]
         return np.flatnonzero(outside.any((1, 2))).tolist() if outside.any() else []

@@ -37,6 +37,21 @@ class ContactWatch:
         self._waits = np.zeros(size, int)  # looks until a region is tried again
         self._sharing: dict[int, Any] = {}
 
+    @property
+    def regions(self) -> SafeRegions:
+        """Regions of the robots, in which no contact is predicted."""
+        return self._regions
+
+    @property
+    def systems(self) -> list[Any]:
+        """Systems to look at in every sim step: those with a robot that has no region. Replaced, never changed."""
+        return self._systems
+
+    @property
+    def links(self) -> dict[Any, tuple[int, int]]:
+        """Robot and number of each link that is watched."""
+        return self._links
+
     def bind(self, robots: Sequence[Any], systems: Sequence[Any], rows: Iterable[int]) -> None:
         """Watch the robots ``rows``, those that share systems and may touch, and no others."""
         self._robots, self._sharing = robots, {row: systems[row] for row in rows}
@@ -74,9 +89,14 @@ class ContactWatch:
         qpos, left = None, list[int]()
         if self._regions.any:
             qpos = read_qpos()
-            if left := self._regions.left(qpos):
-                self._regions.drop(left)
-                left = [row for row in left if row in self._sharing]
+            left = self._regions.left(qpos)
+        return self.look(left), qpos
+
+    def look(self, left: list[int]) -> list[int]:
+        """Return the robots for which contact is predicted, the robots ``left`` having left their regions."""
+        if left:
+            self._regions.drop(left)
+            left = [row for row in left if row in self._sharing]
         systems = self._systems
         if left:
             systems = list(dict.fromkeys([*systems, *(self._sharing[row] for row in left)]))
@@ -84,7 +104,7 @@ class ContactWatch:
         for system in systems:
             if contacts := system.get_contacts():
                 self._add_near_pairs(contacts, near)
-        return (self._look(near) if near else []), qpos
+        return self._look(near) if near else []
 
     def _add_near_pairs(self, contacts: Iterable[Any], near: dict[int, list[NearPair]]) -> None:
         """Add to ``near`` the pairs in a system's contacts, those of robots without a region."""

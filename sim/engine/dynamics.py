@@ -16,6 +16,7 @@ from sim.engine.collision_groups import Pair
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.extents import link_extents, touching_pairs
 from sim.engine.physics import PHYSICS
+from sim.engine.rigid_body import RigidBodies, bodies_of, mass_matrix
 from sim.robot.description import RobotDescription
 from sim.robot.mimics import coupling_of
 from sim.robot.parts import Joint
@@ -45,8 +46,19 @@ class Dynamics:
         # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
 
-    def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
+    @cached_property
+    def bodies(self) -> RigidBodies:
+        """Bodies of the robot on a fixed base."""
+        return bodies_of(self._robot)
+
+    def mass_matrix(self, qpos: Any) -> Any:
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg].
+
+        Those of a JAX array are computed in its program, on the CPU (:mod:`sim.engine.rigid_body`); they have no
+        derivatives.
+        """
+        if not isinstance(qpos, np.ndarray) and hasattr(qpos, "__array_namespace__"):
+            return mass_matrix(self.bodies, qpos)
         return _rowwise(self._model.compute_generalized_mass_matrix, qpos)
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from batchpid.actuators import Actuators
 from batchpid.friction import Friction
 from sim.engine.building import SceneSpec, build_scene, engine_settings, link_frames, new_system, set_collision_group
+from sim.engine.calls import EngineCalls
 from sim.engine.contact_watch import ContactWatch
 from sim.engine.coupling import ConstraintEfforts
 from sim.engine.dynamics import scene_dynamics
@@ -46,6 +47,8 @@ class Pack:
         Efforts last written, in the engine's precision; those of a coupling are not among them.
     friction
         Friction and damping that the loop has to apply to the joints.
+    watch
+        Watch over the contacts.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
     """
@@ -76,7 +79,7 @@ class Pack:
             set_collision_group(scene, row + 1)
         self.size, self.dof = size, self.robots[0].dof
         self.isolated = np.zeros(size, bool)
-        self._watch = ContactWatch(spec, self.robots[0], size)
+        self.watch = ContactWatch(spec, self.robots[0], size)
         self._stepped_qpos: NDArray[Any] | None = None  # of the last sim step, where they were read
         self.friction = self._friction()
         self._implicit = np.array([[joint.armature[0] for joint in self.robots[0].active_joints]])
@@ -112,7 +115,7 @@ class Pack:
         )
         self._stepped_qpos = None
         watched = ~(self.isolated | self._suspended)[: len(robots)]
-        self._watch.bind(robots, self.systems, np.flatnonzero(watched).tolist() if self._isolates else [])
+        self.watch.bind(robots, self.systems, np.flatnonzero(watched).tolist() if self._isolates else [])
 
     def step(self, update: bool = True) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints.
@@ -122,8 +125,19 @@ class Pack:
         if self._constraint is not None:
             self._write_coupled_qf(self._constraint, update)
         self._calls.step()
-        predicted, self._stepped_qpos = self._watch.step(self._read_float64_qpos)
+        predicted, self._stepped_qpos = self.watch.step(self._read_float64_qpos)
         if predicted:
+            self.isolate(predicted)
+
+    @property
+    def calls(self) -> EngineCalls:
+        """Calls into the engine, other ones since robots or systems were replaced."""
+        return self._calls
+
+    def look(self, left: list[int]) -> None:
+        """Look for contacts after a :class:`sim.engine.sim_step.NativeStep` that led ``left`` out of regions."""
+        self._stepped_qpos = None
+        if predicted := self.watch.look(left):
             self.isolate(predicted)
 
     def _write_coupled_qf(self, constraint: ConstraintEfforts, update: bool) -> None:
@@ -146,7 +160,7 @@ class Pack:
         No contact before the placement then has any influence.
         """
         systems = {}
-        for row, predicted in zip(rows, self._watch.place(rows, qpos, qvel), strict=True):
+        for row, predicted in zip(rows, self.watch.place(rows, qpos, qvel), strict=True):
             if predicted:
                 systems[row] = new_system(self.spec)
             elif self.isolated[row]:

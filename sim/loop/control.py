@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.choices import PerMassMatrix
-from batchpid.computed_torque import advance_with_mass_matrix, convert_integral, per_inertia
+from batchpid.coefficients import Coefficients
+from batchpid.computed_torque import convert_integral
 from batchpid.elementwise import clip
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
+from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, acting_params, half_way
 from sim.options import ControlMode
 from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
-
-MASS_MATRIX_STEPS = 4
-"""Sim steps for which a mass matrix is kept within a tick."""
 
 
 class Plant(Protocol):
@@ -69,14 +68,6 @@ class Control:
         self._state = self._state.matched_to(bp.init(params, self._plant.read_qpos()))
         self.params = params
 
-    def _without_followers(self, params: bp.PIDParams) -> bp.PIDParams:
-        """Return ``params`` with zero gains for followers, which move with their leaders."""
-        if self._coupling is None:
-            return params
-        independent = self._coupling.independent
-        gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
-        return params.replace(**{name: gain * independent for name, gain in gains.items() if gain is not None})
-
     def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
         """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
         self.saturated[mask] = False
@@ -111,63 +102,64 @@ class Control:
 class PIDControl(Control):
     """PID control: qf = sat(PID(setpoint, qpos) + feedforward).
 
-    Gains per unit of inertia use a mass matrix that is kept for MASS_MATRIX_STEPS. With the whole matrix M, the joints'
-    viscous damping B is compensated as well: the engine integrates it implicitly, (M + dt B) (v+ - v) = dt (u - B v),
-    so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
+    Gains per unit of inertia use a mass matrix that is kept for MASS_MATRIX_STEPS.
+
+    Attributes
+    ----------
+    law
+        The law as the params ask for it.
+    coefficients
+        Its coefficients (M, dof).
+    damping
+        Viscous damping of the joints that the law compensates (dof,) [N m s/rad or N s/m]; None for none.
     """
 
     _dynamics: Dynamics | None = None
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times; the state carries on, with the integral in the unit of the new gains."""
-        self._whole = isinstance(params.gain_units, PerMassMatrix)
+        self.law = PIDLaw.of(params)
         damping = np.array([joint.damping for joint in self._scene.joints])
-        if self._whole != isinstance(self.params.gain_units, PerMassMatrix):
+        if self.law.whole != PIDLaw.of(self.params).whole:
             matrix = self._mass_matrix(self._plant.read_qpos(), damping)
             self._state = convert_integral(self._state, self.params, params, matrix)
         super().set_params(params)
-        self._damping = damping if self._whole and damping.any() else None
-        self._measures_rate = params.measurement_rate is not None
-        params = self._without_followers(params)
-        self._coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
+        self.damping = damping if self.law.whole and damping.any() else None
+        params = acting_params(params, self._coupling)
+        self.coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Advance the law by one sim step."""
         if self.params.gain_units is not None and step % MASS_MATRIX_STEPS == 0:
             self._update_mass_matrix(qpos, min(MASS_MATRIX_STEPS, self._substeps - step), qvel)
-        if qvel is None and (self._measures_rate or self._damping is not None):
+        if qvel is None and (self.law.measures_rate or self.damping is not None):
             qvel = self._plant.read_qvel()
-        if self._damping is not None and qvel is not None:
-            viscous = self._damping * qvel
+        viscous = None
+        if self.damping is not None and qvel is not None:
+            viscous = self.damping * qvel
             if self._coupling is not None:
                 viscous = self._coupling.efforts(viscous)
-            feedforward = viscous if feedforward is None else feedforward + viscous
-        setpoint, setpoint_rate, _ = self._command
+        matrix = self._matrix if self.law.whole else None
         last = step + 1 == self._substeps
-        inputs = (qvel if self._measures_rate else None, setpoint_rate, feedforward)
-        k = self._coefficients if self._whole else self._scaled
+        command = self._command.setpoint, self._command.setpoint_rate
+        k = self._scaled
         if self.limits[1] is not None:  # saturation and anti-windup are those of the motors
             low, high = (clip(end, k.effort_min, k.effort_max, np) for end in self.limits)
             k = k._replace(effort_min=low, effort_max=high)
-        if self._whole:
-            at = (self._state, setpoint, qpos, self._matrix)
-            new = advance_with_mass_matrix(k, *at, *inputs, terms=last)
-        else:
-            new = bp.advance(k, self._state, setpoint, qpos, *inputs, terms=last)
+        new = self._advance(k, command, qpos, qvel, feedforward, matrix, viscous, terms=last)
         if last:
             self.saturated = new[2].saturated
         self._state, effort = new[:2]
         return effort
 
+    def _advance(self, k: Coefficients, *inputs: Any, terms: bool) -> Any:
+        return partial(self.law.advance, terms=terms)(k, self._state, *inputs)
+
     def _update_mass_matrix(self, qpos: Float64, steps: int, qvel: Float64 | None) -> None:
         """Set the mass matrix, and the gains that depend on it, for so many sim steps from ``qpos``."""
-        # At the pose half-way through these steps, so that the error is zero on average: near upright, axes nearly in
-        # line, a jaco2 leaves its path by 18 mrad under matrices that are 0.3 steps ahead.
         qvel = self._plant.read_qvel() if qvel is None else qvel
-        half_way = qpos + 0.5 * (steps - 1) * self._scene.timestep * qvel
-        self._matrix = self._mass_matrix(half_way, self._damping)
-        if not self._whole:
-            self._scaled = per_inertia(self._coefficients, np.diagonal(self._matrix, axis1=1, axis2=2))
+        self._matrix = self._mass_matrix(half_way(qpos, qvel, steps, self._scene.timestep), self.damping)
+        self._scaled = self.law.scaled(self.coefficients, np.diagonal(self._matrix, axis1=1, axis2=2))
 
     def _mass_matrix(self, qpos: Float64, damping: Float64 | None) -> Float64:
         """Return M + dt B (M, dof, dof), B being the viscous ``damping`` of the joints."""
@@ -192,7 +184,7 @@ class DriveControl(Control):
         """Change gains, limits and times; the state carries on."""
         super().set_params(params)
         self.reads_qpos_each_step = params.ki is not None and bool(np.any(params.ki > 0))
-        params = self._without_followers(params)
+        params = acting_params(params, self._coupling)
         damping = np.zeros_like(params.kp) if params.kd is None else params.kd
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
         self._acting = params

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.loop.control import CONTROLS, Control, Plant
+from sim.loop.control import Control, Plant
 from sim.options import Controller, RunnerOptions
 from sim.robot.robot import Robot
 
@@ -48,16 +47,46 @@ class CustomControl(Control):
             leaf[mask] = fresh[name][mask]
         self._of_controller = unflatten(self._of_controller, leaves)
 
+    def _call(self, *inputs: Float64) -> Any:
+        """Return the controller's effort, and keep its state."""
+        self._of_controller, wanted = self._controller(self._of_controller, *inputs)
+        return wanted
+
+    def call(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
+        """Call the controller in a program of JAX; return its state by name, and the effort.
+
+        Raises
+        ------
+        InvalidArgumentError
+            JAX cannot trace it, or it returns something else.
+        """
+        import jax
+
+        qpos = inputs[1]
+        try:
+            state, wanted = self._controller(unflatten(self._of_controller, leaves), *inputs)
+            new = flatten(state, read=jax.numpy.asarray)
+            effort = jax.numpy.asarray(wanted, qpos.dtype)
+        except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
+            raise InvalidArgumentError(
+                "control",
+                f"cannot be traced by JAX: {str(error).splitlines()[0]}",
+                remedy="write it in jax.numpy, or use backend='numpy'",
+            ) from error
+        _check_effort(effort, qpos)
+        if {name: leaf.shape for name, leaf in new.items()} != {name: leaf.shape for name, leaf in leaves.items()}:
+            raise InvalidArgumentError(
+                "control", "returned a state of another structure or shape", remedy="return one as init does"
+            )
+        return {name: leaf.astype(leaves[name].dtype) for name, leaf in new.items()}, effort
+
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Call the controller, and saturate."""
         qvel = self._plant.read_qvel() if qvel is None else qvel
         passive = np.zeros_like(qpos) if feedforward is None else feedforward
         setpoint = self._command.setpoint
-        self._of_controller, wanted = self._controller(self._of_controller, setpoint, qpos, qvel, passive)
-        total = np.asarray(wanted, np.float64)
-        if total.shape != qpos.shape:
-            problem = f"returned an effort of shape {total.shape}, not {qpos.shape}"
-            raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
+        total = np.asarray(self._call(setpoint, qpos, qvel, passive), np.float64)
+        _check_effort(total, qpos)
         if self._coupling is not None:
             total = self._coupling.efforts(total)
         effort = self._saturate(total)
@@ -74,13 +103,6 @@ class CustomControl(Control):
         self._of_controller, self.saturated = unflatten(self._of_controller, state), saturated
 
 
-def make_control(options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams, plant: Pack) -> Control:
-    """Return the control that ``options`` ask for, of the robots ``plant``."""
-    if isinstance(options.control, str):
-        return CONTROLS[options.control](scene, params, plant)
-    return CustomControl(options.control, options.robot, scene, params, plant)
-
-
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:
     """Return the state of the control of all envs at their start, by name."""
     if not isinstance(options.control, str):
@@ -88,16 +110,22 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDA
     return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
 
 
-def flatten(state: Any, name: str = "") -> dict[str, NDArray[Any]]:
+def _check_effort(effort: Any, qpos: Any) -> None:
+    if effort.shape != qpos.shape:
+        problem = f"returned an effort of shape {effort.shape}, not {qpos.shape}"
+        raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
+
+
+def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray) -> dict[str, Any]:
     """Return the arrays of a nested state by name: keys of mappings and fields of tuples, joined by "/"."""
     if state is None:
         return {}
     if not isinstance(state, Mapping | tuple | list):
-        return {name or "state": np.asarray(state)}
+        return {name or "state": read(state)}
     return {
         leaf: rows
         for key, part in _items(state)
-        for leaf, rows in flatten(part, f"{name}/{key}" if name else key).items()
+        for leaf, rows in flatten(part, f"{name}/{key}" if name else key, read).items()
     }
 
 

@@ -12,9 +12,10 @@ from sim.engine.missed_contact import MissedContacts
 from sim.engine.pack import Pack
 from sim.loop.actuators import JointActuators, model_force
 from sim.loop.arrays import Arrays, Command
-from sim.loop.custom import make_control
+from sim.loop.compiled_tick import CompiledTick, compiled_tick
 from sim.loop.faults import FaultContainment, finite
 from sim.loop.friction import JointFriction
+from sim.loop.jitted import make_control
 from sim.loop.snapshot import EnvStates
 from sim.options import RunnerOptions
 
@@ -46,14 +47,27 @@ class EnvGroup:
         self._actuators: JointActuators | None = None
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
+        self._compiled = self._make_compiled()
+
+    def _make_compiled(self) -> CompiledTick | None:
+        """Return the sim steps of a tick as one program, where the options ask for it and it can be."""
+        compensated = self._gravity, self._coriolis, self._compensates
+        return compiled_tick(self._options, self.pack, self._control, self._friction, self._actuators, compensated)
+
+    def _release(self) -> None:
+        """Let the state of control, friction and robots be changed from here."""
+        if self._compiled is not None:
+            self._compiled.release()
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
+        self._release()
         self._control.set_params(params)
         self._friction.drive = self._control.drive
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
+        self._release()
         ours = self._actuators
         if actuators is None:
             self._actuators, self._control.limits = None, (None, None)
@@ -64,12 +78,14 @@ class EnvGroup:
         if actuators is not None or ours is not None:
             self.pack.write_joints(actuators)
             self._friction.update()
+            self._compiled = self._make_compiled()
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
 
         An env whose ``qpos`` or ``qvel`` (M, dof) is not finite starts where it did last, and has failed.
         """
+        self._release()
         containment = self._containment
         containment.clear(mask)
         bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
@@ -113,6 +129,7 @@ class EnvGroup:
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
         pack = self.pack
+        self._release()
         return EnvStates(
             qpos=pack.read_qpos(np.float32),
             qvel=pack.read_qvel(np.float32),
@@ -147,11 +164,15 @@ class EnvGroup:
         self._qpos = pack.read_qpos()
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))
+        self._compiled = self._make_compiled()
 
     # -- the closed loop ---------------------------------------------------------------------------------------
 
     def _run_substeps(self, substeps: int, command: Command) -> None:
         """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
+        if self._compiled is not None:
+            self._run_compiled(self._compiled, substeps, command)
+            return
         pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
         actuators = self._actuators
@@ -178,14 +199,28 @@ class EnvGroup:
             if effort is not None:
                 pack.write_qf(effort)
             pack.step(step % COUPLING_STEPS == 0)
-            if reads_qpos:
+            if reads_qpos or step + 1 == substeps:
                 qpos = pack.read_qpos()
                 if self._sound(qpos):
                     self._qpos = qpos
                 else:
                     self._contain(qpos, step + 1)
-        if not reads_qpos:
-            self._qpos = pack.read_qpos()
+
+    def _run_compiled(self, compiled: CompiledTick, substeps: int, command: Command) -> None:
+        """Run the sim steps of a tick by the program, and do here what it stops for."""
+        done = 0
+        while done < substeps:
+            done, status = compiled.run(command, done, substeps)
+            self._motor[...] = compiled.read("motor")
+            self._control.saturated = compiled.read("saturated", bool)
+            if not status:
+                continue
+            self.pack.look(compiled.left())
+            qpos = self.pack.read_qpos()
+            if not self._sound(qpos):
+                self._qpos = compiled.read("qpos_before")
+                self._contain(qpos, done)
+        self._qpos = self.pack.read_qpos()
 
     def _actuated(
         self, actuators: JointActuators, command: Command, step: int, qvel: NDArray[Any]
@@ -260,6 +295,7 @@ class EnvGroup:
             self._place(failed, containment.start_qpos, containment.start_qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
+        self._release()
         rows = np.flatnonzero(mask)
         self.pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
         self.pack.suspend(self._containment.suspended)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid import friction
-from batchpid.elementwise import TURN, wrap
+from batchpid.elementwise import TURN, namespace, wrap
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
@@ -22,6 +22,22 @@ REFRESH_STEPS = 64
 """Sim steps of an env for which the inertia that its joints show is kept."""
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, in which the compensation is less than the friction."""
+
+
+class KnownFriction(NamedTuple):
+    """Friction that the compensation cancels, arrays (dof,)."""
+
+    friction: Any
+    """[N m or N]"""
+    band: Any
+    """Half width in which the compensation is less [rad or m]."""
+    turns: Any
+    """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
+
+    def feedforward(self, command: Command, qpos: Any) -> Any:
+        """Return the efforts that cancel it on the way to the setpoint of ``command`` (M, dof), for NumPy and JAX."""
+        error = wrap(command.setpoint - qpos, self.turns, namespace(qpos))
+        return friction.compensation(self.friction, error, command.setpoint_rate, self.band)
 
 
 class JointFriction:
@@ -75,10 +91,19 @@ class JointFriction:
         self._state = fresh if self._state.effort is None else friction.reset(self._state, fresh, mask)
         self._age[mask] = 0
 
+    @property
+    def model(self) -> friction.Friction:
+        """Friction and damping that act."""
+        return self._model
+
+    @property
+    def known(self) -> KnownFriction:
+        """Friction that the compensation cancels."""
+        return KnownFriction(self._known, self._band, self._turns)
+
     def feedforward(self, command: Command, qpos: Float64) -> Float64:
         """Return the efforts that cancel the known friction on the way to the setpoint of ``command`` (M, dof)."""
-        error = wrap(command.setpoint - qpos, self._turns, np)
-        return friction.compensation(self._known, error, command.setpoint_rate, self._band)
+        return self.known.feedforward(command, qpos)
 
     def effort(self, motor: Float64, qvel: Float64) -> Float64:
         """Return the efforts to apply in the next sim step (M, dof)."""

@@ -35,7 +35,8 @@ from sim.workers.serve import DONE
 from sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
-"""Environment of a process whose BLAS uses one thread."""
+ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
+"""Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the caller's thread."""
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
 _PR_SET_PDEATHSIG = 1  # of prctl(2): the signal that a process gets when its parent ends, even when it is stopped

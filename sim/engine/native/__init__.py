@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from sim.engine.calls import EngineCalls, PythonCalls
 
-_gateway: Any
+extension: Any
 try:
-    _gateway = importlib.import_module("sim.engine.native._gateway")
+    extension = importlib.import_module("sim.engine.native._gateway")
 except ImportError:
-    _gateway = None
+    extension = None
 
 SWITCH = "BATCHPID_NATIVE"
 """Environment variable: "0" switches the native calls off."""
@@ -44,6 +44,7 @@ _SYMBOLS = (  # in the order of the gateway's Functions
     "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
     "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
 )
+_CALLBACK = "_ZTVN6sapien5physx20DefaultEventCallbackE"
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 SELF_TEST = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.engine.native import self_test; self_test.main()"
@@ -99,49 +100,66 @@ class NativeCalls:
         self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
     ) -> None:
         self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
-        pointers = [
-            [_pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))
-        ]
-        self._gateway = _gateway.gateway(_functions(), *pointers, qf.shape[1])
-        self._qf, self._skip = qf, skip
+        pointers = [[pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))]
+        self.gateway = extension.gateway(_functions(), *pointers, qf.shape[1])
+        self.systems, self.qf, self.skip = self._objects[1], qf, skip
 
     def qpos(self, dtype: Any) -> NDArray[Any]:
         """Return the joint positions, a new array."""
-        rows = np.empty(self._qf.shape, dtype)
-        _gateway.read_qpos(self._gateway, rows)
+        rows = np.empty(self.qf.shape, dtype)
+        extension.read_qpos(self.gateway, rows)
         return rows
 
     def qvel(self, dtype: Any) -> NDArray[Any]:
         """Return the joint velocities, a new array."""
-        rows = np.empty(self._qf.shape, dtype)
-        _gateway.read_qvel(self._gateway, rows)
+        rows = np.empty(self.qf.shape, dtype)
+        extension.read_qvel(self.gateway, rows)
         return rows
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
-        rows = np.empty(self._qf.shape, dtype)
-        _gateway.passive_force(self._gateway, rows, gravity, coriolis)
+        rows = np.empty(self.qf.shape, dtype)
+        extension.passive_force(self.gateway, rows, gravity, coriolis)
         return rows
 
     def write_qf(self) -> None:
         """Apply the efforts in ``qf``."""
-        _gateway.write_qf(self._gateway, self._qf, self._skip)
+        extension.write_qf(self.gateway, self.qf, self.skip)
 
     def step(self) -> None:
         """Do one sim step of every system."""
-        _gateway.step(self._gateway)
+        extension.step(self.gateway)
 
 
-def _pointer(wrapper: Any, kind: str) -> int:
-    """Return the address of the C++ object in ``wrapper``, by pybind11's conduit, which checks its type and ABI."""
-    capsule = wrapper._pybind11_conduit_v1_(_ABI, _gateway.type_info(kind), b"raw_pointer_ephemeral")
+def pointer(wrapper: Any, kind: str) -> int:
+    """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "body".
+
+    It comes by pybind11's conduit, which checks type and ABI.
+    """
+    capsule = wrapper._pybind11_conduit_v1_(_ABI, extension.type_info(kind), b"raw_pointer_ephemeral")
     if capsule is None:
         raise RuntimeError(f"SAPIEN's {kind} is not of the type that the extension was made for")
     api = ctypes.pythonapi
-    name, pointer = api.PyCapsule_GetName, api.PyCapsule_GetPointer
+    name, get = api.PyCapsule_GetName, api.PyCapsule_GetPointer
     name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
-    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    return pointer(capsule, name(capsule))
+    get.restype, get.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    return get(capsule, name(capsule))
+
+
+def gateway_address(gateway: Any) -> int:
+    """Return the address of what a gateway's capsule holds."""
+    return extension.address(gateway)
+
+
+def gateway_sim_step(address: int, *arrays: NDArray[np.float64]) -> int:
+    """Do a sim step of the group at ``address``: see :class:`sim.engine.sim_step.NativeStep`."""
+    return extension.sim_step(address, *arrays)
+
+
+def contact_maps(gateway: Any) -> list[int]:
+    """Return the address of the map of contacts of each system of a gateway; 0 if it is not found."""
+    vtable = ctypes.addressof(ctypes.c_char.in_dll(ctypes.CDLL(str(_sapien_library())), _CALLBACK))
+    return extension.contacts(gateway, vtable)
 
 
 @cache
@@ -167,7 +185,7 @@ def _sapien_library() -> Path:
 def _fingerprint() -> str:
     """Return a hash of the two libraries."""
     digest = hashlib.blake2b(digest_size=16)
-    for path in (_sapien_library(), Path(_gateway.__file__)):
+    for path in (_sapien_library(), Path(extension.__file__)):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -183,7 +201,7 @@ def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
     ``program`` runs in a child process, with sys.path as JSON in its first argument; it passes by exit status 0. If it
     does not, a RuntimeWarning says so.
     """
-    if _gateway is None:
+    if extension is None:
         return NativeStatus(False, "the extension was not built: it needs a C++ compiler when batchpid is installed")
     try:
         fingerprint = _fingerprint()

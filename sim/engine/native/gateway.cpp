@@ -3,127 +3,24 @@
 // It calls functions that SAPIEN's shared library exports. Their addresses and the objects' pointers come from Python
 // (sim/engine/native/__init__.py), so that nothing of SAPIEN, PhysX or Eigen is needed to compile this file.
 
-#define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
-#define Py_LIMITED_API 0x030B0000
-#endif
-#include <Python.h>
+#include "gateway.h"
 
-#include <cstddef>
-#include <cstdint>
-#include <cstdlib>
-#include <cstring>
-#include <exception>
-#include <typeinfo>
-#include <vector>
+#include "sim_step.h"
+#include "xla_call.h"
 
-namespace sapien::physx {
-class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
-class PhysxSystemCpu {};
-}  // namespace sapien::physx
+using namespace batchpid;
 
 namespace {
 
-using Articulation = sapien::physx::PhysxArticulation;
-using System = sapien::physx::PhysxSystemCpu;
-
-// Layout of Eigen::VectorXf. Its destructor makes the compiler return it as it returns Eigen's.
-struct VectorXf {
-  float *data;
-  std::ptrdiff_t size;
-  ~VectorXf() { std::free(data); }
-};
-
-// Exported functions, in the order in which Python passes their addresses.
-struct Functions {
-  VectorXf (*get_qpos)(Articulation *);
-  VectorXf (*get_qvel)(Articulation *);
-  VectorXf (*compute_passive_force)(Articulation *, bool gravity, bool coriolis);
-  void (*set_qf)(Articulation *, VectorXf const &);
-  void (*step)(System *);
-};
-
-struct Gateway {
-  Functions functions;
-  std::vector<Articulation *> robots;
-  std::vector<System *> systems;
-  std::ptrdiff_t dof;
-};
-
-constexpr char GATEWAY[] = "batchpid.gateway";
-
-// Contiguous buffer of a Python object, released at the end of the scope.
-class Buffer {
- public:
-  bool open(PyObject *object, Py_ssize_t count, Py_ssize_t size, int flags) {
-    if (PyObject_GetBuffer(object, &view_, flags) != 0) return false;
-    held_ = true;
-    if ((size == 0 || view_.itemsize == size) && view_.len == count * view_.itemsize) return true;
-    PyErr_SetString(PyExc_ValueError, "an array of the gateway has a wrong size or type");
-    return false;
-  }
-  ~Buffer() {
-    if (held_) PyBuffer_Release(&view_);
-  }
-  template <class T>
-  T *as() const {
-    return static_cast<T *>(view_.buf);
-  }
-  Py_ssize_t itemsize() const { return view_.itemsize; }
-
- private:
-  Py_buffer view_{};
-  bool held_ = false;
-};
-
-Gateway *gateway_of(PyObject *capsule) {
-  return static_cast<Gateway *>(PyCapsule_GetPointer(capsule, GATEWAY));
-}
-
-// Run `work` without the GIL; a C++ exception becomes a RuntimeError.
-template <class Work>
-PyObject *without_gil(Work work) {
-  char message[512] = "";
-  Py_BEGIN_ALLOW_THREADS
-  try {
-    work();
-  } catch (std::exception const &error) {
-    std::strncpy(message, error.what(), sizeof(message) - 1);
-    if (message[0] == 0) std::strcpy(message, "SAPIEN raised an exception");
-  } catch (...) {
-    std::strcpy(message, "SAPIEN raised an exception");
-  }
-  Py_END_ALLOW_THREADS
-  if (message[0] == 0) Py_RETURN_NONE;
-  PyErr_SetString(PyExc_RuntimeError, message);
-  return nullptr;
-}
-
-template <class T>
-bool pointers(PyObject *sequence, std::vector<T *> &out) {
-  Py_ssize_t const count = PySequence_Size(sequence);
-  if (count < 0) return false;
-  for (Py_ssize_t i = 0; i < count; ++i) {
-    PyObject *item = PySequence_GetItem(sequence, i);
-    if (item == nullptr) return false;
-    void *pointer = PyLong_AsVoidPtr(item);
-    Py_DECREF(item);
-    if (pointer == nullptr) {
-      if (!PyErr_Occurred()) PyErr_SetString(PyExc_ValueError, "a null pointer");
-      return false;
-    }
-    out.push_back(static_cast<T *>(pointer));
-  }
-  return true;
-}
-
-// type_info("robot" | "system"): capsule with the C++ type, as pybind11's conduit expects it.
+// type_info("robot" | "system" | "body"): capsule with the C++ type, as pybind11's conduit expects it.
 PyObject *type_info(PyObject *, PyObject *argument) {
   Py_ssize_t size = 0;
   char const *kind = PyUnicode_AsUTF8AndSize(argument, &size);
   if (kind == nullptr) return nullptr;
-  auto const &info = std::strcmp(kind, "robot") == 0 ? typeid(Articulation) : typeid(System);
-  return PyCapsule_New(const_cast<std::type_info *>(&info), typeid(std::type_info).name(), nullptr);
+  auto const *info = std::strcmp(kind, "robot") == 0    ? &typeid(Articulation)
+                     : std::strcmp(kind, "system") == 0 ? &typeid(System)
+                                                        : &typeid(Body);
+  return PyCapsule_New(const_cast<std::type_info *>(info), typeid(std::type_info).name(), nullptr);
 }
 
 // gateway(functions, robots, systems, dof): addresses and pointers as integers; the caller keeps the objects alive.
@@ -146,6 +43,12 @@ PyObject *make_gateway(PyObject *, PyObject *arguments) {
   }
   std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
   return PyCapsule_New(gateway, GATEWAY, [](PyObject *capsule) { delete gateway_of(capsule); });
+}
+
+// address(gateway): of the Gateway, which lives as long as the capsule.
+PyObject *address(PyObject *, PyObject *capsule) {
+  Gateway *gateway = gateway_of(capsule);
+  return gateway == nullptr ? nullptr : PyLong_FromVoidPtr(gateway);
 }
 
 // Copy one vector of each robot into the rows of an array of float or double.
@@ -200,14 +103,7 @@ PyObject *write_qf(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return without_gil([&] {
     for (Py_ssize_t row = 0; row < count; ++row) {
       if (skip.as<char>()[row]) continue;
-      VectorXf const *view;
-      struct {
-        float *data;
-        std::ptrdiff_t size;
-      } borrowed{qf.as<float>() + row * gateway->dof, gateway->dof};
-      static_assert(sizeof(borrowed) == sizeof(VectorXf));
-      view = reinterpret_cast<VectorXf const *>(&borrowed);
-      gateway->functions.set_qf(gateway->robots[row], *view);
+      apply(gateway->functions, gateway->robots[row], qf.as<float>() + row * gateway->dof, gateway->dof);
     }
   });
 }
@@ -220,6 +116,60 @@ PyObject *step(PyObject *, PyObject *capsule) {
   });
 }
 
+// contacts(gateway, vtable): addresses of the maps of contacts that the systems list; 0 where one is not found.
+//
+// A system holds the callback that collects its contacts; it is found by its vtable, and the map follows that.
+PyObject *contacts(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Gateway *gateway = gateway_of(arguments[0]);
+  if (gateway == nullptr) return nullptr;
+  auto const vtable = reinterpret_cast<std::uintptr_t>(PyLong_AsVoidPtr(arguments[1])) + 2 * sizeof(void *);
+  constexpr std::size_t MOST_WORDS = 64;
+  PyObject *list = PyList_New(0);
+  for (System *system : gateway->systems) {
+    auto *words = reinterpret_cast<std::uintptr_t *>(system);
+    std::size_t at = 0;
+    while (at < MOST_WORDS && words[at] != vtable) ++at;
+    PyObject *address = PyLong_FromVoidPtr(at < MOST_WORDS ? words + at + 1 : nullptr);
+    PyList_Append(list, address);
+    Py_DECREF(address);
+  }
+  return list;
+}
+
+// sim_step(address of a Group, effort, qpos, qvel, passive) -> Status, on arrays (rows, dof) of double.
+PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[0]));
+  if (group == nullptr) return nullptr;
+  auto const dof = group->gateway->dof;
+  auto const rows = static_cast<Py_ssize_t>(group->gateway->robots.size());
+  Buffer arrays[4];
+  for (int i = 0; i < 4; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i == 0 ? 0 : PyBUF_WRITABLE);
+    if (!arrays[i].open(arguments[i + 1], rows * dof, sizeof(double), flags)) return nullptr;
+  }
+  std::int32_t status = 0;
+  PyObject *done = without_gil([&] {
+    status = sim_step(*group, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
+                      arrays[3].as<double>());
+  });
+  if (done == nullptr) return nullptr;
+  Py_DECREF(done);
+  return PyLong_FromLong(status);
+}
+
+// xla_functions(): their addresses, by name.
+PyObject *xla_functions(PyObject *, PyObject *) {
+  PyObject *functions = PyDict_New();
+  auto const add = [&](char const *name, auto *function) {
+    PyObject *address = PyLong_FromVoidPtr(reinterpret_cast<void *>(function));
+    PyDict_SetItemString(functions, name, address);
+    Py_DECREF(address);
+  };
+  add("batchpid_sim_step", xla::batchpid_sim_step);
+  add("batchpid_mass_matrix", xla::batchpid_mass_matrix);
+  return functions;
+}
+
 template <class Function>
 PyCFunction method(Function function) {
   return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
@@ -228,11 +178,15 @@ PyCFunction method(Function function) {
 PyMethodDef METHODS[] = {
     {"type_info", type_info, METH_O, nullptr},
     {"gateway", make_gateway, METH_VARARGS, nullptr},
+    {"address", address, METH_O, nullptr},
     {"read_qpos", method(read_qpos), METH_FASTCALL, nullptr},
     {"read_qvel", method(read_qvel), METH_FASTCALL, nullptr},
     {"passive_force", method(passive_force), METH_FASTCALL, nullptr},
     {"write_qf", method(write_qf), METH_FASTCALL, nullptr},
     {"step", step, METH_O, nullptr},
+    {"contacts", method(contacts), METH_FASTCALL, nullptr},
+    {"sim_step", method(step_group), METH_FASTCALL, nullptr},
+    {"xla_functions", xla_functions, METH_NOARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -1,0 +1,134 @@
+// Gateway to the robots of a pack, and what its calls share; see gateway.cpp.
+
+#pragma once
+
+#define PY_SSIZE_T_CLEAN
+#ifndef Py_LIMITED_API
+#define Py_LIMITED_API 0x030B0000
+#endif
+#include <Python.h>
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <exception>
+#include <typeinfo>
+#include <vector>
+
+namespace sapien::physx {
+class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
+class PhysxSystemCpu {};
+class PhysxRigidBaseComponent {};
+}  // namespace sapien::physx
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+using Articulation = sapien::physx::PhysxArticulation;
+using System = sapien::physx::PhysxSystemCpu;
+using Body = sapien::physx::PhysxRigidBaseComponent;
+
+// Layout of Eigen::VectorXf. Its destructor makes the compiler return it as it returns Eigen's.
+struct VectorXf {
+  float *data;
+  std::ptrdiff_t size;
+  ~VectorXf() { std::free(data); }
+};
+
+// Exported functions, in the order in which Python passes their addresses.
+struct Functions {
+  VectorXf (*get_qpos)(Articulation *);
+  VectorXf (*get_qvel)(Articulation *);
+  VectorXf (*compute_passive_force)(Articulation *, bool gravity, bool coriolis);
+  void (*set_qf)(Articulation *, VectorXf const &);
+  void (*step)(System *);
+};
+
+struct Gateway {
+  Functions functions;
+  std::vector<Articulation *> robots;
+  std::vector<System *> systems;
+  std::ptrdiff_t dof;
+};
+
+// Apply the efforts of one robot (dof,), which stay the caller's.
+inline void apply(Functions const &call, Articulation *robot, float *qf, std::ptrdiff_t dof) {
+  union Borrowed {
+    VectorXf vector;
+    ~Borrowed() {}
+  } borrowed{{qf, dof}};
+  call.set_qf(robot, borrowed.vector);
+}
+
+inline constexpr char GATEWAY[] = "batchpid.gateway";
+
+// Contiguous buffer of a Python object, released at the end of the scope.
+class Buffer {
+ public:
+  bool open(PyObject *object, Py_ssize_t count, Py_ssize_t size, int flags) {
+    if (PyObject_GetBuffer(object, &view_, flags) != 0) return false;
+    held_ = true;
+    if ((size == 0 || view_.itemsize == size) && view_.len == count * view_.itemsize) return true;
+    PyErr_SetString(PyExc_ValueError, "an array of the gateway has a wrong size or type");
+    return false;
+  }
+  ~Buffer() {
+    if (held_) PyBuffer_Release(&view_);
+  }
+  template <class T>
+  T *as() const {
+    return static_cast<T *>(view_.buf);
+  }
+  Py_ssize_t itemsize() const { return view_.itemsize; }
+
+ private:
+  Py_buffer view_{};
+  bool held_ = false;
+};
+
+inline Gateway *gateway_of(PyObject *capsule) {
+  return static_cast<Gateway *>(PyCapsule_GetPointer(capsule, GATEWAY));
+}
+
+// Run `work` without the GIL; a C++ exception becomes a RuntimeError.
+template <class Work>
+PyObject *without_gil(Work work) {
+  char message[512] = "";
+  Py_BEGIN_ALLOW_THREADS
+  try {
+    work();
+  } catch (std::exception const &error) {
+    std::strncpy(message, error.what(), sizeof(message) - 1);
+    if (message[0] == 0) std::strcpy(message, "SAPIEN raised an exception");
+  } catch (...) {
+    std::strcpy(message, "SAPIEN raised an exception");
+  }
+  Py_END_ALLOW_THREADS
+  if (message[0] == 0) Py_RETURN_NONE;
+  PyErr_SetString(PyExc_RuntimeError, message);
+  return nullptr;
+}
+
+template <class T>
+bool pointers(PyObject *sequence, std::vector<T *> &out) {
+  Py_ssize_t const count = PySequence_Size(sequence);
+  if (count < 0) return false;
+  for (Py_ssize_t i = 0; i < count; ++i) {
+    PyObject *item = PySequence_GetItem(sequence, i);
+    if (item == nullptr) return false;
+    void *pointer = PyLong_AsVoidPtr(item);
+    Py_DECREF(item);
+    if (pointer == nullptr) {
+      if (!PyErr_Occurred()) PyErr_SetString(PyExc_ValueError, "a null pointer");
+      return false;
+    }
+    out.push_back(static_cast<T *>(pointer));
+  }
+  return true;
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop

@@ -1,0 +1,74 @@
+"""Functions of the extension in programs of JAX, on the CPU."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from sim.engine import native
+
+
+@cache
+def _registered() -> str:
+    """Make the functions known to JAX; return what is in the way, or nothing."""
+    import jax
+
+    if not hasattr(native.extension, "xla_functions"):
+        return "the extension is of an older version: install batchpid again"
+    for name, address in native.extension.xla_functions().items():
+        try:
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu")
+        except Exception as error:  # JAX promises no type
+            return f"JAX {jax.__version__} does not take the extension's functions: {error}"
+    return ""
+
+
+def status() -> native.NativeStatus:
+    """Return whether programs of JAX can call the extension, and the reason if not. Imports JAX."""
+    calls = native.status()
+    if not calls.active:
+        return calls
+    problem = _registered()
+    return native.NativeStatus(not problem, problem)
+
+
+def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
+    """Do a sim step of a :class:`sim.engine.sim_step.NativeStep` in a program of JAX.
+
+    Order is kept by the data and by the number of the step, which is another in each call.
+
+    Parameters
+    ----------
+    address
+        Of the group, as uint32 (2,).
+    step
+        int32 number.
+    effort
+        (rows, dof) [N m or N], of as many rows as robots, or more.
+
+    Returns
+    -------
+    qpos, qvel, passive force (rows, dof), and status
+        Further rows repeat the first.
+    """
+    import jax
+
+    like = jax.ShapeDtypeStruct(effort.shape, effort.dtype)
+    results = (like, like, like, jax.ShapeDtypeStruct((), np.int32))
+    qpos, qvel, passive, status = jax.ffi.ffi_call("batchpid_sim_step", results)(address, step, effort)
+    return qpos, qvel, passive, status
+
+
+def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
+    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
+
+    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are those of :class:`sim.engine.rigid_body.RigidBodies`.
+    """
+    import jax
+
+    result = jax.ShapeDtypeStruct((*qpos.shape, qpos.shape[-1]), qpos.dtype)
+    call = jax.ffi.ffi_call("batchpid_mass_matrix", result, vmap_method="sequential")
+    return call(tree, jax.numpy.asarray(bodies, qpos.dtype), qpos)

@@ -1,0 +1,172 @@
+// Functions that a program of XLA can call, by its foreign function interface, on the CPU: the sim step, and the mass
+// matrix.
+//
+// The types are those parts of XLA's C interface (xla/ffi/api/c_api.h, version 0.3, stable since 0.0) that are needed
+// here, so that neither jaxlib nor its headers are needed to compile this file.
+
+#pragma once
+
+#include "rigid_body.h"
+#include "sim_step.h"
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid::xla {
+
+enum DataType { S32 = 4, U32 = 8, F32 = 11, F64 = 12 };
+enum Stage { EXECUTE = 3 };
+
+struct Error;
+
+struct ErrorArguments {
+  std::size_t struct_size;
+  void *extension;
+  char const *message;
+  int code;
+};
+
+struct Version {
+  std::size_t struct_size;
+  void *extension;
+  int major, minor;
+};
+
+struct Api {
+  std::size_t struct_size;
+  void *extension;
+  Version version;
+  void const *internal;
+  Error *(*create_error)(ErrorArguments *);
+};
+
+struct Metadata {
+  std::size_t struct_size;
+  Version version;
+};
+
+struct Extension {
+  std::size_t struct_size;
+  int type;  // 1: Metadata
+  Extension *next;
+  Metadata *metadata;
+};
+
+struct Array {
+  std::size_t struct_size;
+  void *extension;
+  int dtype;
+  void *data;
+  std::int64_t rank;
+  std::int64_t *dims;
+};
+
+struct Arrays {
+  std::size_t struct_size;
+  void *extension;
+  std::int64_t size;
+  int *types;
+  Array **arrays;
+};
+
+struct CallFrame {
+  std::size_t struct_size;
+  Extension *extension;
+  Api const *api;
+  void *context;
+  int stage;
+  Arrays arguments, results;
+};
+
+inline Error *invalid(Api const *api, char const *message) {
+  ErrorArguments arguments{sizeof(ErrorArguments), nullptr, message, 3};
+  return api->create_error(&arguments);
+}
+
+// Answer XLA's question for the version, and stages before the execution; return whether the call is one of these.
+inline bool is_answered(CallFrame *frame) {
+  if (frame->extension != nullptr && frame->extension->type == 1) {
+    frame->extension->metadata->version.major = 0;
+    frame->extension->metadata->version.minor = 3;
+    return true;
+  }
+  return frame->stage != EXECUTE;
+}
+
+template <class T>
+T *data(Array const *array) {
+  return static_cast<T *>(array->data);
+}
+
+template <class T>
+std::int32_t call(Group &group, Array **in, Array **out) {
+  return try_sim_step(group, in[2]->dims[0], data<T const>(in[2]), data<T>(out[0]), data<T>(out[1]), data<T>(out[2]));
+}
+
+// (address of the Group as u32[2], number of the step, effort) -> qpos, qvel, passive force, Status. The number of the
+// step is not used: no two calls have the same arguments, so that none can be merged or moved out of a loop.
+extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
+  if (is_answered(frame)) return nullptr;
+  if (frame->arguments.size != 3 || frame->results.size != 4) return invalid(frame->api, "wrong number of arrays");
+  Array **in = frame->arguments.arrays, **out = frame->results.arrays;
+  Group *group;
+  static_assert(sizeof(group) == 2 * sizeof(std::uint32_t));
+  if (in[0]->dtype != U32 || in[0]->rank != 1 || in[0]->dims[0] != 2) return invalid(frame->api, "no address");
+  std::memcpy(&group, in[0]->data, sizeof(group));
+  auto const robots = static_cast<std::int64_t>(group->gateway->robots.size());
+  for (Array const *array : {in[2], out[0], out[1], out[2]}) {
+    if (array->dtype != in[2]->dtype || array->rank != 2 || array->dims[0] != in[2]->dims[0] ||
+        array->dims[1] != group->gateway->dof || array->dims[0] < robots || robots == 0) {
+      return invalid(frame->api, "an array has a wrong shape or type");
+    }
+  }
+  if (out[3]->dtype != S32) return invalid(frame->api, "the status is no int32");
+  std::int32_t *status = data<std::int32_t>(out[3]);
+  if (in[2]->dtype == F64) {
+    *status = call<double>(*group, in, out);
+  } else if (in[2]->dtype == F32) {
+    *status = call<float>(*group, in, out);
+  } else {
+    return invalid(frame->api, "the arrays are neither float32 nor float64");
+  }
+  return nullptr;
+}
+
+template <class T>
+void mass_matrices(std::int64_t count, std::int64_t dof, Array **in, Array *out) {
+  static_assert(sizeof(BodyRow<T>) == 25 * sizeof(T));
+  std::vector<BodyState> bodies;
+  auto const *rows = reinterpret_cast<BodyRow<T> const *>(in[1]->data);
+  for (std::int64_t n = 0; n < count; ++n) {
+    mass_matrix(dof, data<std::int32_t const>(in[0]), rows, data<T const>(in[2]) + n * dof,
+                data<T>(out) + n * dof * dof, bodies);
+  }
+}
+
+// (tree (dof, 2) s32, bodies (dof, 25), qpos (..., dof)) -> mass matrices (..., dof, dof)
+extern "C" inline Error *batchpid_mass_matrix(CallFrame *frame) {
+  if (is_answered(frame)) return nullptr;
+  Array **in = frame->arguments.arrays, *out = *frame->results.arrays;
+  if (frame->arguments.size != 3 || frame->results.size != 1 || in[2]->rank < 1) {
+    return invalid(frame->api, "wrong number of arrays");
+  }
+  std::int64_t const dof = in[2]->dims[in[2]->rank - 1];
+  std::int64_t count = 1;
+  for (std::int64_t axis = 0; axis + 1 < in[2]->rank; ++axis) count *= in[2]->dims[axis];
+  bool const fits = in[0]->dtype == S32 && in[0]->rank == 2 && in[0]->dims[0] == dof && in[0]->dims[1] == 2 &&
+                    in[1]->rank == 2 && in[1]->dims[0] == dof && in[1]->dims[1] == 25 && out->rank == in[2]->rank + 1;
+  if (!fits || in[1]->dtype != in[2]->dtype || out->dtype != in[2]->dtype) {
+    return invalid(frame->api, "an array has a wrong shape or type");
+  }
+  if (out->dtype == F64) {
+    mass_matrices<double>(count, dof, in, out);
+  } else if (out->dtype == F32) {
+    mass_matrices<float>(count, dof, in, out);
+  } else {
+    return invalid(frame->api, "the arrays are neither float32 nor float64");
+  }
+  return nullptr;
+}
+
+}  // namespace batchpid::xla
+
+#pragma GCC visibility pop

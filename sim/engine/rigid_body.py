@@ -1,0 +1,84 @@
+r"""Mass matrix of a tree of rigid bodies in programs of JAX, by the extension.
+
+The composite-rigid-body algorithm (R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.2), with
+all quantities in the axes of the base and about its origin. With the axis a_j and the place p_j of joint j, its motion
+is s_j = (w, v) = (a_j, p_j x a_j), or (0, a_j) if it slides. All that it moves has the mass m, the first moment h and
+the inertia tensor I, so that the momenta under s_j, and the mass matrix, are::
+
+    linear   l_j = m v + w x h        angular   k_j = I w + h x v
+    M_ij = M_ji = s_i . (k_j, l_j)    for a joint i that moves joint j, or is joint j; else 0
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine.native import xla
+from sim.robot.rotations import from_rpy, rotate
+from sim.robot.spatial_inertia import SpatialInertia, total
+
+Float64 = NDArray[np.float64]
+
+
+class RigidBodies(NamedTuple):
+    """Bodies of a robot on a fixed base, one for each joint, parents first; links that cannot move apart are one body.
+
+    A body's frame is that of its joint, which turns about x or slides along it.
+    """
+
+    tree: NDArray[np.int32]
+    """(dof, 2): number of the joint above, -1 for none; 1 for a joint that slides."""
+    rotation: Float64
+    """Orientation of the joint at position 0 in the frame of its parent (dof, 3, 3)."""
+    position: Float64
+    """Position there (dof, 3) [m]."""
+    mass: Float64
+    """(dof,) [kg]."""
+    center: Float64
+    """Center of mass in the body's frame (dof, 3) [m]."""
+    tensor: Float64
+    """Inertia tensor about it, in the body's axes (dof, 3, 3) [kg m^2]."""
+
+    def table(self) -> Float64:
+        """Return all but the tree, a row for each body (dof, 25)."""
+        return np.hstack([leaf.reshape(len(self.tree), -1) for leaf in self[1:]])
+
+
+def bodies_of(robot: Any) -> RigidBodies:
+    """Return the bodies of one of SAPIEN's articulations."""
+    dofs = {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
+    places: dict[Any, tuple[int, Float64]] = {}  # of each link: its body, and its pose in the body's frame
+    parts: list[list[SpatialInertia]] = [[] for _ in dofs]
+    tree, at_zero = np.tile(np.array([-1, 0], np.int32), (len(dofs), 1)), np.tile(np.eye(4), (len(dofs), 1, 1))
+    for link in robot.links:
+        if link.parent is None:
+            places[link] = -1, np.eye(4)
+            continue
+        joint, (body, place) = link.joint, places[link.parent]
+        place = place @ _matrix(joint.pose_in_parent)
+        if (dof := dofs.get(joint.name)) is not None:
+            tree[dof], at_zero[dof] = (body, joint.type == "prismatic"), place
+            body, place = dof, np.eye(4)
+        place = place @ _matrix(joint.pose_in_child.inv())
+        places[link] = body, place
+        if body >= 0:
+            at, principal = place @ _matrix(link.cmass_local_pose), np.diag([float(str(one)) for one in link.inertia])
+            parts[body].append(SpatialInertia(link.mass, at[:3, 3], at[:3, :3] @ principal @ at[:3, :3].T))
+    bodies = [total(of_body) for of_body in parts]
+    return RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, zip(*bodies, strict=True)))
+
+
+def mass_matrix(bodies: RigidBodies, qpos: Any) -> Any:
+    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), a JAX array on the CPU."""
+    return xla.mass_matrix(bodies.tree, bodies.table(), qpos)
+
+
+def _matrix(pose: Any) -> Float64:
+    """Return one of SAPIEN's poses (4, 4), homogeneous: from roll, pitch and yaw, as SAPIEN gives it to Pinocchio."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotate(np.broadcast_to(from_rpy(np.asarray(pose.rpy, float)), (3, 4)), np.eye(3)).T
+    matrix[:3, 3] = pose.p
+    return matrix

@@ -1,0 +1,105 @@
+"""Sim step of a group of robots as one native call, which a program of XLA can make as well."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine import native
+from sim.engine.pack import Pack
+
+LEFT_REGION, CONTACTS, NOT_FINITE, TOO_FAST, FAILED = (1 << bit for bit in range(5))
+"""Bits of the status of a sim step: reasons for which a loop over sim steps has to stop, as in sim_step.h."""
+
+
+class _Group(ctypes.Structure):
+    """The type of this name in sim_step.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "system_of", "contacts", "watched")),
+        *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
+        *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
+        ("pairs", ctypes.c_int64),
+        ("bodies_size", ctypes.c_int64),
+        ("gravity", ctypes.c_int32),
+        ("coriolis", ctypes.c_int32),
+        ("message", ctypes.c_char * 256),
+    ]
+
+
+class NativeStep:
+    """Sim step of the robots of ``pack``: apply efforts, step, read, and judge whether Python has to look.
+
+    It holds for the present :attr:`sim.engine.pack.Pack.calls`, which have to be native.
+
+    Parameters
+    ----------
+    pack
+        Its watch is judged and updated in place.
+    gravity, coriolis
+        Parts of the passive force that is read; without both it is zero.
+    speed_limit
+        Joint speed beyond which the status says so (dof,), or None.
+    """
+
+    def __init__(self, pack: Pack, gravity: bool, coriolis: bool, speed_limit: NDArray[np.float64] | None) -> None:
+        calls, watch = pack.calls, pack.watch
+        assert isinstance(calls, native.NativeCalls)
+        numbers = {system: number for number, system in enumerate(calls.systems)}
+        system_of = [numbers[system] for system in pack.systems]
+        self._watch, self._looked_at = watch, list[Any]()
+        contacts = native.contact_maps(calls.gateway)
+        if not all(contacts):
+            raise RuntimeError("the contacts of SAPIEN's systems are not where they are looked for")
+        regions, count = watch.regions, len(system_of)
+        pairs = regions.arms.shape[1]
+        bodies = sorted((native.pointer(link, "body"), row) for link, (row, _) in watch.links.items())
+        self._outside, self._watched = np.zeros(count, np.uint8), np.zeros(len(contacts), np.uint8)
+        limit = None if speed_limit is None else np.broadcast_to(speed_limit, calls.qf.shape[1:]).astype(np.float64)
+        arrays = {
+            "qf": calls.qf,
+            "skip": calls.skip,
+            "system_of": np.array(system_of, np.int64),
+            "contacts": np.array(contacts, np.uint64),
+            "watched": self._watched,
+            "bodies": np.array([body for body, _ in bodies], np.uint64),
+            "robot_of": np.array([row for _, row in bodies], np.int64),
+            "known": regions.known,
+            "places": regions.places,
+            "arms": np.ascontiguousarray(regions.arms),
+            "sizes": regions.sizes,
+            "used": np.zeros(pairs),
+            "outside": self._outside,
+        } | ({} if limit is None else {"speed_limit": limit})
+        self._group = _Group(
+            gateway=native.gateway_address(calls.gateway),
+            pairs=pairs,
+            bodies_size=len(bodies),
+            gravity=gravity,
+            coriolis=coriolis,
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        self._kept = calls, arrays
+
+    def prepare(self) -> int:
+        """Return the address of the group, for a call of the extension or of XLA, after what changed in its watch."""
+        if self._looked_at is not self._watch.systems:
+            self._looked_at = self._watch.systems
+            self._watched[...] = [system in self._looked_at for system in self._kept[0].systems]
+        return ctypes.addressof(self._group)
+
+    def left(self) -> list[int]:
+        """Return the robots that left their regions in the last sim step."""
+        return np.flatnonzero(self._outside).tolist()
+
+    def __call__(self, *arrays: NDArray[np.float64]) -> int:
+        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
+        return native.gateway_sim_step(self.prepare(), *arrays)
+
+    @property
+    def message(self) -> str:
+        """Message of SAPIEN's exception, after the status FAILED."""
+        return self._group.message.decode(errors="replace")

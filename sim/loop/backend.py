@@ -1,0 +1,43 @@
+"""Way in which law and sim steps are run, by the options of a runner."""
+
+from __future__ import annotations
+
+import batchpid as bp
+from batchpid.errors import MissingDependencyError
+from sim.engine import native
+from sim.engine.native import xla
+from sim.options import RunnerOptions
+
+
+def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
+    """Return why the sim steps of a tick cannot be one program of XLA, under backend "jax"; or nothing."""
+    if options.robot.coupling is not None:
+        return "coupled joints take constraint efforts of NumPy"
+    if options.variation is not None or actuators is not None:
+        return "actuators and variations are in NumPy"
+    if not options.robot.fixed_base and options.robot.friction.any():
+        return "joints with friction on a floating base take an inertia of NumPy"
+    status = xla.status()
+    return "" if status.active else status.reason
+
+
+def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
+    """Return the library of the law, and the kind of the calls into the engine, with reasons."""
+    if options.backend == "numpy":
+        return f"law in NumPy, {native.status()}"
+    if options.control == "drive":
+        return f"law in PhysX (control 'drive'), {native.status()}"
+    reason = obstacle(options, actuators)
+    law = f"law in XLA ({options.dtype})"
+    if not reason:
+        return f"{law}, in one program with native sim steps"
+    calls = "native" if native.status().active else "Python"
+    return f"{law}, a call each sim step ({reason}), {calls} calls into SAPIEN"
+
+
+def check_jax() -> None:
+    """Raise MissingDependencyError without JAX."""
+    try:
+        import jax  # noqa: F401
+    except ImportError:
+        raise MissingDependencyError("jax", "backend='jax'", "jax") from None
