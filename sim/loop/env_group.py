@@ -192,7 +192,9 @@ class EnvGroup:
                 qvel = pack.read_qvel()
                 effort = self._actuated(actuators, command, step, qvel)
             if effort is not None:
-                self._motor[...] = effort = pack.delivered(effort)
+                effort = pack.delivered(effort)
+                if step + 1 == substeps:
+                    self._motor[...] = effort
             if friction.acts:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
                 effort = friction.effort(motor, qvel)
