@@ -66,7 +66,7 @@ class Loop:
         self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
         if options.actuators is not None:
             self.set_actuators(options.actuators.for_envs(envs))
-        self._first_rows = [self.ticks[0].at(group) for group in slices]  # made once: every single tick uses them
+        self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
     def _build(self, envs: slice) -> Pack:
         variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start
@@ -78,9 +78,9 @@ class Loop:
 
     def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
-        for group, rows in zip(self.groups, self._first_rows, strict=True):
+        for group, ticks in zip(self.groups, self._group_ticks, strict=True):
             group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
-            group.observe(rows)
+            group.observe(ticks[0])
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state is kept."""
@@ -95,9 +95,8 @@ class Loop:
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
         began = time.perf_counter()
-        for group, first_rows in zip(self.groups, self._first_rows, strict=True):
-            for done in range(ticks):
-                rows = self.ticks[done].at(group.envs) if done else first_rows
+        for group, group_ticks in zip(self.groups, self._group_ticks, strict=True):
+            for done, rows in enumerate(group_ticks.first(ticks)):
                 setpoint, rate, feedforward = rows.command
                 command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
                 group.run(self._steps + done * substeps, substeps, command)
@@ -117,8 +116,8 @@ class Loop:
         self.set_params(snapshot.params)
         self.set_actuators(snapshot.actuators)
         self._place(snapshot.states)
-        for group, rows in zip(self.groups, self._first_rows, strict=True):
-            group.observe(rows)
+        for group, ticks in zip(self.groups, self._group_ticks, strict=True):
+            group.observe(ticks[0])
 
     def _place(self, states: EnvStates) -> None:
         # The engine's contact caches, and the order in which it solves contacts, depend on its past; only those of a
