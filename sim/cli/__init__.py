@@ -26,6 +26,7 @@ from sim.cli.bench import BenchCommand
 from sim.cli.compare import CompareCommand
 from sim.cli.demo import DemoCommand
 from sim.cli.excite import ExciteCommand
+from sim.cli.identify import IdentifyCommand
 from sim.cli.inspect import InspectCommand
 from sim.cli.plot import PlotCommand
 from sim.cli.progress import close_bars
@@ -42,6 +43,7 @@ COMMANDS: dict[str, type[Any]] = {
     "tune": TuneCommand,
     "compare": CompareCommand,
     "excite": ExciteCommand,
+    "identify": IdentifyCommand,
     "inspect": InspectCommand,
     "survey": SurveyCommand,
     "plot": PlotCommand,

@@ -11,13 +11,23 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import SceneSpec, build_scene, new_system, parse, rigid_bodies, shape_owners
+from sim.engine.building import (
+    SceneSpec,
+    add_point_mass,
+    build_scene,
+    center_of_mass,
+    new_system,
+    parse,
+    rigid_bodies,
+    shape_owners,
+)
 from sim.engine.collision_groups import Pair
 from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
 from sim.engine.extents import link_extents, touching_pairs
 from sim.engine.physics import PHYSICS
 from sim.engine.rigid_body import RigidBodies, bodies_of, mass_matrix
 from sim.robot.description import RobotDescription
+from sim.robot.kinematics import Kinematics
 from sim.robot.mimics import coupling_of
 from sim.robot.parts import Joint
 
@@ -27,13 +37,17 @@ Float64 = NDArray[np.float64]
 class Dynamics:
     """Dynamics and contacts of one robot alone, at poses qpos (n, dof).
 
-    The dynamics are Pinocchio's, on the model that SAPIEN derives. Friction and damping are left out.
+    The dynamics are Pinocchio's, on the model that SAPIEN derives, with ``payload`` [kg] at the center of mass of
+    ``link`` if one is given. Friction and damping are left out.
     """
 
-    def __init__(self, spec: SceneSpec) -> None:
+    def __init__(self, spec: SceneSpec, payload: float = 0.0, link: str | None = None) -> None:
         self._spec = spec
         self._system = new_system(replace(spec, timestep=1e-6))
         self._scene, self._robot = build_scene(spec, self._system)
+        if link is not None:
+            body, center = center_of_mass(spec, link)
+            add_point_mass(next(each for each in self._robot.links if each.name == body), payload, center)
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
         self._coupling = coupling_of(spec.joints)
@@ -194,6 +208,15 @@ def _rowwise(compute: Any, *tables: NDArray[Any]) -> Float64:
 def scene_dynamics(spec: SceneSpec) -> Dynamics:
     """Return the dynamics of the robot of ``spec``, the same object for equal specs."""
     return Dynamics(spec)
+
+
+def loaded_dynamics(robot: RobotDescription, payload: float) -> Dynamics:
+    """Return the dynamics of ``robot`` on a fixed base with ``payload`` [kg] at the center of mass of its tool link."""
+    kinematics = Kinematics(robot)
+    spec = SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"], merge_fixed=robot.merge_fixed
+    )
+    return Dynamics(replace(spec, ground=False), payload, kinematics.links[kinematics.tool])
 
 
 def robot_dynamics(robot: RobotDescription, ground: bool | None = None) -> Dynamics:

@@ -14,14 +14,11 @@ is a log.
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +27,13 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.trajectories import Trajectory
 from batchpid.validate import choice, file_path
 from sim.observation import Rollout
-from sim.recording.files import HDF5, RecordingError, load_h5py, read_recording
+from sim.recording.files import HDF5, read_recording
 from sim.robot.robot import Robot
+from sim.tuning.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
 
 Float64 = NDArray[np.float64]
 CommandKind = Literal["setpoint", "effort"]
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
-QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a log."""
 BEYOND = {"rad": 0.3, "m": 0.05}
@@ -117,10 +114,10 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool) -> lis
     if not path.exists():
         raise FileNotFoundError(2, "there is no such file", str(path))
     if path.suffix.lower() in (".csv", ".txt"):
-        columns, lines = _read_csv(path)
+        columns, lines = read_csv(path)
         return [_build(robot, str(path), columns, lines, kind, hold)]
     if path.suffix.lower() in HDF5:
-        found = _read_columns(path)
+        found = read_hdf5_columns(path)
         if found is not None:
             return [_build(robot, str(path), found, None, kind, hold)]
     return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
@@ -157,66 +154,6 @@ def logs_of_rollout(
     return logs
 
 
-def _read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
-    """Return the columns of a CSV file by name, and the line of each row."""
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise _error(str(path), f"is no text: {error.reason} at byte {error.start}", "save it as UTF-8") from None
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    header: list[str] | None = None
-    delimiter = ","
-    for number, line in enumerate(io.StringIO(text, newline=None), 1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        if header is None:
-            delimiter = max(",;\t", key=line.count)
-            header = [name.strip() for name in next(csv.reader([line], delimiter=delimiter))]
-            continue
-        cells = line.rstrip("\n").split(delimiter)
-        if len(cells) != len(header):
-            problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
-            raise _error(str(path), problem, "complete or remove the line")
-        try:
-            rows.append([float(cell) if cell.strip() else math.nan for cell in cells])
-        except ValueError:
-            column, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
-            if column.partition(":")[0] in (*QUANTITIES, "time"):
-                problem = f"line {number}, column {column!r} is no number"
-                raise _error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
-            rows.append([float(cell) if _is_number(cell) else math.nan for cell in cells])
-        lines.append(number)
-    if header is None or not rows:
-        raise _error(str(path), "has no rows", "give a header and one row per sample")
-    if len(set(header)) != len(header):
-        twice = next(name for name in header if header.count(name) > 1)
-        raise _error(str(path), f"has the column {twice!r} twice", "keep one of them")
-    table = np.array(rows)
-    return {name: table[:, index] for index, name in enumerate(header)}, lines
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return not cell.strip()
-    return True
-
-
-def _read_columns(path: Path) -> dict[str, Float64] | None:
-    """Return the datasets of an HDF5 file by name, None if none is named as a column of a log."""
-    h5py = load_h5py()
-    try:
-        with h5py.File(path, "r") as file:
-            names = [name for name in file if name == "time" or ":" in name]
-            if not any(name.startswith("qpos:") for name in names):
-                return None
-            return {name: np.asarray(file[name][...], np.float64).reshape(-1) for name in names}
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
-        raise RecordingError(f"{path}: cannot be read as a log: {error}") from error
-
-
 def _build(
     robot: Robot,
     source: str,
@@ -228,7 +165,7 @@ def _build(
     """Return the log that the columns of a file hold."""
     if "time" not in columns:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        raise _error(source, problem, "begin the header with time, in seconds")
+        raise error(source, problem, "begin the header with time, in seconds")
     by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
     for name, values in columns.items():
         quantity, colon, joint = name.partition(":")
@@ -236,13 +173,13 @@ def _build(
             choice(f"{source}: column {name!r}: joint", joint.strip(), robot.joint_names)
             by[quantity.strip()][joint.strip()] = values
     if not by["qpos"]:
-        raise _error(
+        raise error(
             source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
         )
     kinds: list[CommandKind] = [each for each in ("effort", "setpoint") if by[each]]
     if not kinds or (kind is not None and kind not in kinds):
         wanted = kind or "setpoint"
-        raise _error(
+        raise error(
             source, f"has no column {wanted}:JOINT", f"commands are needed, e.g. {wanted}:{robot.joint_names[0]}"
         )
     found = kind or kinds[0]
@@ -253,9 +190,9 @@ def _build(
     names = [name for name in robot.joint_names if name in by["qpos"]]
     names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free and name in names]
     if not names:
-        raise _error(source, "holds followers alone, which their leaders move", "give the columns of the leaders")
+        raise error(source, "holds followers alone, which their leaders move", "give the columns of the leaders")
     if len({len(columns["time"]), *(len(by[q][n]) for q in ("qpos", found) for n in names)}) > 1:
-        raise _error(source, "has columns of different lengths", "give one value per row in each")
+        raise error(source, "has columns of different lengths", "give one value per row in each")
     tables = {q: np.stack([by[q][n] for n in names], axis=1) for q in ("qpos", found)}
     whole = all(n in by["qvel"] and len(by["qvel"][n]) == len(columns["time"]) for n in names)
     qvel = np.stack([by["qvel"][n] for n in names], axis=1) if whole else None
@@ -276,19 +213,19 @@ def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
         if table is not None and not np.isfinite(table).all():
             index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
             remedy = "remove the row, or give the number"
-            raise _error(log.source, f"{row(index)}, column '{quantity}:{names[joint]}' is empty or not finite", remedy)
+            raise error(log.source, f"{row(index)}, column '{quantity}:{names[joint]}' is empty or not finite", remedy)
     if not np.isfinite(log.time).all():
         index = int(np.argmin(np.isfinite(log.time)))
-        raise _error(log.source, f"{row(index)}, column 'time' is empty or not finite", "remove the row")
+        raise error(log.source, f"{row(index)}, column 'time' is empty or not finite", "remove the row")
     if (np.diff(log.time) <= 0).any():
         index = int(np.argmax(np.diff(log.time) <= 0)) + 1
-        raise _error(log.source, f"{row(index)}: time does not increase", "sort the rows, and give each time once")
+        raise error(log.source, f"{row(index)}: time does not increase", "sort the rows, and give each time once")
     if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
         problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
-        raise _error(log.source, problem, f"record {MIN_ROWS} rows and {MIN_SECONDS} s at least; time is in seconds")
+        raise error(log.source, problem, f"record {MIN_ROWS} rows and {MIN_SECONDS} s at least; time is in seconds")
     if (period := float(np.median(np.diff(log.time)))) > 0.05:
         remedy = "record at 100 Hz or more; time is in seconds"
-        raise _error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
+        raise error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
     reach = np.array([BEYOND[robot.units[joint]] for joint in log.joints])
     free = robot.continuous[list(log.joints)]
     low, high = (limit[list(log.joints)] for limit in (robot.lower, robot.upper))
@@ -297,12 +234,8 @@ def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
         index, joint = (int(n) for n in np.argwhere(beyond)[0])
         problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
         remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
-        raise _error(log.source, problem, remedy, float(log.qpos[index, joint]))
+        raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
     return log
-
-
-def _error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidArgumentError:
-    return InvalidArgumentError(source, problem, remedy=remedy, value=value)
 
 
 def setpoint_csv(robot: Robot, motion: Trajectory) -> str:

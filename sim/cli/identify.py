@@ -1,0 +1,146 @@
+"""``batchpid identify``: a robot's motors, friction and payload, found from logs."""
+
+from __future__ import annotations
+
+import json as json_text
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot
+from sim.cli import flags
+from sim.cli.progress import bar
+
+if TYPE_CHECKING:
+    from sim.tuning.identification.result import Identification
+
+Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Logs: .csv, .h5 or recordings.")]
+
+
+@dataclass(frozen=True)
+class IdentifyCommand:
+    """Identify a robot's motors from logs of its motion, from this robot or another simulator.
+
+    Finds armature, damping, friction, strength and bias of each joint, the delay of the commands and the payload at the
+    tool, by fitting simulated motions; writes them for --actuators of other commands. A log has a header and SI units:
+    "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --params FILE, or
+    "time, effort:JOINT ..., qpos:JOINT ...".
+    """
+
+    robot: flags.RobotName = "panda"
+    logs: Logs = ()
+    params: flags.OptionalPath = None
+    """Params file (.yaml or .json) of the PID law that drove the robot. Without it the logs' efforts are used."""
+    compensate: flags.Compensate = "gravity+coriolis+friction"
+    timestep: float = 1 / 2000
+    """Time step of the control that drove the robot [s]."""
+    hold: flags.Switch = False
+    """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
+    no_payload: flags.Switch = False
+    """There is no payload at the tool."""
+    iterations: int = 25
+    """Most Gauss-Newton steps."""
+    seed: int = 0
+    """Seed of the search where regression finds no start. The result does not depend on the number of workers."""
+    workers: flags.Workers = None
+    missing_meshes: flags.MissingMeshes = "skip"
+    resume: flags.Switch = False
+    """Continue a fit with the same options that was stopped."""
+    out: flags.OptionalPath = None
+    """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
+    json: flags.OptionalPath = None
+    """Estimates with their 95 % intervals to write: .json."""
+    picture: flags.OptionalPath = None
+    """Position errors before and after, to draw: .png or .svg. Default: named as the actuators file."""
+
+    imports = ("sim.plots", "sim.engine.dynamics", "sim.tuning.identification.identify")
+
+    def run(self) -> None:
+        """Run the command."""
+        import batchpid as bp
+        from batchpid.files import write_atomically
+        from sim import plots
+        from sim.tuning.identification.identify import identify
+
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        if not self.logs:
+            raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
+        out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
+        out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
+        details = flags.output_path("json", self.json, (".json",))
+        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)
+        history = out.with_suffix(".fit.json")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if not self.resume:
+            history.unlink(missing_ok=True)
+        found = identify(
+            robot,
+            self.logs,
+            params=None if self.params is None else _params(robot, self.params),
+            compensate=self.compensate,
+            timestep=self.timestep,
+            payload=not self.no_payload,
+            hold=self.hold,
+            iterations=self.iterations,
+            seed=self.seed,
+            workers=self.workers,
+            history=history,
+            progress=bar("identifying", unit="step"),
+        )
+        print(report(found))
+        about = {"identified_from": found.settings["logs"], "held_out_error": found.document()["held_out_error"]}
+        bp.save_actuators(out, found.actuators(), robot.joint_names, about)
+        print(f"\nwritten: {out}")
+        if details is not None:
+            details.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(details, json_text.dumps(found.document(), indent=2, allow_nan=False) + "\n")
+            print(f"written: {details}")
+        names, units = ([table[joint] for joint in found.joints] for table in (robot.joint_names, robot.units))
+        errors = [plots.FitErrors(*fit[1:]) for fit in found.fits if fit.log == 0]
+        title = f"{robot.name}: position error, shaded where it was not fitted"
+        print(f"picture: {plots.save(plots.fit_errors(errors, names, units, title), picture)}")
+        history.unlink(missing_ok=True)
+
+
+def _params(robot: Robot, path: Path) -> Any:
+    """Return the params of a file, of all joints of ``robot`` or of some, in the robot's order."""
+    import batchpid as bp
+
+    names = bp.load_params(path)[1]
+    order = [name for name in robot.joint_names if name in names]
+    if len(order) < len(names):
+        return bp.load_params(path, robot.joint_names)[0]  # raises, naming the joints
+    return bp.load_params(path, order)[0]
+
+
+def report(found: Identification) -> str:
+    """Return a table of the joints, and the delay, the payload and the errors in lines."""
+    from sim.cli.report import table
+    from sim.tuning.identification.unknowns import PER_JOINT
+
+    def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
+        interval = found.interval(kind, joint)
+        if interval is None:
+            return "-"
+        value, low, high = (factor * each for each in interval)
+        return f"{value:.4g} ± {max(high - value, value - low):.1g}"
+
+    names = [found.robot.joint_names[joint] for joint in found.joints]
+    rows = [[name, *(cell(kind, joint) for kind in PER_JOINT)] for joint, name in enumerate(names)]
+    text = [table(rows, ["95 % intervals, SI units", *PER_JOINT], "lrrrrr"), ""]
+    text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
+    if ("payload", None) in found.unknowns.names:
+        text.append(f"payload at the tool: {cell('payload')} kg")
+    if found.drive.params is None and found.drive.compensate == "none":
+        text.append("gravity: within the logged efforts")
+    elif found.drive.compensate != "none":
+        way = "through its motors" if found.drive.through else "apart from its motors"
+        text.append(f"the robot compensates {found.drive.compensate} {way}")
+    before, after = found.held_out_error
+    text.append(f"position error on the part that was kept: {before:.3g} as described, {after:.3g} as identified")
+    if missing := found.not_identified:
+        text.append(f"NOT IDENTIFIABLE from these logs: {', '.join(missing)}")
+    return "\n".join(text)

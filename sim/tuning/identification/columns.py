@@ -1,0 +1,83 @@
+"""Columns of a log by name, from CSV and HDF5 files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import InvalidArgumentError
+from sim.recording.files import RecordingError, load_h5py
+
+Float64 = NDArray[np.float64]
+QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
+
+
+def error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidArgumentError:
+    """Return the error of a file."""
+    return InvalidArgumentError(source, problem, remedy=remedy, value=value)
+
+
+def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
+    """Return the columns of a CSV file by name, and the line of each row."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as bad:
+        raise error(str(path), f"is no text: {bad.reason} at byte {bad.start}", "save it as UTF-8") from None
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    header: list[str] | None = None
+    delimiter = ","
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if header is None:
+            delimiter = max(",;\t", key=line.count)
+            header = [name.strip() for name in next(csv.reader([line], delimiter=delimiter))]
+            continue
+        cells = line.rstrip("\n").split(delimiter)
+        if len(cells) != len(header):
+            problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
+            raise error(str(path), problem, "complete or remove the line")
+        try:
+            rows.append([float(cell) if cell.strip() else math.nan for cell in cells])
+        except ValueError:
+            column, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
+            if column.partition(":")[0] in (*QUANTITIES, "time"):
+                problem = f"line {number}, column {column!r} is no number"
+                raise error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
+            rows.append([float(cell) if _is_number(cell) else math.nan for cell in cells])
+        lines.append(number)
+    if header is None or not rows:
+        raise error(str(path), "has no rows", "give a header and one row per sample")
+    if len(set(header)) != len(header):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise error(str(path), f"has the column {twice!r} twice", "keep one of them")
+    table = np.array(rows)
+    return {name: table[:, index] for index, name in enumerate(header)}, lines
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return not cell.strip()
+    return True
+
+
+def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
+    """Return the datasets of an HDF5 file by name, None if none is named as a column of a log."""
+    h5py = load_h5py()
+    try:
+        with h5py.File(path, "r") as file:
+            names = [name for name in file if name == "time" or ":" in name]
+            if not any(name.startswith("qpos:") for name in names):
+                return None
+            return {name: np.asarray(file[name][...], np.float64).reshape(-1) for name in names}
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as bad:
+        raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad

@@ -1,0 +1,87 @@
+r"""Uncertainty of a fit: covariance, intervals, and what the logs do not identify.
+
+The residuals of a fit are not white: the feedback loop filters the sensors' noise, and no model is exact. With weighted
+residuals r and Jacobian J of the N rows of each joint, the covariance of the estimates for coloured residuals is::
+
+    cov = H^-1 S H^-1,     H = J^T J,     S = sum over joints, k and l of J_k^T c(k - l) J_l
+
+c is the autocovariance of the joint's residuals, tapered (E. A. Morelli and V. Klein, "Accuracy of aerodynamic model
+parameters estimated from flight test data", Journal of Guidance, Control, and Dynamics 20(1), 1997). For white
+residuals it is H^-1. The singular values of J in units of typical sizes tell which combinations a log does not show.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.tuning.identification.fit import Iterate, Problem
+
+Float64 = NDArray[np.float64]
+MEMORY = 0.3
+"""Longest lag of the autocovariance [s]."""
+INTERVAL = 1.96
+"""Half width of a 95 % interval, in standard deviations."""
+RESOLVED = 0.1
+"""Largest half width, over the estimate or FLOOR of its typical size, of an unknown that counts as identified."""
+FLOOR = 0.2
+
+
+class Uncertainty(NamedTuple):
+    """Uncertainty of the unknowns (unknowns,)."""
+
+    deviation: Float64
+    """Standard deviations."""
+    identified: NDArray[np.bool_]
+    singular_values: Float64
+    """Of the Jacobian in units of typical sizes, over the largest, descending."""
+
+
+def uncertainty(problem: Problem, point: Iterate) -> Uncertainty:
+    """Return the uncertainty of the fitted ``point``."""
+    unknowns = problem.unknowns
+    count = len(unknowns.scale)
+    size = np.array(problem.lags(MEMORY))
+    normal, spread = np.zeros((count, count)), np.zeros((count, count))
+    covariances = _autocovariances(problem, point, int(size.max()))
+    for (_, jacobian), window in zip(point.windows, problem.windows, strict=True):
+        assert jacobian is not None
+        for joint in range(jacobian.shape[1]):
+            columns = np.nan_to_num(jacobian[window.fitted, joint]) * unknowns.scale / point.sigma[joint]
+            if not len(columns):
+                continue
+            normal += columns.T @ columns
+            length = 2 ** int(np.ceil(np.log2(len(columns) + len(covariances))))
+            c = np.zeros(length)
+            c[: len(covariances)] = covariances[:, joint]
+            c[-len(covariances) + 1 :] = covariances[1:, joint][::-1]
+            power = np.maximum(np.fft.rfft(c).real, 0.0)
+            spectrum = np.fft.rfft(columns, length, axis=0)
+            weights = np.full(len(power), 2.0)
+            weights[[0, -1]] = 1.0
+            spread += ((spectrum.conj() * (weights * power)[:, None]).T @ spectrum).real / length
+    prior = (unknowns.scale / unknowns.spread) ** 2
+    inverse = np.linalg.inv(normal + np.diag(prior))
+    covariance = inverse @ (spread + np.diag(prior)) @ inverse
+    white = np.diagonal(inverse)
+    deviation = unknowns.scale * np.sqrt(np.maximum(np.diagonal(covariance), white))
+    values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
+    size_of = np.maximum(np.abs(point.theta), FLOOR * unknowns.scale)
+    identified = INTERVAL * deviation <= RESOLVED * size_of
+    return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
+
+
+def _autocovariances(problem: Problem, point: Iterate, lags: int) -> Float64:
+    """Return the tapered autocovariances of the weighted residuals of each joint (lags, joints)."""
+    parts = [r[w.fitted] / point.sigma for (r, _), w in zip(point.windows, problem.windows, strict=True)]
+    parts = [part for part in parts if len(part)]
+    lags = max(2, min(lags, min(map(len, parts)) // 2))
+    total = np.zeros((lags, parts[0].shape[1]))
+    for part in parts:
+        length = 2 ** int(np.ceil(np.log2(len(part) + lags)))
+        spectrum = np.abs(np.fft.rfft(part, length, axis=0)) ** 2
+        total += np.fft.irfft(spectrum, length, axis=0)[:lags]
+    taper = 1 - np.arange(lags) / lags
+    return taper[:, None] * total / sum(map(len, parts))

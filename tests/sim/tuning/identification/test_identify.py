@@ -1,0 +1,164 @@
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from sim import Robot
+from sim.tuning import identify
+from sim.tuning.identification.excitation import excite
+from sim.tuning.identification.logs import Log, read_logs
+from sim.tuning.identification.plant import Drive, Motors, Plant, Segment
+from sim.tuning.identification.unknowns import PER_JOINT
+
+pytest.importorskip("scipy")
+EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
+ARM = """<robot name="arm2"><link name="base"/>
+<link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
+<inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
+<link name="fore"><inertial><origin xyz="0 0 0.15"/><mass value="1"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.002"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.5"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="40" velocity="6"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="20" velocity="6"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory) -> Robot:
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(ARM)
+    return Robot.load(path)
+
+
+@pytest.fixture(scope="module")
+def mujoco_log():
+    pytest.importorskip("mujoco")
+    return runpy.run_path(str(EXAMPLE))
+
+
+def as_log(robot: Robot, table: dict, kind: str) -> Log:
+    joints = tuple(range(robot.dof))
+    return Log("log", joints, kind, table["time"], table["qpos"], table["time"], table[kind], False)
+
+
+@pytest.fixture(scope="module")
+def runs(arm, mujoco_log):
+    """Truth, and logs of 1.6 s of setpoints and of efforts."""
+    truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
+    table = mujoco_log["simulate"](arm, truth, excite(arm, 1.6, lowest=0.6), params, every=1, seed=1)
+    return truth, as_log(arm, table, "setpoint"), as_log(arm, table, "effort")
+
+
+def row(value) -> np.ndarray:
+    return np.atleast_2d(np.asarray(value, float))
+
+
+def test_the_plant_moves_as_mujoco(arm, mujoco_log):
+    truth, params = mujoco_log["plausible"](arm, 3)._replace(noise=0.0), arm.designed("effort")
+    table = mujoco_log["simulate"](arm, truth, excite(arm, 1.0, lowest=0.6), params, every=1)
+    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
+    motors = Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0))
+    for kind in ("setpoint", "effort"):
+        plant = Plant(arm, (0, 1), Drive(1 / 2000, params if kind == "setpoint" else None, "gravity+coriolis"))
+        segment = Segment(table["qpos"][0], np.zeros(2), table[kind])
+        moved = plant.simulate(motors, [segment], 0)[0, :-1]
+        np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
+
+
+def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
+    plant = Plant(arm, (0, 1), Drive(1 / 2000, arm.designed("effort"), "gravity"))
+    rng = np.random.default_rng(0)
+    leaves = [rng.uniform(0.1, 1.0, (3, 2)) for _ in PER_JOINT]
+    motors = Motors(*leaves, *(rng.uniform(0.002, 0.01, (3, 1)) for _ in range(2)), np.array([[0.0], [0.3], [0.3]]))
+    segments = [Segment(q, np.zeros(2), np.tile(q + 0.2, (50, 1))) for q in rng.uniform(-1, 1, (3, 2))]
+    together = plant.simulate(motors, segments, 0)
+    for k in range(3):
+        assert np.array_equal(plant.simulate(motors.take([k]), [segments[k]], 0)[0], together[k])
+
+
+@pytest.mark.parametrize("kind", ["setpoint", "effort"])
+def test_known_motors_are_found(arm, runs, kind):
+    truth, setpoints, efforts = runs
+    by_law = kind == "setpoint"
+    found = identify(
+        arm,
+        setpoints if by_law else efforts,
+        params=arm.designed("effort") if by_law else None,
+        workers=0,
+        payload=False,
+    )
+    document = json.loads(json.dumps(found.document()))
+    for index, joint in enumerate(arm.joint_names):
+        for name in PER_JOINT:
+            estimate, low, high = document["joints"][joint][name]
+            assert low <= estimate <= high
+            wanted = float(getattr(truth, name)[index])
+            assert abs(estimate - wanted) < max(0.05 * abs(wanted), 3 * (high - low)), (joint, name)
+    assert document["delay"][0] == pytest.approx(truth.delay, abs=2e-4)
+    before, after = document["held_out_error"]
+    assert after < before / 10
+    assert found.not_identified == []
+    actuators = found.actuators()
+    assert actuators.command_delay[0, 0] == pytest.approx(document["delay"][0])
+    assert actuators.coulomb[0, 0] == pytest.approx(document["joints"]["shoulder"]["friction"][0])
+
+
+def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
+    (tmp_path / "turret.urdf").write_text(ARM.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 0 1"/>', 1))
+    turret = Robot.load(tmp_path / "turret.urdf")  # pitching its upper joint does not turn the lower one
+    truth, params = mujoco_log["plausible"](turret, 2), turret.designed("effort")
+    motion = excite(turret, 1.6, lowest=0.6)
+    still = motion._replace(position=np.where([False, True], motion.position, motion.position[0]))
+    table = mujoco_log["simulate"](turret, truth, still, params, every=2, compensate=False)
+    log = as_log(turret, table, "setpoint")
+    found = identify(turret, log, params=params, compensate="none", workers=0, payload=False, iterations=3)
+    document = found.document()
+    assert {f"shoulder: {kind}" for kind in PER_JOINT} <= set(found.not_identified)
+    assert "elbow: friction" not in found.not_identified
+    assert document["joints"]["shoulder"]["damping"] == [None, None, None]
+    assert found.actuators().strength[0, 0] == 1.0
+    assert found.uncertainty.singular_values[-1] < 1e-3
+
+
+def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
+    _, setpoints, _ = runs
+    time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
+    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "iterations": 2}
+    whole = identify(arm, log, **options)
+
+    def stop(steps):
+        for step in steps:
+            if step == 1:
+                raise KeyboardInterrupt
+            yield step
+
+    with pytest.raises(KeyboardInterrupt):
+        identify(arm, log, **options, history=tmp_path / "fit.json", progress=stop)
+    resumed = identify(arm, log, **options, history=tmp_path / "fit.json")
+    assert np.array_equal(resumed.estimate, whole.estimate)
+    with pytest.raises(bp.InvalidArgumentError, match=r"another fit \(seed differ\)"):
+        identify(arm, log, **options, seed=1, history=tmp_path / "fit.json")
+
+
+def test_logs_and_params_have_to_fit(arm, runs):
+    _, setpoints, efforts = runs
+    with pytest.raises(bp.InvalidArgumentError, match="give the params that drove the robot"):
+        identify(arm, setpoints, workers=0)
+    with pytest.raises(bp.InvalidArgumentError, match="give no params"):
+        identify(arm, efforts, params=arm.designed("effort"), workers=0)
+    with pytest.raises(bp.InvalidArgumentError, match="hold 3 joints"):
+        identify(arm, setpoints, params=bp.make_params(3, kp=1.0), workers=0)
+    with pytest.raises(bp.InvalidArgumentError, match="name one file"):
+        identify(arm, [], workers=0)
+
+
+def test_the_example_writes_a_log_that_reads_back(arm, mujoco_log, runs, tmp_path):
+    truth = runs[0]
+    table = mujoco_log["simulate"](arm, truth, excite(arm, 1.0), arm.designed("effort"))
+    mujoco_log["write"](arm, table, tmp_path / "log.csv")
+    (log,) = read_logs(arm, [tmp_path / "log.csv"])
+    np.testing.assert_allclose(log.qpos, table["qpos"], atol=1e-8)
