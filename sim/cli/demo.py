@@ -28,6 +28,7 @@ class DemoCommand:
     seed: int = 0
     """Seed of the start poses."""
     workers: flags.Workers = None
+    backend: flags.Backend = "numpy"
     missing_meshes: flags.MissingMeshes = "skip"
     picture: Path = Path("out/demo.png")
     """Step responses to draw: .png or .svg."""
@@ -56,7 +57,12 @@ class DemoCommand:
         start = start_poses(robot, self.num_envs, 0.3, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-        options: dict[str, Any] = {"params": gains.params, "control": gains.control, "workers": self.workers}
+        options: dict[str, Any] = {
+            "params": gains.params,
+            "control": gains.control,
+            "workers": self.workers,
+            "backend": self.backend,
+        }
         with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
             rollout, report = hold_setpoint(runner, start, settings.target, seconds)

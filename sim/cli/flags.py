@@ -74,6 +74,7 @@ Compensate = Annotated[
     Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
     _flag("Passive force and known friction, added at every sim step."),
 ]
+Backend = Annotated[Literal["numpy", "jax"], _flag("Library of the law: NumPy, or JAX, as one program with the steps.")]
 Seconds = Annotated[float, _flag("Simulated time [s].")]
 Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]

@@ -38,6 +38,7 @@ class RolloutCommand:
     """Largest distance of a start pose from the robot's own [rad or m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
     physics: flags.Physics = "accurate"
+    backend: flags.Backend = "numpy"
     collisions: flags.Collisions = True
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
@@ -79,6 +80,7 @@ class RolloutCommand:
             substeps=self.substeps,
             compensate=self.compensate,
             physics=self.physics,
+            backend=self.backend,
             collisions=self.collisions,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"

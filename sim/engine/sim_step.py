@@ -26,6 +26,8 @@ class _Group(ctypes.Structure):
         ("bodies_size", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
         ("coriolis", ctypes.c_int32),
+        ("velocities", ctypes.c_int32),
+        ("unused", ctypes.c_int32),
         ("message", ctypes.c_char * 256),
     ]
 
@@ -41,11 +43,15 @@ class NativeStep:
         Its watch is judged and updated in place.
     gravity, coriolis
         Parts of the passive force that is read; without both it is zero.
+    velocities
+        Whether to read velocities; otherwise they are zero.
     speed_limit
         Joint speed beyond which the status says so (dof,), or None.
     """
 
-    def __init__(self, pack: Pack, gravity: bool, coriolis: bool, speed_limit: NDArray[np.float64] | None) -> None:
+    def __init__(
+        self, pack: Pack, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+    ) -> None:
         calls, watch = pack.calls, pack.watch
         assert isinstance(calls, native.NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
@@ -80,6 +86,7 @@ class NativeStep:
             bodies_size=len(bodies),
             gravity=gravity,
             coriolis=coriolis,
+            velocities=velocities,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
         self._kept = calls, arrays

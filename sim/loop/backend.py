@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import batchpid as bp
-from batchpid.errors import MissingDependencyError
 from sim.engine import native
 from sim.engine.native import xla
 from sim.options import RunnerOptions
@@ -33,11 +32,3 @@ def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
         return f"{law}, in one program with native sim steps"
     calls = "native" if native.status().active else "Python"
     return f"{law}, a call each sim step ({reason}), {calls} calls into SAPIEN"
-
-
-def check_jax() -> None:
-    """Raise MissingDependencyError without JAX."""
-    try:
-        import jax  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError("jax", "backend='jax'", "jax") from None

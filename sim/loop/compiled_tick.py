@@ -52,20 +52,20 @@ class CompiledTick:
         self._matrix: Any = None
         self._constants: tuple[tuple[Any, ...], Constants] | None = None
         self._native: NativeStep | None = None
-        self._calls: Any = None
+        self._bound: tuple[Any, bool] | None = None
 
     def run(self, command: Command, begin: int, end: int) -> tuple[int, int]:
         """Run the sim steps of a tick from ``begin`` to ``end``; return the steps done, and the status of the last."""
         pack = self._pack
-        if self._calls is not pack.calls:  # robots or systems have changed
-            self._calls = pack.calls
-            self._native = NativeStep(pack, self._gravity, self._coriolis, self._speed_limit)
+        constants = self._take_constants()
+        if self._bound != (bound := (pack.calls, self._needs_qvel)):  # robots, systems or the law have changed
+            self._bound = bound
+            self._native = NativeStep(pack, self._gravity, self._coriolis, self._needs_qvel, self._speed_limit)
             if self._carry is not None:
                 self._carry = self._carry._replace(**self._read())
         native = self._native
         assert native is not None
         with precision(self._options.dtype):
-            constants = self._take_constants()
             carry = self._take_over() if self._carry is None else self._carry
             carry = carry._replace(progress=np.array([begin, 0], np.int32))
             address = np.array([native.prepare()], np.uint64).view(np.uint32)
@@ -140,6 +140,12 @@ class CompiledTick:
         return Carry(progress=None, qpos_before=read["qpos"], **read, **put(own))
 
     @property
+    def _needs_qvel(self) -> bool:
+        law, controller = self._layout.law, self._layout.controller
+        measured = controller is not None if law is None else law.measures_rate
+        return self._needs_matrix or measured or self._friction.acts
+
+    @property
     def _needs_matrix(self) -> bool:
         law = self._layout.law
         return law is not None and (law.whole or law.per_inertia)
@@ -173,7 +179,8 @@ class CompiledTick:
             friction=Friction(*map(spread, friction.model)),
             known=friction.known,
         )
-        self._constants = sources, put(constants)
+        with precision(self._options.dtype):
+            self._constants = sources, put(constants)
         return self._constants[1]
 
 

@@ -38,6 +38,7 @@ struct Group {
   double const *speed_limit;         // (dof,), or null
   std::int64_t pairs, bodies_size;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
+  std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
   char message[256];                 // of an exception of SAPIEN
 };
 
@@ -103,22 +104,23 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
       if (group.system_of[row] != static_cast<std::int64_t>(system)) continue;
       Articulation *robot = gateway.robots[row];
       std::ptrdiff_t const at = static_cast<std::ptrdiff_t>(row) * dof;
-      VectorXf const position = call.get_qpos(robot), velocity = call.get_qvel(robot);
+      VectorXf const position = call.get_qpos(robot);
       copy_row(position, qpos + at, dof);
-      copy_row(velocity, qvel + at, dof);
+      if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);
       if (group.gravity || group.coriolis) {
         copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
       }
       for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
         if (!std::isfinite(position.data[joint])) status |= NOT_FINITE;
-        if (group.speed_limit && !(std::fabs(velocity.data[joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
+        if (group.speed_limit && !(std::fabs(qvel[at + joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
       }
       group.outside[row] = group.known[row] && leaves_region(group, row, position.data);
       if (group.outside[row]) status |= LEFT_REGION;
     }
   }
-  if (!group.gravity && !group.coriolis) std::memset(passive, 0, static_cast<std::size_t>(rows * dof) * sizeof(T));
-  auto const size = static_cast<std::size_t>(dof) * sizeof(T);
+  auto const size = static_cast<std::size_t>(dof) * sizeof(T), all = static_cast<std::size_t>(rows) * size;
+  if (!group.gravity && !group.coriolis) std::memset(passive, 0, all);
+  if (!group.velocities && !group.speed_limit) std::memset(qvel, 0, all);
   for (auto row = static_cast<std::int64_t>(robots); row < rows; ++row) {
     for (T *table : {qpos, qvel, passive}) std::memcpy(table + row * dof, table, size);
   }

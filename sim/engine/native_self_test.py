@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from sim.engine.building import SceneSpec, build_scene, new_system
 from sim.engine.calls import PythonCalls
-from sim.engine.native import NativeCalls
+from sim.engine.native import NativeCalls, assumed, python_calls
+from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
+from sim.engine.sim_step import NativeStep
 from sim.robot.parts import Joint
 
 STEPS = 50
@@ -27,6 +29,37 @@ _URDF = f"""<robot name="test"><link name="base"/><link name="arm">{_BODY}</link
 
 def main() -> None:
     """Compare native and Python calls on four robots in two systems; raise what is found."""
+    _compare_calls()
+    _compare_steps()
+
+
+def _compare_steps() -> None:
+    """Compare the native sim step with Python's, in two packs of robots that approach the ground."""
+    with assumed():
+        ours = Pack(_spec(), 4, system_size=2)
+    with python_calls():
+        theirs = Pack(_spec(), 4, system_size=2)
+    table, looks = np.zeros((3, 4, 2)), 0
+    for pack in (ours, theirs):
+        pack.write_state(range(4), np.linspace((0, 0), (1.2, 0.4), 4), np.zeros((4, 2)))
+    step = NativeStep(ours, True, True, True, None)
+    for number in range(STEPS):
+        effort = np.tile([20.0 * np.sin(number), 5.0], (4, 1))
+        theirs.write_qf(effort)
+        theirs.step()
+        if step(effort, *table):
+            looks += 1
+            ours.look(step.left())
+            with assumed():
+                step = NativeStep(ours, True, True, True, None)
+        reads = theirs.read_qpos(), theirs.read_qvel(), theirs.passive_force(True, True)
+        if np.array(reads).tobytes() != table.tobytes() or (ours.isolated != theirs.isolated).any():
+            raise AssertionError("native and Python sim steps give different results")
+    if not looks:
+        raise AssertionError("no contact was listed")
+
+
+def _compare_calls() -> None:
     reads = [_run(make) for make in (PythonCalls, NativeCalls)]
     for ours, theirs in zip(*reads, strict=True):
         if ours.tobytes() != theirs.tobytes():
@@ -35,10 +68,14 @@ def main() -> None:
         raise AssertionError("no robot moved")
 
 
+def _spec() -> SceneSpec:
+    joints = (Joint("turn", "revolute", "base", "arm"), Joint("slide", "prismatic", "arm", "hand"))
+    return SceneSpec(_URDF, (), joints, 1e-2, PHYSICS["accurate"])
+
+
 def _run(make: Callable[..., Any]) -> list[NDArray[Any]]:
     """Return everything that is read in a run under varied efforts, which ends on the ground."""
-    joints = (Joint("turn", "revolute", "base", "arm"), Joint("slide", "prismatic", "arm", "hand"))
-    spec = SceneSpec(_URDF, (), joints, 1e-2, PHYSICS["accurate"])
+    spec = _spec()
     systems = [new_system(spec), new_system(spec)]
     scenes, robots = zip(*(build_scene(spec, systems[row // 2]) for row in range(4)), strict=True)
     qf, skip = np.zeros((4, 2), np.float32), np.array([False, False, False, True])
