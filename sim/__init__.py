@@ -21,6 +21,8 @@ from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
 from sim.observation import Observation, Rollout, RunInfo
 from sim.options import Controller, RunnerOptions
+from sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
+from sim.randomization.randomization import Randomization
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, Engine, RobotDescription, register_engine
@@ -35,15 +37,19 @@ if TYPE_CHECKING:
     from sim.workers.pool import RecoveryWarning
 
 __all__ = [
+    "Choice",
     "ClusterWarning",
     "Controller",
     "Fault",
     "FaultWarning",
     "Finding",
+    "LogUniform",
     "MissedContact",
     "MissedContactWarning",
+    "Normal",
     "Observation",
     "Physics",
+    "Randomization",
     "Ray",
     "Recorder",
     "RecordingError",
@@ -55,6 +61,7 @@ __all__ = [
     "RunnerOptions",
     "SetpointWarning",
     "Snapshot",
+    "Uniform",
     "read_recording",
     "write_recording",
 ]

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,7 @@ class ReachVectorEnv(VectorEnv):
     autoreset_mode
         Of :class:`gymnasium.vector.AutoresetMode`.
     options
-        Of :class:`sim.Runner`: params, workers, timestep, physics, compensate, build, ...
+        Of :class:`sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
 
     Raises
     ------
@@ -141,7 +141,7 @@ class ReachVectorEnv(VectorEnv):
         """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
 
         An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
-        an env draws depends on its own seed alone.
+        an env draws depends on its own seed alone, which is the stream of a ``randomization``, too.
         """
         mask = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
@@ -155,10 +155,11 @@ class ReachVectorEnv(VectorEnv):
             raise InvalidArgumentError(
                 "seed", f"has {len(seeds)} entries for {self.num_envs} envs", remedy="give an int, or one for each env"
             )
+        streams: dict[int, int] = {}
         for env in np.flatnonzero(mask).tolist():
-            if seeds is not None and seeds[env] is not None:
-                self._generators[env] = np.random.default_rng(seeds[env])
-        self._begin(mask)
+            if seeds is not None and (stream := seeds[env]) is not None:
+                self._generators[env], streams[env] = np.random.default_rng(stream), stream
+        self._begin(mask, streams)
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
@@ -222,8 +223,8 @@ class ReachVectorEnv(VectorEnv):
         """Close the runner."""
         self.runner.close()
 
-    def _begin(self, mask: Bool) -> None:
-        """Draw start and goal of the masked envs, and place their robots."""
+    def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
+        """Draw start and goal of the masked envs, and place their robots; ``streams`` are new ones of some envs."""
         start = self._setpoint.copy()
         margin = MARGIN * (self.high - self.low)
         for env in np.flatnonzero(mask).tolist():
@@ -234,7 +235,14 @@ class ReachVectorEnv(VectorEnv):
         self._setpoint = start
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        self._observe(self.runner.reset(self._of_robot(start), mask=mask))
+        qpos, seeds = self._of_robot(start), np.zeros(self.num_envs, np.int64)
+        if streams and self.runner.options.randomization is not None:
+            seeded = np.isin(np.arange(self.num_envs), list(streams))
+            seeds[list(streams)] = list(streams.values())
+            self._observe(self.runner.reset(qpos, mask=seeded, seed=seeds))
+            mask = mask & ~seeded
+        if mask.any():
+            self._observe(self.runner.reset(qpos, mask=mask))
 
     def _of_robot(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return positions (envs, joints) of the independent joints for all joints of the robot (envs, dof)."""

@@ -67,6 +67,16 @@ def empty_observation(*shape: int) -> Observation:
     return Observation(*(np.empty(shape if each.per_joint else shape[:-1], each.dtype) for each in fields))
 
 
+class Redraw(NamedTuple):
+    """Beginning of an episode during a run: a randomization drew for an env again."""
+
+    time: float
+    """End of the first tick [s]."""
+    env: int
+    stream: int
+    episode: int
+
+
 @dataclass(frozen=True, eq=False)
 class RunInfo:
     """Robot, options and origin of a run; what is not known is None.
@@ -117,6 +127,14 @@ class RunInfo:
     """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`sim.Fault`) of the runner up to the end of the run."""
+    randomization: Mapping[str, Any] | None = None
+    """Distributions, as :meth:`sim.Randomization.to_dict` returns them."""
+    draws: Mapping[str, Float64] | None = None
+    """Draws at the start, by field: (envs, joints or links)."""
+    episodes: NDArray[np.int64] | None = None
+    """Stream and episode of each env at the start (envs, 2)."""
+    redraws: tuple[Redraw, ...] = ()
+    """Episodes that began after that."""
 
     def quantity(self, name: str) -> Quantity:
         """Return the quantity ``name`` of :data:`RECORDED`; under control "effort" the setpoint is an effort."""
@@ -125,10 +143,14 @@ class RunInfo:
 
     def for_envs(self, envs: slice | Any) -> RunInfo:
         """Return the info of some envs (a slice or an index array)."""
+        rows = () if self.episodes is None else np.arange(len(self.episodes))[envs].tolist()
         return replace(
             self,
             params=None if self.params is None else self.params.for_envs(envs),
             start=None if self.start is None else self.start[envs],
+            draws=None if self.draws is None else {name: values[envs] for name, values in self.draws.items()},
+            episodes=None if self.episodes is None else self.episodes[envs],
+            redraws=tuple(each._replace(env=rows.index(each.env)) for each in self.redraws if each.env in rows),
         )
 
     def __repr__(self) -> str:

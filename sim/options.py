@@ -17,12 +17,13 @@ from batchpid.computed_torque import check_gain_units
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
 from sim.cluster import Ray
+from sim.randomization.checks import check_params, check_robot, prepared_actuators
+from sim.randomization.randomization import Randomization
 from sim.robot.actuators import fit_actuators
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
-    from sim.engine.variation import Variation
 
 ControlMode = Literal["pid", "drive", "effort"]
 
@@ -125,9 +126,9 @@ class RunnerOptions:
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
     row per env. Default those of the robot, under control "drive" their friction and armature. The control sees
     measured positions and velocities; observations hold the true ones, and the effort that was delivered."""
-    variation: Variation | None = None
-    """Differences of each env's robot from the model: :func:`sim.tuning.randomization.draw_variation`. Snapshots do
-    not hold it, so that it turns off recovery and checkpoints."""
+    randomization: Randomization | None = None
+    """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
+    (docs/randomization.md); default none."""
     on_invalid_input: InvalidInputAction = "raise"
     """``"raise"`` an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"`` it: the env that
     it is for fails."""
@@ -147,7 +148,6 @@ class RunnerOptions:
 
     def __post_init__(self) -> None:
         from sim.engine.physics import Physics
-        from sim.engine.variation import Variation
 
         robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
         checked: dict[str, Any] = {
@@ -191,13 +191,9 @@ class RunnerOptions:
             checked["speed_limit"] = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
         if self.checkpoint_steps is not None:
             checked["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
-        if self.variation is not None:
-            checked |= {"recover": False, "checkpoint_steps": None}
-            count = len(instance("variation", self.variation, Variation, "draw one with draw_variation").payload)
-            if count != checked["num_envs"]:
-                raise InvalidArgumentError(
-                    "variation", f"is for {count} envs, not {checked['num_envs']}", remedy="draw one for each env"
-                )
+        if self.randomization is not None:
+            remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
+            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
         vars(self).update(checked)
         actuators = robot.actuators if self.actuators is None else self.actuators
         if self.actuators is None and actuators is not None and self.control == "drive":
@@ -252,7 +248,7 @@ class RunnerOptions:
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
         added = actuators is not None and (actuators.coulomb is not None or actuators.static is not None)
-        return bool(self.robot.friction.any()) or added or self.variation is not None
+        return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params`` if they fit the robot, the number of envs and the control.
@@ -282,6 +278,8 @@ class RunnerOptions:
                 f"hold {params.num_envs} envs, the runner has {self.num_envs}",
                 remedy="give one row, or one row per env",
             )
+        if self.randomization is not None:
+            check_params(self.randomization, params, self.robot)
         return params
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
@@ -292,7 +290,10 @@ class RunnerOptions:
         InvalidArgumentError
             They do not fit.
         """
-        return None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
+        fitted = None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
+        if self.randomization is None:
+            return fitted
+        return prepared_actuators(self.randomization, fitted, self.robot, self.control)
 
     def about(self) -> dict[str, Any]:
         """Return the options that two runners must share to restore each other's snapshots, as plain values."""
@@ -315,6 +316,7 @@ class RunnerOptions:
             "fixed_base": robot.fixed_base,
             "merge_fixed": robot.merge_fixed,
             "coupling": None if coupling is None else [coupling.matrix.tolist(), coupling.offset.tolist()],
+            "randomization": None if self.randomization is None else self.randomization.to_dict(),
         }
 
 

@@ -43,6 +43,8 @@ from sim.options import (
     RunnerOptions,
     default_params,
 )
+from sim.randomization.draws import NOTHING, Draws
+from sim.randomization.randomization import Randomization
 from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
 from sim.workers.ledger import Commit, Ledger
@@ -62,7 +64,6 @@ from sim.workers.requests import (
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
-    from sim.engine.variation import Variation
 
 _FARTHEST = 1e6  # rad or m, and per second: PhysX turns what is beyond into NaN
 
@@ -84,6 +85,7 @@ class _Books(NamedTuple):
 
     params: bp.PIDParams
     faults: FaultLog
+    draws: Draws
     steps: int = 0
     steps_since_checkpoint: int = 0
     work_seconds: tuple[float, ...] = ()
@@ -138,7 +140,7 @@ class Runner:
         on_fault: FaultAction = "hold",
         speed_limit: ArrayLike | None = None,
         actuators: bp.Actuators | None = None,
-        variation: Variation | None = None,
+        randomization: Randomization | None = None,
         on_invalid_input: InvalidInputAction = "raise",
         recover: bool = True,
         checkpoint_steps: int | None = 8000,
@@ -164,7 +166,7 @@ class Runner:
             on_fault=on_fault,
             speed_limit=speed_limit,
             actuators=actuators,
-            variation=variation,
+            randomization=randomization,
             on_invalid_input=on_invalid_input,
             recover=recover,
             checkpoint_steps=checkpoint_steps,
@@ -189,10 +191,13 @@ class Runner:
                 self.num_envs, self.timestep, lambda qpos: robot_dynamics(robot).nearest_links(qpos)
             )
         self._pool = WorkerPool(options, params)
-        self._ledger = Ledger(self._pool, _Books(params, faults, actuators=options.actuators, contacts=contacts))
+        randomization = options.randomization
+        draws = NOTHING if randomization is None else randomization.first(robot, self.num_envs)
+        books = _Books(params, faults, draws, actuators=options.actuators, contacts=contacts)
+        self._ledger = Ledger(self._pool, books)
         try:
             self._pool.open()
-            self.reset()
+            self.reset(seed=None if randomization is None else 0)
         except BaseException:
             self.close()
             raise
@@ -211,7 +216,12 @@ class Runner:
     # -- commands ------------------------------------------------------------------------------------------------
 
     def reset(
-        self, qpos: ArrayLike | None = None, qvel: ArrayLike | None = None, mask: ArrayLike | None = None
+        self,
+        qpos: ArrayLike | None = None,
+        qvel: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        *,
+        seed: int | ArrayLike | None = None,
     ) -> Observation:
         """Place robots at ``qpos`` and ``qvel`` with a fresh controller state and zero effort.
 
@@ -222,20 +232,30 @@ class Runner:
             where their leaders have them.
         mask
             Envs to reset (envs,) bool; default all. The others are not affected.
+        seed
+            Begin with the first episode of another stream of the randomization: an int s for stream s + k in env k, or
+            one for each env. Default: draw for the next episode of each env's stream.
         """
-        self._settle()
+        books = self._settle()
         position = self._state("qpos", self.robot.start if qpos is None else qpos)
         velocity = self._state("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        self._limits.check("qpos", self.robot.coupled(position[chosen]))
+        draws, randomization = books.draws, self.options.randomization
+        if randomization is not None:
+            draws = randomization.redraw(self.robot, draws, chosen, seed)
+            position, velocity = randomization.start(position, velocity, draws, self.robot)
+        elif seed is not None:
+            raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
         if (coupling := self.robot.coupling) is not None:
             position, velocity = coupling.positions(position), coupling.rates(velocity)
-        self._limits.check("qpos", position[chosen])
 
         def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
             present = self._pool.present
-            return books._replace(faults=books.faults.without(chosen).noting(present)), _copy(present)
+            faults = books.faults.without(chosen).noting(present)
+            return books._replace(faults=faults, draws=draws), _copy(present)
 
-        observation: Observation = self._execute(Reset(chosen, position, velocity), commit)
+        observation: Observation = self._execute(Reset(chosen, position, velocity, draws), commit)
         return observation
 
     def step(
@@ -416,13 +436,13 @@ class Runner:
         It is a barrier: this runner, too, goes on as if restored from it, so that both are bit-identical from here on.
         """
         self._settle()
-        self._refuse_variation()
 
         def commit(books: _Books, results: list[Any]) -> tuple[_Books, Snapshot]:
-            snapshot = Snapshot(
-                self.options.about(), books.steps, books.params, EnvStates.join(results), books.actuators
-            )
-            self._pool.start_replay_from(Restore(snapshot))
+            episodes = None if self.options.randomization is None else books.draws.episodes
+            states = EnvStates.join(results)
+            about = self.options.about()
+            snapshot = Snapshot(about, books.steps, books.params, states, books.actuators, episodes)
+            self._pool.start_replay_from(Restore(snapshot, books.draws))
             return books._replace(steps_since_checkpoint=0), snapshot
 
         snapshot: Snapshot = self._execute(TakeSnapshot(), commit)
@@ -437,22 +457,25 @@ class Runner:
             It is of another robot, number of envs, timestep, control, ...
         """
         self._settle()
-        self._refuse_variation()
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
         snapshot.check(self.options.about())
         self.options.check_params(snapshot.params)
         sizes = [size for part in self._execute(ReadContentSizes(), _read) for size in part]
-        controller, actuators = (
-            initial_state(self.options, snapshot.params),
-            self.options.check_actuators(snapshot.actuators),
-        )
-        motors = initial_actuators(actuators, *self._shape, self.timestep)
-        stiction = self.options.has_stiction(actuators)
+        controller = initial_state(self.options, snapshot.params)
+        acting = actuators = self.options.check_actuators(snapshot.actuators)
+        draws, randomization = NOTHING, self.options.randomization
+        if randomization is not None and snapshot.episodes is not None:
+            draws = randomization.draw(self.robot, snapshot.episodes)
+            acting = randomization.randomized_actuators(actuators, draws, self.robot)
+        motors = initial_actuators(acting, *self._shape, self.timestep)
+        stiction = self.options.has_stiction(acting)
         snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, sizes)
+        request = Restore(replace(snapshot, actuators=actuators), draws)
 
         def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
-            self._pool.start_replay_from(Restore(snapshot))
+            self._pool.start_replay_from(request)
             books = books._replace(
+                draws=draws,
                 params=snapshot.params,
                 actuators=actuators,
                 steps=snapshot.steps,
@@ -461,7 +484,7 @@ class Runner:
             )
             return books, _copy(self._pool.present)
 
-        observation: Observation = self._execute(Restore(snapshot), commit)
+        observation: Observation = self._execute(request, commit)
         return observation
 
     def settle(self) -> None:
@@ -489,6 +512,9 @@ class Runner:
             versions=self._versions,
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
             faults=tuple(self.faults),
+            randomization=None if self.options.randomization is None else self.options.randomization.to_dict(),
+            draws=None if self.options.randomization is None else self.draws,
+            episodes=None if self.options.randomization is None else self.episodes,
         )
 
     @cached_property
@@ -505,6 +531,16 @@ class Runner:
         """First contact that each robot would have had since it was placed, without collisions; latest last."""
         contacts = self._books.contacts
         return () if contacts is None else tuple(contacts.contacts)
+
+    @property
+    def draws(self) -> dict[str, NDArray[np.float64]]:
+        """Draws of the randomization for the present episodes, by field: (envs, joints or links), as copies."""
+        return {name: rows.copy() for name, rows in self._books.draws.values.items()}
+
+    @property
+    def episodes(self) -> NDArray[np.int64]:
+        """Stream and number of the present episode of each env (envs, 2); (0, 2) without a randomization."""
+        return self._books.draws.episodes.copy()
 
     @property
     def backend(self) -> str:
@@ -654,12 +690,6 @@ class Runner:
             return most
         left = every - self._settle().steps_since_checkpoint % every
         return min(most, -(-left // self.substeps))
-
-    def _refuse_variation(self) -> None:
-        if self.options.variation is not None:
-            raise InvalidArgumentError(
-                "variation", "is not part of snapshots", remedy="make the runner without variation="
-            )
 
     def _settle(self, *, refusals: bool = False) -> _Books:
         """Complete a command that was sent or interrupted; return the books."""

@@ -21,6 +21,7 @@ class CompareCommand:
     seed: int = 0
     """Seed of the moves; no search of `batchpid tune` with the same seed sees them."""
     seconds: flags.Seconds = 2.0
+    randomize: flags.Randomize = None
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
@@ -38,7 +39,7 @@ class CompareCommand:
         """Run the command."""
         from sim import plots
         from sim.cli.report import draw_first_move, evaluation_table
-        from sim.cli.run import evaluate_sets
+        from sim.cli.run import evaluate_sets, read_variation
 
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
@@ -46,12 +47,14 @@ class CompareCommand:
         sets = [gain_set(robot, name) for name in self.gains or default]
         if picture is not None and len(sets) < 2:
             raise InvalidArgumentError("gains", "is one set", remedy="name two for a picture")
+        variation = (self.payload, self.friction) if self.variation else None
+        robot, randomization = read_variation(robot, self.randomize, variation)
         evaluations = evaluate_sets(
             robot,
             sets,
             moves=self.moves,
             seed=self.seed,
-            variation={"payload": self.payload, "friction": self.friction} if self.variation else None,
+            randomization=randomization,
             seconds=self.seconds,
             workers=self.workers,
             physics=self.physics,

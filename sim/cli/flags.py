@@ -78,6 +78,14 @@ Backend = Annotated[Literal["numpy", "jax"], _flag("Library of the law: NumPy, o
 Seconds = Annotated[float, _flag("Simulated time [s].")]
 Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]
+Randomize = Annotated[
+    str | None,
+    _flag(
+        "Draw the robot of each move or env: payload, model, or a YAML file (docs/randomization.md), e.g. "
+        "`payload: {uniform: [0, 0.5]}`.",
+        metavar="NAME|FILE",
+    ),
+]
 Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
 Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")]
 Friction = Annotated[float, _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")]

@@ -42,6 +42,7 @@ class RolloutCommand:
     collisions: flags.Collisions = True
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
+    randomize: flags.Randomize = None
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     actuators: flags.Actuators = None
@@ -56,13 +57,14 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from sim import Runner, plots
-        from sim.cli.run import hold_setpoint, start_poses
+        from sim.cli.run import hold_setpoint, read_variation, start_poses
 
         out = flags.output_path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = flags.output_path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(
             self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators, dissipation=self.dissipation
         )
+        robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         target = robot.start if robot.settings is None else robot.settings.target
@@ -82,6 +84,7 @@ class RolloutCommand:
             physics=self.physics,
             backend=self.backend,
             collisions=self.collisions,
+            randomization=randomization,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():

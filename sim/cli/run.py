@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from batchpid.validate import integer, number
 from sim import Robot, Rollout, Runner, read_recording
 from sim.cli.progress import bar
 from sim.cli.report import run_report
+from sim.randomization.randomization import Randomization
 from sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from sim.tuning.gain_sets import GainSet
 from sim.tuning.moves import Moves, random_moves, tutorial_move
-from sim.tuning.randomization import draw_variation
+from sim.tuning.randomization import at_the_joints, load_randomization, reseeded, usual_variation
 
 
 def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArray[np.float64]:
@@ -45,19 +47,40 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
 
 
 def evaluate_sets(
-    robot: Robot, sets: Sequence[GainSet], *, moves: int, seed: int, variation: dict[str, Any] | None, **options: Any
+    robot: Robot, sets: Sequence[GainSet], *, moves: int, seed: int, randomization: Randomization | None, **options: Any
 ) -> list[Evaluation]:
     """Evaluate ``sets`` on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
 
-    ``variation`` has options of :func:`sim.tuning.randomization.draw_variation`; ``options`` go to
-    :func:`sim.tuning.evaluation.evaluate_gains`.
+    ``options`` go to :func:`sim.tuning.evaluation.evaluate_gains`. Of the actuators, those at the joints act on drives.
     """
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
-    drawn = None if variation is None else draw_variation(robot, len(unseen.start), seed + 1, **variation)
-    return [
-        evaluate_gains(robot, each.params, unseen, name=each.name, control=each.control, variation=drawn, **options)
-        for each in bar("comparing", unit="set")(sets)
-    ]
+
+    def evaluate(each: GainSet) -> Evaluation:
+        drawn = reseeded(randomization, seed + 1)
+        drawn = at_the_joints(drawn) if each.control == "drive" else drawn
+        known = options | {"name": each.name, "control": each.control, "randomization": drawn}
+        return evaluate_gains(robot, each.params, unseen, **known)
+
+    return [evaluate(each) for each in bar("comparing", unit="set")(sets)]
+
+
+def read_variation(
+    robot: Robot, randomize: str | None, variation: tuple[float, float] | None = None
+) -> tuple[Robot, Randomization | None]:
+    """Return the robot and the randomization that flags of these names ask for; ``variation``: payload and friction.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The file does not fit, or there is ``--variation`` with ``--randomize`` or ``--actuators``.
+    """
+    if variation is None:
+        return robot, None if randomize is None else load_randomization(randomize, robot)
+    if randomize is not None or robot.actuators is not None:
+        remedy = "leave it out, and write what it stands for into these files"
+        raise InvalidArgumentError("variation", "excludes --randomize and --actuators", remedy=remedy)
+    randomization, actuators = usual_variation(robot, *variation)
+    return replace(robot, actuators=actuators), randomization
 
 
 def read_run(path: Path, robot: str | None, missing_meshes: str) -> tuple[Rollout, Robot]:

@@ -37,6 +37,7 @@ class TuneCommand:
     per_joint: flags.Switch = False
     """Search for a factor of each joint too; needs more generations."""
     weights: Annotated[Weights, tyro.conf.arg(name="")] = field(default_factory=Weights)
+    randomize: flags.Randomize = None
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
@@ -60,7 +61,7 @@ class TuneCommand:
         """Run the command."""
         from sim import plots
         from sim.cli.report import draw_first_move, evaluation_table
-        from sim.cli.run import evaluate_sets
+        from sim.cli.run import evaluate_sets, read_variation
         from sim.tuning.evaluation import arm_joints
         from sim.tuning.search import tune
 
@@ -72,7 +73,8 @@ class TuneCommand:
         out.parent.mkdir(parents=True, exist_ok=True)
         if not self.resume:
             history.unlink(missing_ok=True)
-        variation = {"payload": self.payload, "friction": self.friction} if self.variation else None
+        variation = (self.payload, self.friction) if self.variation else None
+        robot, randomization = read_variation(robot, self.randomize, variation)
         found = tune(
             robot,
             seed=self.seed,
@@ -82,7 +84,7 @@ class TuneCommand:
             gain_units=self.gain_units,
             per_joint=self.per_joint,
             weights=self.weights,
-            variation=variation,
+            randomization=randomization,
             workers=self.workers,
             cluster=self.cluster,
             time_limit=self.time_limit,
@@ -98,7 +100,7 @@ class TuneCommand:
             sets,
             moves=20,
             seed=self.seed,
-            variation=variation,
+            randomization=randomization,
             workers=self.workers,
             cluster=self.cluster,
             physics=self.physics,

@@ -95,7 +95,11 @@ def center_of_mass(spec: SceneSpec, link: str) -> tuple[str, NDArray[np.float64]
 
 def add_point_mass(link: Any, mass: float, position: NDArray[np.float64]) -> None:
     """Add ``mass`` [kg] at ``position`` (3,) [m] in the frame of one of SAPIEN's links."""
-    inertia = total([link_inertia(link), SpatialInertia(mass, position, np.zeros((3, 3)))])
+    set_inertia(link, total([link_inertia(link), SpatialInertia(mass, position, np.zeros((3, 3)))]))
+
+
+def set_inertia(link: Any, inertia: SpatialInertia) -> None:
+    """Give one of SAPIEN's links this inertia, in the frame of the link."""
     principal, axes = np.linalg.eigh(inertia.tensor)
     at = np.eye(4)
     at[:3, :3], at[:3, 3] = axes * np.linalg.det(axes), inertia.center  # a rotation, not a reflection

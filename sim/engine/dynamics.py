@@ -219,6 +219,13 @@ def loaded_dynamics(robot: RobotDescription, payload: float) -> Dynamics:
     return Dynamics(replace(spec, ground=False), payload, kinematics.links[kinematics.tool])
 
 
+def model_force(spec: SceneSpec, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
+    """Return the passive force of the model at ``qpos`` and ``qvel`` (M, dof), as a controller computes it."""
+    model, still = scene_dynamics(spec), np.zeros_like(qpos)
+    force = model.inverse_dynamics(qpos, qvel if coriolis else still, still)
+    return force if gravity else force - model.inverse_dynamics(qpos, still, still)
+
+
 def robot_dynamics(robot: RobotDescription, ground: bool | None = None) -> Dynamics:
     """Return the dynamics of ``robot`` on a fixed base, with or without a ground at height 0."""
     spec = SceneSpec(

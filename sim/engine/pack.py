@@ -83,7 +83,7 @@ class Pack:
         self._stepped_qpos: NDArray[Any] | None = None  # of the last sim step, where they were read
         self.friction = self._friction()
         self._implicit = np.array([[joint.armature[0] for joint in self.robots[0].active_joints]])
-        self.armature: NDArray[Any] = np.zeros((1, self.dof))
+        self.armature = self._motors = np.zeros((1, self.dof))
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
@@ -145,8 +145,7 @@ class Pack:
         qpos = self._calls.qpos(np.float64)
         if update:
             passive = self._calls.passive_force(True, True, np.float64)
-            matrix = scene_dynamics(self.spec).joint_mass_matrix(qpos)
-            constraint.update(matrix + self._implicit[:, None] * np.eye(self.dof), passive)
+            constraint.update(self.joint_mass_matrix(qpos) + self._implicit[:, None] * np.eye(self.dof), passive)
         self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
         self._calls.write_qf()
 
@@ -200,13 +199,13 @@ class Pack:
         """Return the joint velocities [rad/s or m/s], a new array."""
         return self._calls.qvel(dtype)
 
+    def joint_mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
+        return scene_dynamics(self.spec).joint_mass_matrix(qpos)
+
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], a new array."""
         return self._calls.passive_force(gravity, coriolis, dtype)
-
-    def delivered(self, effort: NDArray[Any]) -> NDArray[Any]:
-        """Return the efforts that the motors deliver when these are asked for (M, dof) [N m or N]."""
-        return effort
 
     def write_qf(self, effort: NDArray[Any]) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
@@ -270,8 +269,8 @@ class Pack:
         """Return the poses of each scene's watched entities, (watched, 7) each."""
         return [content.poses() for content in self._contents]
 
-    def write_joints(self, actuators: Actuators | None) -> None:
-        """Add the friction, damping and reflected inertia of ``actuators`` to those of the robot's description."""
+    def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
+        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
         added = Actuators() if actuators is None else actuators
         own, static = self._friction(), added.static
         both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
@@ -280,11 +279,12 @@ class Pack:
             static = static if own.coulomb is None else static + own.coulomb
             coulomb = np.zeros_like(static) if coulomb is None else coulomb
         self.friction = Friction(coulomb, viscous, static)
-        self.armature = np.zeros((1, self.dof)) if added.armature is None else added.armature
+        self.armature = self._motors + (0.0 if added.armature is None else added.armature)
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
         values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
-        for joint, value in zip(self._joints, values.reshape(-1, 1), strict=True):
-            joint.set_armature(value)
+        for row in range(self.size) if rows is None else rows:
+            for joint, value in zip(self.robots[row].active_joints, values[row, :, None], strict=True):
+                joint.set_armature(value)
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).

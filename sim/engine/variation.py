@@ -1,94 +1,177 @@
-"""Robots that differ from the model, env by env: payload, joint friction, quantized sensors, delayed efforts.
+"""Robots that differ from the model, env by env: payload, masses of links, friction, damping and armature of joints.
 
-Compensation and mass matrix stay those of the unloaded robot, because a controller does not know its payload.
+Compensation and mass matrix stay those of the model, because a controller does not know its payload.
+
+The engine takes these changes while a robot exists, and then moves bit-identically to a robot that was built with them,
+with one exception: a new center of mass moves the frames of the joints by rounding, so that they are set again.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sapien import Pose
 
 from batchpid.friction import Friction
-from sim.engine.building import SceneSpec, add_point_mass, center_of_mass
-from sim.engine.dynamics import scene_dynamics
+from sim.engine.building import SceneSpec, center_of_mass, merged, set_inertia
+from sim.engine.dynamics import model_force
 from sim.engine.pack import Pack
+from sim.robot.merging import place_links
 from sim.robot.mimics import coupling_of
+from sim.robot.spatial_inertia import SpatialInertia, total
 
 Float64 = NDArray[np.float64]
+_NO_MASS = 1e-6
+"""Mass [kg] that SAPIEN gives a link without mass."""
 
 
-@dataclass(frozen=True, eq=False)
-class Variation:
-    """Differences of each env's robot from the model."""
+class Variation(NamedTuple):
+    """Differences of some robots from the model, one row each; None where there is none."""
 
-    payload: Float64
-    """Mass added at the center of mass of ``link`` (envs,) [kg]."""
-    friction: Float64
-    """Coulomb friction added to every joint (envs,) [N m or N]."""
-    link: str
-    """Name of the link that carries the payload."""
-    resolution: float = 0.0
-    """Step of the position sensors [rad or m], 0 for none."""
-    late: bool = False
-    """True to apply every effort one sim step after it was computed."""
-
-    def for_envs(self, envs: slice | Any) -> Variation:
-        """Return the variation of some envs (a slice or an index array)."""
-        return Variation(self.payload[envs], self.friction[envs], self.link, self.resolution, self.late)
+    payload: Float64 | None = None
+    """Mass added at the center of mass of a link (envs,) [kg]."""
+    link_mass: Float64 | None = None
+    """Mass of each link of the URDF as a share of its own (envs, links); NaN for 1."""
+    friction: Float64 | None = None
+    """Coulomb friction of the joints (envs, dof) [N m or N]."""
+    damping: Float64 | None = None
+    """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
+    armature: Float64 | None = None
+    """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""
 
 
 class VariedPack(Pack):
-    """Pack whose robots differ from the model by ``variation``, one entry for each of its scenes."""
+    """Pack whose robots differ from the model by ``variation``, one row for each, which :meth:`vary` changes.
 
-    def __init__(self, spec: SceneSpec, size: int, first_env: int, system_size: int, variation: Variation) -> None:
-        self._variation, self._model, self._resolution = variation, scene_dynamics(spec), variation.resolution
-        self._carrier = center_of_mass(spec, variation.link)
+    ``carrier`` is the link of the URDF that carries the payload, ``links`` are those of ``variation.link_mass``.
+    """
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int,
+        system_size: int,
+        variation: Variation,
+        carrier: str,
+        links: Sequence[str],
+    ) -> None:
+        self._variation = variation
+        varies_mass = variation.payload is not None or variation.link_mass is not None
+        self._bodies = _bodies(spec, carrier, links if variation.link_mass is not None else []) if varies_mass else {}
+        self._least_share = _least_share(variation)
+        self._frames: list[tuple[Pose, Pose] | None] = []
         super().__init__(spec, size, first_env, system_size)
-        self._pending = np.zeros((size, self.dof)) if variation.late else None
+        if variation.armature is not None:
+            self._motors = variation.armature  # vary() changes its rows
+        self.write_joints(None)
+
+    def vary(self, rows: Sequence[int], variation: Variation) -> None:
+        """Change the robots ``rows`` to ``variation``, one row for each of them.
+
+        Next :meth:`write_joints` has to change their joints, and :meth:`write_state` to place them.
+        """
+        for mine, new in zip(self._variation, variation, strict=True):
+            if mine is not None:
+                mine[rows] = new
+        self._least_share = _least_share(self._variation)
+        for row in rows:
+            self._change_masses(self.robots[row], row)
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
-        """Return a new scene and the robot in it, with its payload."""
+        """Return a new scene and the robot in it, with its masses."""
         scene, robot = super()._build(row, system)
-        variation = self._variation
-        body, center = self._carrier
-        for link in robot.links:
-            if link.name == body:
-                add_point_mass(link, float(variation.payload[row]), center)
+        if not self._frames:
+            moves = [joint.parent_link is not None for joint in robot.joints]
+            pairs = zip(robot.joints, moves, strict=True)
+            self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
+        self._change_masses(robot, row)
         return scene, robot
 
-    def _friction(self) -> Friction:
-        """Return the friction of the joints, with what is added."""
-        coupling = coupling_of(self.spec.joints)
-        where = np.ones(self.dof) if coupling is None else coupling.independent  # the coupling moves the others
-        model, added = super()._friction(), self._variation.friction[:, None] * where
-        return model._replace(coulomb=added if model.coulomb is None else added + model.coulomb)
+    def _change_masses(self, robot: Any, row: int) -> None:
+        if not self._bodies:
+            return
+        for link in robot.links:
+            if (body := self._bodies.get(link.name)) is not None:
+                set_inertia(link, _varied_inertia(body, self._variation, row))
+        for joint, frames in zip(robot.joints, self._frames, strict=True):
+            if frames is not None:
+                joint.set_pose_in_parent(frames[0])
+                joint.set_pose_in_child(frames[1])
 
-    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the joint positions as the sensors measure them."""
-        qpos = super().read_qpos(dtype)
-        return qpos if self._resolution == 0 else (np.rint(qpos / self._resolution) * self._resolution).astype(dtype)
+    def _friction(self) -> Friction:
+        """Return the friction and damping of the joints."""
+        model, variation = super()._friction(), self._variation
+        if variation.friction is not None:
+            coupling = coupling_of(self.spec.joints)
+            where = 1.0 if coupling is None else coupling.independent  # the coupling moves the others
+            model = model._replace(coulomb=variation.friction * where)
+        return model if variation.damping is None else model._replace(viscous=variation.damping.copy())
+
+    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+        """Return a lower bound of the mass matrices that the joints show (M, dof, dof): that of the lightest links."""
+        return super().joint_mass_matrix(qpos) * self._least_share[:, None, None]
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the passive force of the unloaded robot's model at the measured positions."""
-        qpos, still = self.read_qpos(), np.zeros((self.size, self.dof))
-        qvel = self.read_qvel() if coriolis else still
-        force = self._model.inverse_dynamics(qpos, qvel, still)
-        if coriolis and not gravity:
-            force = force - self._model.inverse_dynamics(qpos, still, still)
+        """Return the passive force of the model at the measured positions."""
+        if not self._bodies:
+            return super().passive_force(gravity, coriolis, dtype)
+        force = model_force(self.spec, self.read_qpos(), self.read_qvel(), gravity, coriolis)
         return force.astype(dtype)
 
-    def delivered(self, effort: NDArray[Any]) -> NDArray[Any]:
-        """Return these efforts, or those of the step before where they are late."""
-        if self._pending is not None:
-            effort, self._pending = self._pending, np.array(effort, np.float64)
-        return effort
 
-    def write_state(self, rows: Sequence[int], *state: Any) -> None:
-        """Place robots; their pending efforts are dropped."""
-        super().write_state(rows, *state)
-        if self._pending is not None:
-            self._pending[list(rows)] = 0.0
+class _Part(NamedTuple):
+    """Link of the URDF in the simulated body that it is part of."""
+
+    inertia: SpatialInertia
+    """In the frame of the body."""
+    column: int | None
+    """Column of :attr:`Variation.link_mass`; None for a link that does not vary."""
+
+
+class _Body(NamedTuple):
+    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without."""
+
+    parts: list[_Part]
+    payload: Float64 | None
+
+
+def _bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, _Body]:
+    """Return the simulated bodies whose mass varies, by name: those of ``links``, and that of ``carrier``."""
+    placements, inertias = place_links(spec.urdf, spec.merge_fixed), merged(spec).inertias
+    parts: dict[str, list[_Part]] = defaultdict(list)
+    for name, at in placements.items():
+        if name in inertias and inertias[name].mass > 0:
+            inertia = inertias[name].moved(at.position, at.wxyz)
+            parts[at.link].append(_Part(inertia, links.index(name) if name in links else None))
+    loaded, place = center_of_mass(spec, carrier)
+    if not parts[loaded]:
+        parts[loaded].append(_Part(SpatialInertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)), None))
+    return {
+        body: _Body(members, place if body == loaded else None)
+        for body, members in parts.items()
+        if body == loaded or any(part.column is not None for part in members)
+    }
+
+
+def _least_share(variation: Variation) -> Float64:
+    """Return a bound b <= 1 (envs,) of the mass matrices: M >= b M of the model, since M is linear in the inertias."""
+    if variation.link_mass is None:
+        return np.ones(1)
+    return np.fmin(np.fmin.reduce(variation.link_mass, axis=1, initial=1.0), 1.0)
+
+
+def _varied_inertia(body: _Body, variation: Variation, row: int) -> SpatialInertia:
+    """Return the inertia of a body with its links scaled, and with the payload."""
+    parts = []
+    for part in body.parts:
+        share = 1.0 if variation.link_mass is None or part.column is None else variation.link_mass[row, part.column]
+        share = 1.0 if np.isnan(share) else share
+        parts.append(SpatialInertia(share * part.inertia.mass, part.inertia.center, share * part.inertia.tensor))
+    if body.payload is not None and variation.payload is not None:
+        parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
+    return total(parts)

@@ -11,8 +11,6 @@ import batchpid as bp
 from batchpid.actuators import ActuatorState, advance_effort, advance_measurement, discretise
 from batchpid.actuators.envelope import limits
 from batchpid.actuators.noise import normals
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import scene_dynamics
 from sim.loop.snapshot import EPISODE
 
 Float64 = NDArray[np.float64]
@@ -97,10 +95,3 @@ class JointActuators:
             steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
             self._normals, self._drawn = normals(state.key, steps, self._dof, np.float64, np), 0
         return self._normals[0][self._drawn], self._normals[1][self._drawn]
-
-
-def model_force(spec: SceneSpec, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
-    """Return the passive force of the model at ``qpos`` and ``qvel`` (M, dof), as a controller computes it."""
-    model, still = scene_dynamics(spec), np.zeros_like(qpos)
-    force = model.inverse_dynamics(qpos, qvel if coriolis else still, still)
-    return force if gravity else force - model.inverse_dynamics(qpos, still, still)

@@ -12,8 +12,8 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return why the sim steps of a tick cannot be one program of XLA, under backend "jax"; or nothing."""
     if options.robot.coupling is not None:
         return "coupled joints take constraint efforts of NumPy"
-    if options.variation is not None or actuators is not None:
-        return "actuators and variations are in NumPy"
+    if options.randomization is not None or actuators is not None:
+        return "actuators and randomizations are in NumPy"
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"
     status = xla.status()

@@ -23,7 +23,7 @@ def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
     runs, with the instructions that NumPy, OpenBLAS and XLA choose on this machine.
     """
     robot = options.robot
-    options = replace(options, num_envs=1, build=None, variation=None, actuators=None)
+    options = replace(options, num_envs=1, build=None, randomization=None, actuators=None)
     layout = Arrays.layout(_TICKS, 1, robot.dof)
     fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
     arrays = Arrays.from_fields(fields)

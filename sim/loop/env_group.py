@@ -8,16 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from sim.engine.dynamics import model_force
 from sim.engine.missed_contact import MissedContacts
 from sim.engine.pack import Pack
-from sim.loop.actuators import JointActuators, model_force
+from sim.engine.variation import VariedPack
+from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
 from sim.loop.compiled_tick import CompiledTick, compiled_tick
 from sim.loop.faults import FaultContainment, finite
 from sim.loop.friction import JointFriction
 from sim.loop.jitted import make_control
 from sim.loop.snapshot import EnvStates
+from sim.loop.variation import acting_actuators, acting_params, variation
 from sim.options import RunnerOptions
+from sim.randomization.draws import Draws
 
 Float64 = NDArray[np.float64]
 
@@ -37,6 +41,9 @@ class EnvGroup:
         self._gravity, self._coriolis = "gravity" in compensated, "coriolis" in compensated
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         self._coupling = options.robot.coupling
+        self.draws: Draws | None = None
+        """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
+        self._params, self._own_actuators = params, options.actuators  # before the randomization
         self._control = make_control(options, pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._friction = JointFriction(pack, self._control.drive)
@@ -62,13 +69,15 @@ class EnvGroup:
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
         self._release()
-        self._control.set_params(params)
+        self._params = params
+        self._control.set_params(acting_params(self._options, params, self.draws))
         self._friction.drive = self._control.drive
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
         self._release()
-        ours = self._actuators
+        self._own_actuators, ours = actuators, self._actuators
+        actuators = acting_actuators(self._options, actuators, self.draws)
         if actuators is None:
             self._actuators, self._control.limits = None, (None, None)
         elif ours is None:
@@ -88,6 +97,7 @@ class EnvGroup:
         self._release()
         containment = self._containment
         containment.clear(mask)
+        self._vary(mask)
         bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
         good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
         containment.start_qpos[good], containment.start_qvel[good] = qpos[good], qvel[good]
@@ -166,6 +176,19 @@ class EnvGroup:
             self._contacts.place(np.ones(pack.size, bool))
         self._compiled = self._make_compiled()
 
+    def _vary(self, mask: NDArray[np.bool_]) -> None:
+        """Put the draws of the envs of ``mask`` (M,), which are to be placed, into effect."""
+        rows = np.flatnonzero(mask).tolist()
+        if self._options.randomization is None or self.draws is None or not rows:
+            return
+        if isinstance(self.pack, VariedPack):
+            self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
+        actuators = acting_actuators(self._options, self._own_actuators, self.draws)
+        if self._actuators is not None and actuators is not None:
+            self._actuators.set_actuators(actuators, self._qpos)
+        self.pack.write_joints(actuators, rows)
+        self.set_params(self._params)
+
     # -- the closed loop ---------------------------------------------------------------------------------------
 
     def _run_substeps(self, substeps: int, command: Command) -> None:
@@ -191,10 +214,8 @@ class EnvGroup:
             else:
                 qvel = pack.read_qvel()
                 effort = self._actuated(actuators, command, step, qvel)
-            if effort is not None:
-                effort = pack.delivered(effort)
-                if step + 1 == substeps:
-                    self._motor[...] = effort
+            if effort is not None and step + 1 == substeps:
+                self._motor[...] = effort
             if friction.acts:
                 motor = np.zeros_like(self._qpos) if effort is None else effort
                 effort = friction.effort(motor, qvel)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from batchpid import friction
 from batchpid.elementwise import TURN, namespace, wrap
-from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
 from sim.loop.snapshot import AGE
@@ -70,7 +69,6 @@ class JointFriction:
 
     def update(self) -> None:
         """Take the friction of the pack, which has changed; the state carries on."""
-        self._model = self._pack.friction
         self.acts = any(leaf is not None for leaf in self._model)
         if self._model.coulomb is None:
             self._state = friction.FrictionState()
@@ -78,6 +76,10 @@ class JointFriction:
             self.reset(np.ones(self._pack.size, bool))
         else:
             self._age[:] = REFRESH_STEPS
+
+    @property
+    def _model(self) -> friction.Friction:
+        return self._pack.friction
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Reset the envs of ``mask`` (M,), which were placed."""
@@ -131,7 +133,7 @@ class JointFriction:
 
     def _mass_matrix(self) -> Float64:
         pack = self._pack
-        matrix = scene_dynamics(pack.spec).joint_mass_matrix(pack.read_qpos())
+        matrix = pack.joint_mass_matrix(pack.read_qpos())
         if pack.armature.any():
             matrix = matrix + pack.armature[:, None] * np.eye(pack.dof)
         return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)

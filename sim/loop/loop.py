@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 import batchpid as bp
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
-from sim.engine.variation import VariedPack
 from sim.loop.arrays import Arrays, Command, Ticks
 from sim.loop.env_group import EnvGroup
 from sim.loop.snapshot import EnvStates, Snapshot
+from sim.loop.variation import make_pack
 from sim.options import RunnerOptions
+from sim.randomization.draws import NOTHING, Draws
 
 GROUP_SIZE = 16
 """Envs of a group: enough to share the overhead of NumPy calls, few enough for the working set to stay in the cache."""
@@ -64,21 +65,21 @@ class Loop:
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
-        if options.actuators is not None:
-            self.set_actuators(options.actuators.for_envs(envs))
+        self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
-    def _build(self, envs: slice) -> Pack:
-        variation, pack_size, size = self.options.variation, self.options.scenes_per_system, envs.stop - envs.start
-        first = self._first_env + envs.start
-        if variation is None:
-            return Pack(self._scene, size, first, pack_size)
-        varied = variation.for_envs(slice(first, first + size))
-        return VariedPack(self._scene, size, first, pack_size, varied)
+    def _build(self, envs: slice, draws: Draws | None = None) -> Pack:
+        return make_pack(self.options, self._scene, envs.stop - envs.start, self._first_env + envs.start, draws)
 
-    def reset(self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state."""
+    def reset(
+        self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], draws: Draws = NOTHING
+    ) -> None:
+        """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state.
+
+        ``draws`` are those of all envs from now on; they differ from those before in these envs alone.
+        """
         for group, ticks in zip(self.groups, self._group_ticks, strict=True):
+            group.draws = draws.for_envs(group.envs)
             group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
             group.observe(ticks[0])
 
@@ -110,9 +111,11 @@ class Loop:
         self._place(states)
         return states
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Put every env into its state in ``snapshot``, with its params."""
+    def restore(self, snapshot: Snapshot, draws: Draws) -> None:
+        """Put every env into its state in ``snapshot``, with its params and ``draws``."""
         self._steps = snapshot.steps
+        for group in self.groups:
+            group.draws = draws.for_envs(group.envs)
         self.set_params(snapshot.params)
         self.set_actuators(snapshot.actuators)
         self._place(snapshot.states)
@@ -124,7 +127,7 @@ class Loop:
         # new world do not.
         for group in self.groups:
             group.pack.close()
-            group.write(self._build(group.envs), states.for_envs(group.envs))
+            group.write(self._build(group.envs, group.draws), states.for_envs(group.envs))
 
     def content_sizes(self) -> list[int]:
         """Return how many numbers a snapshot holds of each env's user content."""

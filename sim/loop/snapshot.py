@@ -26,6 +26,7 @@ from batchpid.friction import FrictionState
 from batchpid.npz import read_npz
 from batchpid.validate import file_path, integer, names
 from sim.loop.faults import CAUSES, FaultContainment
+from sim.loop.tables import flatten, nest, widen
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
@@ -63,14 +64,14 @@ class EnvStates:
 
     def for_envs(self, envs: slice) -> EnvStates:
         """Return the state of some envs, as copies."""
-        return EnvStates(**_nest({name: rows[envs].copy() for name, rows in _flatten(vars(self)).items()}))
+        return EnvStates(**nest({name: rows[envs].copy() for name, rows in flatten(vars(self)).items()}))
 
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
         """Return the states of the envs of all ``parts``."""
         width = max(part.content.shape[1] for part in parts)
-        tables = [_flatten(vars(replace(part, content=_widen(part.content, width)))) for part in parts]
-        return EnvStates(**_nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
+        tables = [flatten(vars(replace(part, content=widen(part.content, width)))) for part in parts]
+        return EnvStates(**nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
 
     def check(
         self,
@@ -105,7 +106,7 @@ class EnvStates:
             actuators=actuators,
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
-        ours, theirs = _flatten(vars(expected)), _flatten(vars(self))
+        ours, theirs = flatten(vars(expected)), flatten(vars(self))
         for name in sorted(ours | theirs):
             if name not in theirs:
                 problem = f"no {name}"
@@ -144,6 +145,8 @@ class Snapshot:
     params: bp.PIDParams
     states: EnvStates
     actuators: bp.Actuators | None = None
+    episodes: NDArray[np.int64] | None = None
+    """Stream and episode of each env (envs, 2), from which everything is drawn again; None without randomization."""
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Check that a runner with options ``about`` can restore it.
@@ -164,7 +167,9 @@ class Snapshot:
     def for_envs(self, envs: slice) -> Snapshot:
         """Return the snapshot of some envs."""
         actuators = None if self.actuators is None else self.actuators.for_envs(envs)
-        return replace(self, params=self.params.for_envs(envs), states=self.states.for_envs(envs), actuators=actuators)
+        episodes = None if self.episodes is None else self.episodes[envs]
+        params, states = self.params.for_envs(envs), self.states.for_envs(envs)
+        return replace(self, params=params, states=states, actuators=actuators, episodes=episodes)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz file, as a whole or not at all: an older file stays until this one is complete.
@@ -180,8 +185,10 @@ class Snapshot:
         head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": choices}
         tables: dict[str, Any] = {
             "head": np.array(json.dumps(head)),
-            **_flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
+            **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
         }
+        if self.episodes is not None:
+            tables["episodes"] = self.episodes
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
 
     @classmethod
@@ -215,7 +222,14 @@ class Snapshot:
         about, steps, choices = head["about"], head["steps"], head["markers"]
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
-        groups = _nest(tables)
+        episodes = tables.pop("episodes", None)
+        if (about.get("randomization") is None) != (episodes is None):
+            raise ValueError("its episodes do not fit its randomization")
+        if episodes is not None and (
+            episodes.shape != (num_envs, 2) or episodes.dtype != np.int64 or (episodes < 0).any()
+        ):
+            raise ValueError(f"its episodes are no counts (envs, 2) of {num_envs} envs")
+        groups = nest(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
         actuators = bp.make_actuators(dof, **motors) if motors else None
@@ -233,8 +247,10 @@ class Snapshot:
         if any(leaf.shape[:1] != (num_envs,) for leaf in controller.values()):
             raise ValueError(f"the state of its controller is not of {num_envs} envs")
         motors = initial_actuators(actuators, num_envs, dof, about["timestep"])
+        if (about.get("randomization") or {}).get("actuators"):
+            motors = states.actuators  # the runner that restores it checks them
         states.check(num_envs, dof, controller, bool(states.friction), motors, ())
-        return cls(about, steps, params, states, actuators)
+        return cls(about, steps, params, states, actuators, episodes)
 
     def __repr__(self) -> str:
         about = self.about
@@ -261,27 +277,3 @@ def _options(actuators: bp.Actuators | None) -> dict[str, NDArray[Any]]:
     if actuators is None:
         return {}
     return {name: np.asarray(value) for name, value in actuators.options().items() if name != "dtype"}
-
-
-def _flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Return all arrays by name; those of a group as "group.name"."""
-    tables: dict[str, NDArray[Any]] = {}
-    for name, value in groups.items():
-        tables |= {f"{name}.{leaf}": rows for leaf, rows in value.items()} if isinstance(value, dict) else {name: value}
-    return tables
-
-
-def _nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the groups of :func:`_flatten`."""
-    groups: dict[str, Any] = {"controller": {}, "friction": {}, "actuators": {}, "containment": {}}
-    for name, rows in tables.items():
-        group, dot, leaf = name.partition(".")
-        if dot:
-            groups.setdefault(group, {})[leaf] = rows
-        else:
-            groups[name] = rows
-    return groups
-
-
-def _widen(rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=np.nan)

@@ -26,7 +26,7 @@ from batchpid.files import write_atomically
 from batchpid.npz import read_npz
 from batchpid.validate import file_path, instance, integer
 from sim.loop.faults import Fault
-from sim.observation import RECORDED, Observation, Rollout, RunInfo
+from sim.observation import RECORDED, Observation, Redraw, Rollout, RunInfo
 from sim.recording.hdf5 import NOT_WRITTEN, read_hdf5
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 FORMAT = "batchpid-recording-1"
 HDF5 = (".h5", ".hdf5")
+_DRAW = "draw."  # in front of the names of draws
 CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
 DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
 """Dtype of each array of a recording."""
@@ -219,14 +220,22 @@ def faults_text(faults: Iterable[Fault]) -> str:
     return json.dumps([fault._asdict() for fault in faults])
 
 
+def redraws_text(redraws: Iterable[Redraw]) -> str:
+    """Return ``redraws`` as the JSON text that a recording holds."""
+    return json.dumps([list(redraw) for redraw in redraws])
+
+
 def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     """Return what is known of a run as numbers, texts, and arrays of them."""
     known = {name: value for name, value in vars(info).items() if value is not None}
     known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
     if info.params is not None:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
-    if info.versions is not None:
-        known["versions"] = json.dumps(dict(info.versions))
+    for name in ("versions", "randomization"):
+        if name in known:
+            known[name] = json.dumps(dict(known[name]))
+    known["redraws"] = redraws_text(info.redraws)
+    known |= {f"{_DRAW}{name}": rows for name, rows in known.pop("draws", {}).items()}
     known |= {"format": FORMAT, "num_envs": num_envs, "tick": tick}
     return known | {"checksum": attribute_checksum(known)}
 
@@ -245,19 +254,21 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     decode: dict[str, Callable[[Any], Any]] = {
         **dict.fromkeys(texts, str),
         **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
-        **dict.fromkeys(("lower", "upper", "effort_limit", "start"), _numbers),
+        **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
         "timestep": float,
         "substeps": int,
         **dict.fromkeys(("complete", "merge_fixed", "collisions"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
-        "versions": lambda text: dict(json.loads(str(text))),
+        **dict.fromkeys(("versions", "randomization"), lambda text: dict(json.loads(str(text)))),
+        "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),
         "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
     }
     for name in ("units", "lower", "upper", "effort_limit"):
         if np.shape(known[name]) != (len(names),):
             raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
-    return RunInfo(**{name: decode[name](value) for name, value in known.items()})
+    draws = {name.removeprefix(_DRAW): _numbers(rows) for name, rows in attributes.items() if name.startswith(_DRAW)}
+    return RunInfo(**{name: decode[name](value) for name, value in known.items()}, draws=draws or None)
 
 
 def _numbers(value: NDArray[Any]) -> NDArray[Any]:
@@ -278,3 +289,8 @@ def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> No
         raise ValueError("its times are not finite")
     if info.start is not None and info.start.shape != (envs, dof):
         raise ValueError(f"its start has shape {info.start.shape}, not {(envs, dof)}")
+    if info.episodes is not None and info.episodes.shape != (envs, 2):
+        raise ValueError(f"its episodes have shape {info.episodes.shape}, not {(envs, 2)}")
+    for name, rows in (info.draws or {}).items():
+        if rows.ndim != 2 or len(rows) != envs:
+            raise ValueError(f"its draws of {name} have shape {rows.shape}, not one row for each of {envs} envs")

@@ -90,7 +90,7 @@ class PartialFile:
         self._file.close()
         self._partial.unlink()
 
-    def finish(self, complete: bool, faults: str) -> None:
+    def finish(self, complete: bool, faults: str, redraws: str) -> None:
         """Close the file and give it its name; one that is not ``complete`` keeps the partial name if that one exists.
 
         Raises
@@ -102,12 +102,13 @@ class PartialFile:
         with contextlib.suppress(Exception):
             self._file.close()
         try:
-            self._reserve(size, len(faults))
+            self._reserve(size, len(faults) + len(redraws))
             # Without a lock, because a reader may hold one.
             with files.load_h5py().File(self._partial, "r+", locking=False) as file:
                 try:
                     file.attrs["complete"] = complete
                     file.attrs["faults"] = faults
+                    file.attrs["redraws"] = redraws
                     file.attrs["checksum"] = files.attribute_checksum(file.attrs)
                     file.flush()
                 except BaseException:

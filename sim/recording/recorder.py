@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
 from batchpid.validate import flag, instance, integer
 from sim.loop.faults import Fault
-from sim.observation import RECORDED, Observation
+from sim.observation import RECORDED, Observation, Redraw
 from sim.recording import files
 from sim.recording.files import RecordingError
 from sim.recording.partial_file import PartialFile
@@ -102,6 +102,7 @@ class Recorder:
         self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
         self._oldest = math.inf  # when the oldest row was recorded that is being written
         self._faults: deque[Fault] = runner.faults  # up to the last row
+        self._episodes, self._redraws = runner.episodes, list[Redraw]()
         self._end: Callable[[PartialFile], None] | None = None
         self._error: RecordingError | None = None
         self._has_raised = False
@@ -127,7 +128,10 @@ class Recorder:
             self._wake.put(None)
             time.sleep(_RETRY)
         self._check()
-        self._faults = self._runner.faults
+        self._faults, episodes = self._runner.faults, self._runner.episodes
+        for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
+            self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
+        self._episodes = episodes
         self._rows.put(_Row(time.monotonic(), time_, np.array(setpoint), observation))
 
     def close(self, complete: bool = True) -> None:
@@ -147,8 +151,8 @@ class Recorder:
                     failure = error
                 self._faults = runner.faults
             runner.recorder = None
-        faults = files.faults_text(self._faults)
-        self._finish_with(lambda file: file.finish(complete, faults))
+        faults, redraws = files.faults_text(self._faults), files.redraws_text(self._redraws)
+        self._finish_with(lambda file: file.finish(complete, faults, redraws))
         try:
             self._writing.result()
             self._check()

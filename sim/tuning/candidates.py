@@ -98,7 +98,8 @@ class Candidates:
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
         runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
-        rollout, m = run_moves(runner, moves.take(np.tile(np.arange(len(moves.start)), count)), self.seconds)
+        each = np.tile(np.arange(len(moves.start)), count)
+        rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each)
         w = self.weights
 
         def bounded(figure: Float64) -> Float64:

@@ -118,19 +118,26 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
 
 
 def run_moves(
-    runner: Runner, moves: Moves, seconds: float, progress: Callable[[Iterable[int]], Iterable[int]] | None = None
+    runner: Runner,
+    moves: Moves,
+    seconds: float,
+    progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+    streams: NDArray[np.int64] | None = None,
 ) -> tuple[Rollout, StepMetrics]:
     """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
 
-    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``.
+    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` are those of the runner's randomization
+    (moves,), by default one for each move: the draws are the same at every call.
     """
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
-        runner.reset(moves.start)
+        randomized = runner.options.randomization is not None
+        start = runner.reset(moves.start, seed=(0 if streams is None else streams) if randomized else None)
         rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)), progress=progress)
     with_effort = runner.control != "drive"
-    return rollout, step_response_metrics(runner.robot, rollout, moves.start, with_effort=with_effort)
+    began = start.qpos if randomized else moves.start
+    return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)
 
 
 def evaluate_gains(

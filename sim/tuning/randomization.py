@@ -1,45 +1,96 @@
-"""Random variations of the robots, env by env: payloads that the robot can carry, and joint friction."""
+"""Randomization for evaluation and search: presets, files, and payloads that the robot can carry."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-from batchpid.validate import integer, number
-from sim.engine.variation import Variation
+import numpy as np
+import yaml
+
+import batchpid as bp
+from batchpid.actuators import JOINT_SIDE
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import file_path, number
+from sim.options import RunnerOptions
+from sim.randomization.checks import check_robot
+from sim.randomization.distributions import Uniform
+from sim.randomization.randomization import Randomization
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 
 GRAVITY = 9.81
+ENCODER = 2 * np.pi / 2**18
+"""Resolution of an 18-bit encoder [rad]."""
 PAYLOAD_SHARE = 0.5
 """Share that a payload may take of the effort that the robot's own weight leaves."""
+PAYLOAD = 0.5
+"""Largest payload of the presets [kg]; less where the robot cannot carry it."""
+PRESETS: dict[str, dict[str, Any]] = {
+    "payload": {},
+    "model": {
+        "link_mass": Uniform(0.9, 1.1, operation="scale"),
+        "friction": Uniform(0.5, 1.5, operation="scale", shared=True),
+        "damping": Uniform(0.5, 1.5, operation="scale", shared=True),
+    },
+}
+"""Fields of the presets, in addition to the payload."""
 
 
-def draw_variation(
-    robot: Robot,
-    num_envs: int,
-    seed: int = 0,
-    *,
-    payload: float = 2.0,
-    friction: float = 0.1,
-    resolution: float = 2 * np.pi / 2**18,
-    late: bool = True,
-) -> Variation:
-    """Return a variation for ``num_envs`` envs, with payload and friction drawn uniformly.
+def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomization:
+    """Return a preset for ``robot``, or the randomization in a YAML file; without a seed there, with ``seed``.
 
-    Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; joint friction from 0
-    to ``friction`` [N m or N]. ``resolution`` and ``late`` are those of :class:`Variation`. Raises
-    InvalidArgumentError for a number out of range.
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such preset or file, or it does not fit the robot.
     """
-    num_envs, seed = integer("num_envs", num_envs, 1, 1_000_000), integer("seed", seed, 0, 2**63 - 1)
+    if name in PRESETS:
+        payload = Uniform(0, min(PAYLOAD, payload_capacity(robot)))
+        return Randomization(seed=seed, payload=payload, **PRESETS[str(name)])
+    path = file_path("randomize", name)
+    try:
+        known = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidArgumentError(
+            "randomize",
+            f"is neither a preset nor a file that can be read: {error}",
+            value=str(name),
+            remedy=f"use a YAML file, or {' or '.join(PRESETS)}",
+        ) from None
+    known = {"seed": seed, **known} if isinstance(known, dict) else known
+    randomization = Randomization.from_dict(known)
+    check_robot(randomization, robot)
+    return randomization
+
+
+def usual_variation(
+    robot: Robot, payload: float = 2.0, friction: float = 0.1, timestep: float = RunnerOptions.timestep
+) -> tuple[Randomization, bp.Actuators]:
+    """Return the robots of ``--variation``: payload and friction drawn uniformly, 18-bit sensors, efforts a step late.
+
+    Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; friction from 0 to
+    ``friction`` [N m or N], added to all joints alike. Raises InvalidArgumentError for a number out of range.
+    """
     payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "N m or N")
-    rng, kinematics = np.random.default_rng(seed), Kinematics(robot)
-    return Variation(
-        payload=rng.uniform(0, min(payload, payload_capacity(robot)), num_envs),
-        friction=rng.uniform(0, friction, num_envs),
-        link=kinematics.links[kinematics.tool],
-        resolution=number("resolution", resolution, 0, np.inf, "rad or m"),
-        late=late,
+    drawn = Randomization(
+        payload=Uniform(0, min(payload, payload_capacity(robot))), friction=Uniform(0, friction, shared=True)
     )
+    return drawn, bp.make_actuators(robot.dof, command_delay=timestep, position_resolution=ENCODER)
+
+
+def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:
+    """Return ``randomization`` with ``seed`` added to its own, for other draws."""
+    return None if randomization is None else replace(randomization, seed=randomization.seed + seed)
+
+
+def at_the_joints(randomization: Randomization | None) -> Randomization | None:
+    """Return ``randomization`` with the fields of actuators that act on PhysX's drives, too: friction and inertia."""
+    if randomization is None:
+        return None
+    fields = {name: each for name, each in randomization.actuators.items() if name in JOINT_SIDE}
+    return replace(randomization, actuators=fields)
 
 
 def payload_capacity(robot: Robot) -> float:

@@ -19,7 +19,7 @@ import dataclasses
 import json
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -33,12 +33,13 @@ from batchpid.validate import integer, number
 from batchpid.versions import package_versions
 from sim.cluster import Ray
 from sim.loop.contact_log import MissedContactWarning
+from sim.randomization.randomization import Randomization
 from sim.robot.robot import Robot
 from sim.runner import Runner
 from sim.tuning.candidates import HEADROOM, Candidates
 from sim.tuning.evaluation import SUBSTEPS
 from sim.tuning.moves import Moves, random_moves, search_moves
-from sim.tuning.randomization import draw_variation
+from sim.tuning.randomization import reseeded
 from sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
@@ -78,7 +79,7 @@ def tune(
     per_joint: bool = False,
     weights: Weights | None = None,
     moves: Moves | None = None,
-    variation: Mapping[str, Any] | None = None,
+    randomization: Randomization | None = None,
     workers: int | None = None,
     cluster: Literal["ray"] | Ray | None = None,
     time_limit: float | None = None,
@@ -91,7 +92,7 @@ def tune(
     Parameters
     ----------
     seed
-        Of the search, the moves and the variation.
+        Of the search, the moves and, with that of the randomization, of the draws.
     generations, population
         Number of generations, and of candidates in each.
     seconds
@@ -105,9 +106,8 @@ def tune(
     moves
         Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Moves that are
         given are the final as well, and are searched on with the physics of the final, since they may touch something.
-    variation
-        Options of :func:`sim.tuning.randomization.draw_variation`, {} for its defaults: the robot of each move has its
-        own payload and friction, the same for all candidates. None: no variation.
+    randomization
+        The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     workers, cluster
         Number of processes, or a cluster: as for :class:`sim.Runner`. The result does not depend on them.
     time_limit
@@ -151,19 +151,16 @@ def tune(
         "seconds": seconds,
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
-        "variation": None if variation is None else dict(variation),
+        "randomization": None if randomization is None else randomization.to_dict(),
         **{name: str(value) for name, value in runner_options.items()},
         "search_physics": SEARCH_PHYSICS if is_free else None,
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
     record = _History(history, settings)
-    if variation is not None:
-        drawn = draw_variation(robot, count, seed, **variation)
-        runner_options["variation"] = drawn.for_envs(np.tile(np.arange(count), population))
     search = Candidates(robot, gain_units, per_joint, moves, seconds, weights)
     optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
     start = search.params(np.zeros((1, search.dimension)))
-    where = {"workers": workers, "cluster": cluster}
+    where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     points: list[Float64] = []
     began = time.monotonic()
@@ -188,11 +185,8 @@ def tune(
     if final is not None and best:
         ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS] if index]
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
-        if variation is not None:
-            drawn = draw_variation(robot, FINAL_MOVES, seed + _FINAL_SEED, **variation)
-            runner_options["variation"] = drawn.for_envs(np.tile(np.arange(FINAL_MOVES), len(finalists)))
         judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0)
-        options |= runner_options
+        options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
         with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
             best = finalists[int(np.argmin(judge.costs(runner, np.array(points)[finalists])))]
     return Tuning(

@@ -19,6 +19,7 @@ from sim.loop.canonical import canonical_digest
 from sim.loop.loop import Loop
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.options import RunnerOptions
+from sim.randomization.draws import NOTHING, Draws
 
 _RUN = struct.Struct("<cII??")  # b"R", ticks, substeps, use_rate, use_feedforward
 
@@ -109,10 +110,11 @@ class Reset(Request):
     mask: NDArray[np.bool_]
     qpos: NDArray[np.float64]
     qvel: NDArray[np.float64]
+    draws: Draws = NOTHING
     observed_tick = 0
 
     def apply(self, loop: Loop) -> None:
-        loop.reset(self.mask, self.qpos, self.qvel)
+        loop.reset(self.mask, self.qpos, self.qvel, self.draws)
 
 
 @dataclass(frozen=True)
@@ -199,13 +201,14 @@ class TakeSnapshot(Request):
 
 @dataclass(frozen=True)
 class Restore(Request):
-    """Put every env into its state in ``snapshot``, with its params."""
+    """Put every env into its state in ``snapshot``, with its params and ``draws``."""
 
     snapshot: Snapshot
+    draws: Draws = NOTHING
     observed_tick = 0
 
     def apply(self, loop: Loop) -> None:
-        loop.restore(self.snapshot)
+        loop.restore(self.snapshot, self.draws)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError
-from sim import Recorder, Robot, Runner, Snapshot, read_recording
+from sim import Randomization, Recorder, Robot, Runner, Snapshot, Uniform, read_recording
 
 CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "10000"))
 ROBOT = load_bundled("panda")
@@ -166,7 +166,7 @@ GOOD_RUNNER = {
     "pack_size": 1,
     "on_fault": "hold",
     "speed_limit": 100.0,
-    "variation": None,
+    "randomization": Randomization(payload=Uniform(0, 1)),
     "on_invalid_input": "raise",
     "recover": True,
     "checkpoint_steps": 100,

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import tiny_urdf
 
-from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner, RunnerOptions
 from sim.options import default_params
-from sim.tuning.randomization import draw_variation
 
 
 def same(first, second):
@@ -85,14 +83,6 @@ def test_options_are_plain_values_of_their_documented_type(panda):
     options = RunnerOptions(panda, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2)
     assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (int, int, float)
     np.testing.assert_array_equal(options.speed_limit, np.full(panda.dof, 2.0))
-
-
-def test_a_variation_turns_off_recovery_and_checkpoints(panda):
-    options = RunnerOptions(panda, 3, variation=draw_variation(panda, 3))
-    assert not options.recover
-    assert options.checkpoint_steps is None
-    with pytest.raises(InvalidArgumentError, match="variation: is for 3 envs, not 4"):
-        RunnerOptions(panda, 4, variation=draw_variation(panda, 3))
 
 
 def test_its_repr_fits_two_lines(panda):

@@ -104,6 +104,7 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
         "seconds",
         "substeps",
         "variation",
+        "randomize",
         "fps",
     ],
 )

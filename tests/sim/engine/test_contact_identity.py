@@ -6,6 +6,7 @@ import functools
 import os
 import signal
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from robots import load_bundled
 
 from sim import RecoveryWarning, Robot, Runner
 from sim.engine.contact_prediction import ContactPredictor
-from sim.tuning.randomization import draw_variation
+from sim.tuning.randomization import usual_variation
 
 N, TICKS = 16, 20
 OPEN_LOOP = {"kp": 0.0, "ki": 0.0, "kd": 0.0}
@@ -152,7 +153,8 @@ def test_a_robot_that_is_isolated_keeps_its_drives(jaco2, packs):
 
 
 def test_a_robot_that_is_isolated_keeps_its_payload_and_friction(jaco2, packs):
-    options = {"variation": draw_variation(jaco2, N, seed=2), "recover": False, "checkpoint_steps": None}
+    randomization, actuators = usual_variation(jaco2)
+    options = {"randomization": replace(randomization, seed=2), "actuators": actuators}
     isolated = []
     runs = [
         thrash(pack_size=size, after=lambda runner: isolated.append(packs.isolated()), **options) for size in (1, 8)

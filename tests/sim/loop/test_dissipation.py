@@ -7,11 +7,10 @@ import pytest
 from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
-from sim import Robot, Runner
+from sim import Randomization, Robot, Runner, Uniform
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.physics import PHYSICS
-from sim.engine.variation import Variation
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]
@@ -164,10 +163,11 @@ def test_friction_beyond_all_efforts_keeps_the_pose(fixed_base, gravity, tmp_pat
     assert rollout.ok.all()
 
 
-def test_friction_of_a_variation_is_in_the_urdfs_units(tmp_path):
-    variation = Variation(payload=np.zeros(3), friction=np.array([0.0, 0.4, 2.0]), link="arm")
-    rollout = push(wheel(tmp_path, 0.1, friction=0.1), np.ones(3), 0.5, variation=variation)
-    np.testing.assert_allclose(rollout.qvel[-1, :, 0], [0.9 / 0.1 * 0.5, 0.5 / 0.1 * 0.5, 0.0], rtol=1e-3)
+@pytest.mark.parametrize(("added", "speed"), [(0.0, 0.9 / 0.1 * 0.5), (0.4, 0.5 / 0.1 * 0.5), (2.0, 0.0)])
+def test_friction_that_is_drawn_is_in_the_urdfs_units(added, speed, tmp_path):
+    drawn = Randomization(friction=Uniform(added, added))
+    rollout = push(wheel(tmp_path, 0.1, friction=0.1), 1.0, 0.5, randomization=drawn)
+    np.testing.assert_allclose(rollout.qvel[-1, 0, 0], speed, rtol=1e-3)
 
 
 def test_without_friction_and_damping_the_effort_is_that_of_the_motor(tmp_path):

@@ -7,10 +7,10 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
+from sim import LogUniform, Randomization, Runner, Uniform
 from sim.tuning.evaluation import arm_joints, evaluate_gains, step_response_metrics
 from sim.tuning.moves import Moves, random_moves, tutorial_move
-from sim.tuning.randomization import Variation, draw_variation, payload_capacity
+from sim.tuning.randomization import PRESETS, load_randomization, payload_capacity, usual_variation
 
 
 def hold(pose, name="hold"):
@@ -66,14 +66,17 @@ def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
     assert not weak.worse_than(tuned, np.zeros(panda.dof, bool))  # no joint, no demand
 
 
-def test_variation_changes_the_motion_alike_for_any_number_of_workers(panda):
+def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
     moves = random_moves(panda, 3, 2)
-    drawn = draw_variation(panda, 3, 1)
-    assert (drawn.payload <= min(2.0, payload_capacity(panda))).all()
-    assert (drawn.friction <= 0.1).all()
+    drawn, actuators = usual_variation(panda)
+    assert drawn.payload.high <= payload_capacity(panda)
     plain, *varied = (
-        evaluate_gains(panda, panda.designed(), moves, seconds=0.3, variation=v, workers=w)
-        for v, w in ((None, 0), (drawn, 0), (drawn, 2))
+        evaluate_gains(panda, panda.designed(), moves, seconds=0.3, workers=workers, **options)
+        for workers, options in (
+            (0, {}),
+            (0, {"randomization": drawn, "actuators": actuators}),
+            (2, {"randomization": drawn, "actuators": actuators}),
+        )
     )
     assert varied[0].rollout.qpos.tobytes() == varied[1].rollout.qpos.tobytes()
     assert np.abs(varied[0].rollout.qpos - plain.rollout.qpos).max() > 1e-3
@@ -82,28 +85,28 @@ def test_variation_changes_the_motion_alike_for_any_number_of_workers(panda):
 def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it(panda):
     pose = panda.start.copy()
     pose[[1, 3]] = 0.8, -1.0
-    loaded = Variation(np.array([2.0]), np.zeros(1), "panda_hand")
+    loaded = Randomization(payload=Uniform(2.0, 2.0), payload_link="panda_hand")
     gains = bp.design_gains(panda, gain_units="mass_matrix", measurement_rate="measured")
-    evaluation = evaluate_gains(panda, gains, hold(pose), seconds=3.0, variation=loaded, workers=0)
+    evaluation = evaluate_gains(panda, gains, hold(pose), seconds=3.0, randomization=loaded, workers=0)
     assert evaluation.metrics.peak_deviation[0, 1] > 3e-3
     assert evaluation.metrics.steady_state_error[0, :7].max() < 1e-3
 
 
-def test_coarse_sensors_round_the_measured_positions(panda):
-    step = 0.01 * np.array([1, 1, 1, -1, 1, 1, 1, 0, 0])
-    small = Moves(panda.start[None], panda.start[None] + step, ("small",))
-    coarse = Variation(np.zeros(1), np.zeros(1), "panda_hand", resolution=1e-3, late=True)
-    evaluation = evaluate_gains(panda, panda.designed(), small, seconds=0.2, variation=coarse, workers=0)
-    steps = evaluation.rollout.qpos / 1e-3
-    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-2)
-
-
-def test_variation_must_fit_the_envs(panda):
-    with pytest.raises(InvalidArgumentError, match="variation"):
-        evaluate_gains(panda, panda.params(), random_moves(panda, 2), variation=draw_variation(panda, 3), workers=0)
-
-
-@pytest.mark.parametrize("argument", ["payload", "friction", "resolution"])
+@pytest.mark.parametrize("argument", ["payload", "friction"])
 def test_variation_out_of_range_is_refused(panda, argument):
     with pytest.raises(InvalidArgumentError, match=argument):
-        draw_variation(panda, 3, **{argument: -1.0})
+        usual_variation(panda, **{argument: -1.0})
+
+
+def test_randomization_is_a_preset_or_a_file(panda, tmp_path):
+    path = tmp_path / "drawn.yaml"
+    path.write_text("payload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n")
+    loaded = load_randomization(path, panda, seed=4)
+    kp = LogUniform(0.5, 2, operation="scale")
+    assert loaded == Randomization(seed=4, payload=Uniform(0, 0.3), params={"kp": kp})
+    for name in PRESETS:
+        assert load_randomization(name, panda).payload.high <= 0.5
+    path.write_text("payload: {uniform: [-1, 0]}")
+    for name, message in ((path, "payload: of 'payload' may become -1"), ("none.yaml", "neither a preset nor a file")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            load_randomization(name, panda)

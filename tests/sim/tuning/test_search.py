@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
+from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
+from sim import Randomization, Runner, Uniform
 from sim.tuning.moves import random_moves
 from sim.tuning.search import tune
 from sim.tuning.weights import Weights
@@ -93,13 +95,15 @@ def test_other_units_and_single_joints_can_be_searched_too(panda, units):
     assert found.cost == found.start_cost or np.ptp(ratio) > 0
 
 
-def test_variation_makes_another_search(panda):
-    moves = random_moves(panda, 1, 0)
-    plain, varied = (
-        tune(panda, moves=moves, variation=v, workers=0, **SMALL) for v in (None, {"payload": 1.0, "friction": 0.01})
+def test_randomization_and_actuators_make_another_search(panda):
+    moves, drawn = random_moves(panda, 1, 0), Randomization(payload=Uniform(0, 1))
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
+    plain, varied, late = (
+        tune(robot, moves=moves, workers=0, randomization=randomization, **SMALL)
+        for robot, randomization in ((panda, None), (panda, drawn), (late, None))
     )
-    assert plain.history != varied.history
-    assert varied.settings["variation"] == {"payload": 1.0, "friction": 0.01}
+    assert len({plain.history, varied.history, late.history}) == 3
+    assert varied.settings["randomization"] == drawn.to_dict()
 
 
 def test_time_limit_ends_the_search_after_a_generation(panda):

@@ -1,0 +1,132 @@
+"""Checks of a randomization: its names, and the range of what can result from its draws."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.actuators import JOINT_SIDE
+from batchpid.actuators.model import NEUTRAL
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice
+from sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
+from sim.randomization.randomization import Randomization
+from sim.robot.robot import Robot
+
+DRAWN = [name for name in NEUTRAL if name != "static"]  # which depends on another
+"""Fields of actuators that can be drawn."""
+_PAIRED = ("saturation_effort", "no_load_speed")
+_HUGE = 1e300
+
+
+def check_robot(randomization: Randomization, robot: Robot) -> None:
+    """Check that the names and ranges of ``randomization`` fit ``robot``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not.
+    """
+    for name, each in randomization.given.items():
+        if name in PHYSICAL:
+            _check_range(name, each, robot)
+        elif name in START:
+            list(parts(name, each, robot.joint_names))
+    if randomization.damping is not None and robot.dissipation != "urdf":
+        remedy = "load the robot with dissipation='urdf'"
+        raise InvalidArgumentError("damping", "is the engine's under this dissipation", remedy=remedy)
+    if randomization.payload_link is not None:
+        choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
+
+
+def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:
+    """Check that the params have the leaves that are drawn, and that no draw makes them invalid.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A leaf is off, or a draw may be out of its range.
+    """
+    for leaf, each in randomization.params.items():
+        name = f"params.{leaf}"
+        nominal = getattr(params, leaf, None) if leaf in params._fields else None
+        if nominal is None or isinstance(nominal, tuple):
+            on = [name for name, one in params._asdict().items() if one is not None and not isinstance(one, tuple)]
+            remedy = f"turn it on in the params, or draw one of {', '.join(on)}"
+            raise InvalidArgumentError(name, "is off in the params, or none of their numbers", remedy=remedy)
+        for _, chosen, distribution in parts(name, each, robot.joint_names):
+            for end in np.clip(distribution.support, -_HUGE, _HUGE):
+                leaves = np.array(nominal)
+                leaves[:, chosen] = distribution.apply(leaves[:, chosen], end)
+                params._replace(**{leaf: leaves}).check(params.num_envs, robot.joint_names)
+
+
+def prepared_actuators(
+    randomization: Randomization, actuators: bp.Actuators | None, robot: Robot, control: object = "pid"
+) -> bp.Actuators | None:
+    """Return ``actuators`` with every field that is drawn on, also where it is neutral, and histories long enough.
+
+    So the state has the same arrays in all envs.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A field is unknown, or has no effect under ``control``, or a draw may be out of its range, or changes a limit
+        that is off.
+    """
+    if not randomization.actuators:
+        return actuators
+    if control == "drive" and (bypassed := sorted(randomization.actuators.keys() - set(JOINT_SIDE))):
+        remedy = f"use control 'pid', or draw only {', '.join(JOINT_SIDE)}"
+        raise InvalidArgumentError(f"actuators.{bypassed[0]}", "has no effect on PhysX's drives", remedy=remedy)
+    known = bp.Actuators() if actuators is None else actuators
+    delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
+    values: dict[str, NDArray[Any]] = {}
+    for leaf, each in randomization.actuators.items():
+        nominal = getattr(known, choice("actuators", leaf, DRAWN))
+        if nominal is None and np.isinf(NEUTRAL[leaf]):
+            remedy = f"give the runner actuators with {leaf}"
+            raise InvalidArgumentError(f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy)
+        values[leaf] = np.full((1, robot.dof), NEUTRAL[leaf]) if nominal is None else np.asarray(nominal)
+        for _, chosen, distribution in parts(f"actuators.{leaf}", each, robot.joint_names):
+            for end in np.clip(distribution.support, -_HUGE, _HUGE):
+                rows = np.array(values[leaf])
+                rows[:, chosen] = distribution.apply(rows[:, chosen], end)
+                paired: dict[str, Any] = dict.fromkeys(_PAIRED, 1.0) if leaf in _PAIRED else {}
+                checked = bp.make_actuators(robot.dof, **(paired | {leaf: rows}), joint_names=robot.joint_names)
+                delay = max(delay, 0.0 if checked.max_delay is None else float(checked.max_delay[0, 0]))
+    like = bp.make_actuators(robot.dof, command_delay=1e-3, position_noise=1.0, max_delay=max(delay, 1e-3))
+    noisy = known.seed is None and not values.keys().isdisjoint(("position_noise", "velocity_noise"))
+    delayed = not values.keys().isdisjoint(("command_delay", "sensor_delay"))
+    return known._replace(
+        **values,
+        seed=like.seed if noisy else known.seed,
+        max_delay=like.max_delay if delayed else known.max_delay,
+        continuous=bp.make_actuators(robot.dof, continuous=robot.continuous).continuous,
+    )
+
+
+def _check_range(name: str, each: Field, robot: Robot) -> None:
+    """Check the results of the least and the largest draws."""
+    columns, nominal = elements(name, robot), nominal_values(name, robot)
+    strict = name == "link_mass"
+    for _, chosen, distribution in parts(name, each, columns):
+        if name == "payload" and distribution.operation == "scale":
+            raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
+        known = nominal[chosen]
+        if strict and distribution.operation == "scale":
+            known = np.where(np.isnan(known), 1.0, known)  # the engine finds it
+        ends = [distribution.apply(known, end) for end in np.clip(distribution.support, -_HUGE, _HUGE)]
+        least = np.min(ends, axis=0)
+        good = least > 0 if strict else least >= 0  # NaN is neither
+        if not good.all():
+            at = int(np.argmin(good))
+            raise InvalidArgumentError(
+                name,
+                f"of {columns[chosen[at]]!r} may become {least[at]:.3g}, but must be {'>' if strict else '>='} 0",
+                value=distribution.to_dict(),
+                remedy="change the bounds or the operation; a normal distribution takes low=",
+            )

@@ -1,0 +1,219 @@
+"""Distributions of a :class:`sim.Randomization`: uniform, log-uniform, normal, choice."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice, flag, number
+
+Float64 = NDArray[np.float64]
+Operation = Literal["add", "scale", "abs"]
+LEAST_SHARE = 0.01
+"""Least share of a normal distribution within its bounds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distribution(ABC):
+    """Distribution of a quantity, drawn for each joint or link separately.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument is out of range.
+    """
+
+    operation: Operation = "add"
+    """Use of a draw: ``"add"`` it to the nominal value, ``"scale"`` that by it, or ``"abs"``: take it instead."""
+    shared: bool = False
+    """True for one draw for all joints or links of an env."""
+    kind: ClassVar[str] = ""
+    """Name in a file, where the arguments without default are a list."""
+
+    def __post_init__(self) -> None:
+        choice("operation", self.operation, get_args(Operation))
+        flag("shared", self.shared)
+
+    @property
+    @abstractmethod
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+
+    @abstractmethod
+    def sample(self, generator: np.random.Generator, size: int) -> Float64:
+        """Return independent draws (size,)."""
+
+    def apply(self, nominal: Any, drawn: Any) -> Any:
+        """Return the value that results from the nominal one and a draw."""
+        if self.operation == "abs":
+            return drawn + np.zeros_like(nominal)
+        return nominal * drawn if self.operation == "scale" else nominal + drawn
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
+        values = [getattr(self, each.name) for each in fields(self) if not each.kw_only]
+        options = [each for each in fields(self) if each.kw_only and getattr(self, each.name) != each.default]
+        first = values if len(values) > 1 else list(*values)
+        return {self.kind: first, **{each.name: getattr(self, each.name) for each in options}}
+
+    def _numbers(self, *names: str, low: float = -math.inf) -> None:
+        for name in names:
+            value = number(name, getattr(self, name), low, math.inf, "in the unit of the field")
+            object.__setattr__(self, name, value)
+
+    def _ordered(self, low: float, high: float) -> None:
+        if low > high:
+            raise InvalidArgumentError("high", f"is less than low, {low:g}", value=high, remedy="swap them")
+
+
+@dataclass(frozen=True)
+class Uniform(Distribution):
+    """Uniform distribution on [low, high]."""
+
+    low: float
+    high: float
+    kind = "uniform"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._numbers("low", "high")
+        self._ordered(self.low, self.high)
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return self.low, self.high
+
+    def sample(self, generator: np.random.Generator, size: int) -> Float64:
+        """Return independent draws (size,)."""
+        return generator.uniform(self.low, self.high, size)
+
+
+@dataclass(frozen=True)
+class LogUniform(Distribution):
+    """Distribution on [low, high], both > 0, whose logarithm is uniform."""
+
+    low: float
+    high: float
+    kind = "log_uniform"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._numbers("low", "high", low=np.finfo(float).tiny)
+        self._ordered(self.low, self.high)
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return self.low, self.high
+
+    def sample(self, generator: np.random.Generator, size: int) -> Float64:
+        """Return independent draws (size,)."""
+        drawn = np.exp(generator.uniform(math.log(self.low), math.log(self.high), size))
+        return np.clip(drawn, self.low, self.high)  # against rounding
+
+
+@dataclass(frozen=True)
+class Normal(Distribution):
+    """Normal distribution, truncated to [low, high]: draws outside are repeated."""
+
+    mean: float
+    std: float
+    low: float = field(default=-math.inf, kw_only=True)
+    high: float = field(default=math.inf, kw_only=True)
+    kind = "normal"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._numbers("mean")
+        self._numbers("std", low=np.finfo(float).tiny)
+        low, high = (_bound(name, getattr(self, name)) for name in ("low", "high"))
+        self._ordered(low, high)
+        share = 0.5 * (math.erf((high - self.mean) / self._scale) - math.erf((low - self.mean) / self._scale))
+        if share < LEAST_SHARE:
+            problem = f"and high leave {share:.2g} of the draws"
+            raise InvalidArgumentError("low", problem, value=low, remedy="use a uniform distribution for a tail")
+
+    @property
+    def _scale(self) -> float:
+        return math.sqrt(2.0) * self.std
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return float(self.low), float(self.high)
+
+    def sample(self, generator: np.random.Generator, size: int) -> Float64:
+        """Return independent draws (size,)."""
+        drawn = generator.normal(self.mean, self.std, size)
+        while (outside := (drawn < self.low) | (drawn > self.high)).any():
+            drawn[outside] = generator.normal(self.mean, self.std, int(outside.sum()))
+        return drawn
+
+
+@dataclass(frozen=True)
+class Choice(Distribution):
+    """Choice among ``values``, all alike probable."""
+
+    values: Sequence[float]
+    kind = "choice"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.values, str) or not isinstance(self.values, Sequence | np.ndarray) or not len(self.values):
+            raise InvalidArgumentError("values", "must be a list of numbers", value=self.values, remedy="give one")
+        unit = "in the unit of the field"
+        values = tuple(number("values", value, -math.inf, math.inf, unit) for value in self.values)
+        object.__setattr__(self, "values", values)
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return min(self.values), max(self.values)
+
+    def sample(self, generator: np.random.Generator, size: int) -> Float64:
+        """Return independent draws (size,)."""
+        return np.array(self.values)[generator.integers(len(self.values), size=size)]
+
+
+KINDS: dict[str, type[Distribution]] = {each.kind: each for each in (Uniform, LogUniform, Normal, Choice)}
+"""Distributions by their name in a file."""
+
+
+def read_distribution(name: str, value: Any) -> Distribution:
+    """Return the distribution of the field ``name`` that a file describes, as :meth:`Distribution.to_dict` does.
+
+    Raises
+    ------
+    InvalidArgumentError
+        It describes none.
+    """
+    kinds = [kind for kind in KINDS if isinstance(value, Mapping) and kind in value]
+    if len(kinds) != 1:
+        remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
+        raise InvalidArgumentError(name, "is no distribution", value=value, remedy=remedy)
+    (kind,) = kinds
+    options = {key: option for key, option in value.items() if key != kind}
+    arguments = [value[kind]] if kind == Choice.kind else value[kind]
+    try:
+        if not isinstance(arguments, list | tuple):
+            raise TypeError(f"{kind} needs a list of numbers")
+        return KINDS[kind](*arguments, **options)
+    except TypeError as error:
+        remedy = f"the options are {', '.join(each.name for each in fields(KINDS[kind]) if each.kw_only)}"
+        raise InvalidArgumentError(name, f"is no distribution: {error}", value=value, remedy=remedy) from None
+    except InvalidArgumentError as error:
+        problem = f"{error.argument} {error.problem}"
+        raise InvalidArgumentError(name, problem, value=error.value, remedy=error.remedy) from None
+
+
+def _bound(name: str, value: Any) -> float:
+    """Return a bound, which may be infinite."""
+    return float(value) if value in (-math.inf, math.inf) else number(name, value, -math.inf, math.inf, "bound")

@@ -1,0 +1,68 @@
+"""Fields of a randomization: names, the joints or links that they have values for, and nominal values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice
+from sim.randomization.distributions import Distribution, read_distribution
+from sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+Field = Distribution | Mapping[str, Distribution]
+"""Distribution for all joints or links, or one for each of those that are named."""
+
+PHYSICAL = ("payload", "link_mass", "friction", "damping", "armature")
+"""Fields that change the simulated robot."""
+START = ("qpos", "qvel")
+"""Fields that change the state at a reset."""
+GROUPS = ("params", "actuators")
+"""Fields that are mappings, by name of a further field."""
+
+
+def elements(name: str, robot: Robot) -> Sequence[str]:
+    """Return what a field has one value each of: joints, links, or one thing."""
+    if name == "payload":
+        return ("payload",)
+    if name == "link_mass":
+        return [link.name for link in robot.links if link.mass or (link.mass is None and link.collisions)]
+    return robot.joint_names
+
+
+def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str, list[int], Distribution]]:
+    """Yield the name of each independent part of a field, its columns and its distribution."""
+    if isinstance(each, Distribution):
+        yield name, list(range(len(columns))), each
+        return
+    for element, distribution in each.items():
+        choice(name, element, columns)
+        yield f"{name}.{element}", [columns.index(element)], distribution
+
+
+def nominal_values(name: str, robot: Robot) -> Float64:
+    """Return the nominal values of a field in :data:`PHYSICAL` (elements,); NaN for masses that the engine finds."""
+    if name == "link_mass":
+        masses = {link.name: link.mass for link in robot.links}
+        return np.array([masses[link] for link in elements(name, robot)], np.float64)  # None is NaN
+    known = {"friction": robot.friction, "damping": robot.damping, "payload": np.zeros(1)}
+    return known.get(name, np.zeros(robot.dof))
+
+
+def mapping(name: str, value: object) -> Mapping[str, Any]:
+    """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
+    if not isinstance(value, Mapping):
+        remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
+        raise InvalidArgumentError(name, "is no mapping of fields to distributions", value=value, remedy=remedy)
+    return value
+
+
+def read_field(name: str, value: Any) -> Field:
+    """Return the field that a file describes: a distribution, or a mapping of names to distributions."""
+    if isinstance(value, Mapping) and value and all(isinstance(part, Mapping) for part in value.values()):
+        return {str(element): read_distribution(f"{name}.{element}", part) for element, part in value.items()}
+    return read_distribution(name, value)

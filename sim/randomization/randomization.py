@@ -1,0 +1,218 @@
+"""Randomization: distributions of a robot's parameters, drawn by (seed, env, episode).
+
+Each env has a stream, by default its index, and counts its episodes. The draws of one field come from the counter-based
+generator Philox4x64 (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) with the key (seed,
+hash of the field's name) and a counter that begins at (0, 0, episode, stream). So they depend on these alone, and not
+on other envs, fields or earlier episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.actuators import JOINT_SIDE
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice, integer, read_array
+from sim.randomization.distributions import Distribution
+from sim.randomization.draws import Draws, generators
+from sim.randomization.fields import GROUPS, PHYSICAL, START, Field, elements, mapping, parts, read_field
+from sim.robot.kinematics import Kinematics
+from sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+LARGEST = 2**63 - 1
+OF_JOINTS = ("bias", *JOINT_SIDE)
+"""Fields of the actuators that followers do not have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """Distributions of the parameters of the robots, for the option ``randomization`` of :class:`sim.Runner`.
+
+    A field is a distribution (:class:`sim.Uniform`, :class:`sim.LogUniform`, :class:`sim.Normal`, :class:`sim.Choice`),
+    drawn for each joint or link, or a mapping of the names of some joints or links to distributions.
+
+    The controller knows the nominal robot: compensation and mass matrix do not change.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A field is none of these.
+    """
+
+    seed: int = 0
+    """Seed of all draws."""
+    each: Literal["episode", "env"] = "episode"
+    """Draw for each ``"episode"``, when it begins with a reset, or once for each ``"env"``."""
+    payload: Distribution | None = None
+    """Mass at the center of mass of ``payload_link`` [kg]; nominal 0."""
+    payload_link: str | None = None
+    """Link that carries the payload; default the last before the fingers."""
+    link_mass: Field | None = None
+    """Masses of the links of the URDF [kg]; their inertia tensors change in proportion."""
+    friction: Field | None = None
+    """Coulomb friction of the joints [N m or N]; nominal that of the URDF."""
+    damping: Field | None = None
+    """Viscous damping of the joints [N m s/rad or N s/m]; nominal that of the URDF."""
+    armature: Field | None = None
+    """Reflected inertia of the motors [kg m^2 or kg]; nominal 0."""
+    qpos: Field | None = None
+    """Position at a reset [rad or m], within the joint limits; nominal that which is given to ``reset``."""
+    qvel: Field | None = None
+    """Velocity at a reset [rad/s or m/s]."""
+    params: Mapping[str, Field] = field(default_factory=dict)
+    """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
+    actuators: Mapping[str, Field] = field(default_factory=dict)
+    """Fields of :class:`batchpid.Actuators`, e.g. ``{"command_delay": ...}``; nominal those of the runner's actuators,
+    or those of ideal ones."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
+        choice("each", self.each, get_args(Literal["episode", "env"]))
+        for group in GROUPS:
+            object.__setattr__(self, group, dict(mapping(group, getattr(self, group))))
+        remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
+        for name, each in self.given.items():
+            given = list(each.values()) if isinstance(each, Mapping) and name != "payload" else [each]
+            for part in given or [None]:
+                if not isinstance(part, Distribution):
+                    raise InvalidArgumentError(name, "is no distribution", value=part, remedy=remedy)
+
+    @property
+    def given(self) -> dict[str, Field]:
+        """Fields that are given, by name, those of a group as "group.name"."""
+        known = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
+        for group in GROUPS:
+            known |= {f"{group}.{name}": each for name, each in getattr(self, group).items()}
+        return {name: each for name, each in known.items() if each is not None}
+
+    @property
+    def changes_robot(self) -> bool:
+        """True if the simulated robots differ from the model."""
+        return any(getattr(self, name) is not None for name in PHYSICAL)
+
+    def carrier(self, robot: Robot) -> str:
+        """Return the name of the link that carries the payload."""
+        kinematics = Kinematics(robot)
+        return self.payload_link or kinematics.links[kinematics.tool]
+
+    # -- draws -------------------------------------------------------------------------------------------------------
+
+    def draw(self, robot: Robot, episodes: NDArray[Any]) -> Draws:
+        """Return the draws for envs with these streams and episodes (envs, 2)."""
+        values, episodes = {}, episodes.astype(np.int64)
+        for name, each in self.given.items():
+            columns = elements(name, robot)
+            rows = np.full((len(episodes), len(columns)), np.nan)
+            for part, chosen, distribution in parts(name, each, columns):
+                each_env = generators(self.seed, part, episodes, self.each == "env")
+                size = 1 if distribution.shared else len(chosen)
+                for row, generator in zip(rows, each_env, strict=True):
+                    row[chosen] = distribution.sample(generator, size)
+            values[name] = rows
+        return Draws(episodes, values)
+
+    def first(self, robot: Robot, num_envs: int) -> Draws:
+        """Return the draws for the first episode of each env, of the stream of its index."""
+        return self.draw(robot, np.stack([np.arange(num_envs), np.zeros(num_envs, np.int64)], 1))
+
+    def redraw(self, robot: Robot, draws: Draws, mask: NDArray[np.bool_], seed: int | ArrayLike | None) -> Draws:
+        """Return ``draws`` with new ones for the envs of ``mask`` (envs,), which begin an episode.
+
+        It is the next of each env's stream, or the first of the stream ``seed`` + k for env k, or of ``seed`` (envs,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            A seed is negative, or no whole number, or there is not one for each env.
+        """
+        num_envs = len(mask)
+        if seed is None:
+            episodes = draws.episodes + np.array([0, 1])
+        else:
+            if np.ndim(seed) == 0:
+                streams = integer("seed", seed, 0, LARGEST - num_envs) + np.arange(num_envs)
+            else:
+                streams = read_array("seed", seed, "iu")
+                if streams.shape != (num_envs,) or not ((streams >= 0) & (streams <= LARGEST)).all():
+                    problem = f"must be {num_envs} whole numbers >= 0, one for each env"
+                    raise InvalidArgumentError("seed", problem, value=seed, remedy="pass these, or an int")
+            episodes = np.stack([streams.astype(np.int64), np.zeros(num_envs, np.int64)], 1)
+        return draws.replaced(mask, self.draw(robot, episodes[mask]))
+
+    def apply(self, name: str, nominal: Any, draws: Draws, robot: Robot) -> Float64:
+        """Return the values of a field (envs, joints or links) that result from ``nominal``, which broadcasts to it."""
+        drawn = draws.values[name]
+        values = np.array(np.broadcast_to(nominal, drawn.shape))
+        for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):
+            values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
+        return values
+
+    def randomized_params(self, params: bp.PIDParams, draws: Draws | None, robot: Robot) -> bp.PIDParams:
+        """Return ``params`` with the draws applied, one row for each env; the same if nothing is drawn for them."""
+        if draws is None or not self.params:
+            return params
+        values = {name: self.apply(f"params.{name}", getattr(params, name), draws, robot) for name in self.params}
+        return params._replace(**{name: rows.astype(params.dtype) for name, rows in values.items()})
+
+    def randomized_actuators(
+        self, actuators: bp.Actuators | None, draws: Draws | None, robot: Robot
+    ) -> bp.Actuators | None:
+        """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is drawn for them.
+
+        They are those of :func:`sim.randomization.checks.prepared_actuators`.
+        """
+        if draws is None or actuators is None or not self.actuators:
+            return actuators
+        values = {}
+        for name in self.actuators:
+            rows = self.apply(f"actuators.{name}", getattr(actuators, name), draws, robot)
+            values[name] = rows * robot.independent if name in OF_JOINTS else rows
+        return actuators._replace(**values)
+
+    def start(self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot) -> tuple[Float64, Float64]:
+        """Return position and velocity (envs, dof) at a reset to ``qpos`` and ``qvel``; NaN stays."""
+        if self.qpos is not None:
+            qpos = np.clip(self.apply("qpos", qpos, draws, robot), robot.lower, robot.upper)
+        if self.qvel is not None:
+            qvel = self.apply("qvel", qvel, draws, robot)
+        return qpos, qvel
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain values, for :meth:`from_dict`; what is not given is left out."""
+
+        def plain(each: Any) -> Any:
+            if isinstance(each, Mapping):
+                return {name: plain(part) for name, part in each.items()}
+            return each.to_dict() if isinstance(each, Distribution) else each
+
+        known = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: plain(value) for name, value in known.items() if value is not None and value != {}}
+
+    @classmethod
+    def from_dict(cls, known: Mapping[str, Any]) -> Randomization:
+        """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0, 0.5]}, ...}``.
+
+        Raises
+        ------
+        InvalidArgumentError
+            It is none, or has a field that is unknown.
+        """
+        known = mapping("randomization", known)
+        names = [each.name for each in fields(cls)]
+        values = {choice("randomization", name, names): value for name, value in known.items()}
+        for name in (*PHYSICAL, *START):
+            if name in values:
+                values[name] = read_field(name, values[name])
+        for group in GROUPS:
+            given = mapping(group, values.get(group, {}))
+            values[group] = {name: read_field(f"{group}.{name}", value) for name, value in given.items()}
+        return cls(**values)

@@ -1,0 +1,105 @@
+"""Distributions: moments, bounds, and what they are in a file."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from batchpid.errors import InvalidArgumentError
+from sim.randomization.distributions import Choice, LogUniform, Normal, Uniform, read_distribution
+
+COUNT = 20_000
+numbers = st.floats(-1e3, 1e3, allow_nan=False)
+pairs = st.tuples(numbers, numbers).map(sorted)
+options = st.fixed_dictionaries({"operation": st.sampled_from(["add", "scale", "abs"]), "shared": st.booleans()})
+distributions = st.one_of(
+    st.builds(lambda ends, rest: Uniform(*ends, **rest), pairs, options),
+    st.builds(
+        lambda ends, rest: LogUniform(*(1e-3 + abs(end) for end in sorted(ends, key=abs)), **rest), pairs, options
+    ),
+    st.builds(lambda mean, std, rest: Normal(mean, std, **rest), numbers, st.floats(1e-3, 1e3), options),
+    st.builds(lambda mean, std: Normal(mean, std, low=mean - std, high=mean + 2 * std), numbers, st.floats(1e-3, 1e3)),
+    st.builds(lambda values, rest: Choice(values, **rest), st.lists(numbers, min_size=1, max_size=5), options),
+)
+
+
+def moments(distribution):
+    drawn = distribution.sample(np.random.default_rng(0), COUNT)
+    return drawn.mean(), drawn.std(), 4 * drawn.std() / math.sqrt(COUNT)
+
+
+def test_uniform_has_its_moments():
+    mean, std, error = moments(Uniform(1, 4))
+    assert mean == pytest.approx(2.5, abs=error)
+    assert std == pytest.approx(3 / math.sqrt(12), rel=0.02)
+
+
+def test_the_logarithm_of_log_uniform_is_uniform():
+    drawn = np.log(LogUniform(0.1, 10).sample(np.random.default_rng(0), COUNT))
+    assert drawn.mean() == pytest.approx(0, abs=4 * drawn.std() / math.sqrt(COUNT))
+    assert drawn.std() == pytest.approx(2 * math.log(10) / math.sqrt(12), rel=0.02)
+
+
+def test_normal_has_its_moments():
+    mean, std, error = moments(Normal(-2, 0.5))
+    assert mean == pytest.approx(-2, abs=error)
+    assert std == pytest.approx(0.5, rel=0.02)
+
+
+def test_normal_that_is_truncated_symmetrically_keeps_its_mean_and_is_narrower():
+    """The variance of a standard normal within +-1 is 1 - 2 phi(1) / (2 Phi(1) - 1) (N. Johnson et al., ch. 13)."""
+    mean, std, error = moments(Normal(0, 1, low=-1, high=1))
+    share = math.erf(1 / math.sqrt(2))
+    assert mean == pytest.approx(0, abs=error)
+    assert std == pytest.approx(math.sqrt(1 - 2 * math.exp(-0.5) / math.sqrt(2 * math.pi) / share), rel=0.02)
+
+
+def test_choice_draws_all_values_alike_often():
+    drawn = Choice([1, 2, 5]).sample(np.random.default_rng(0), COUNT)
+    values, counts = np.unique(drawn, return_counts=True)
+    assert values.tolist() == [1, 2, 5]
+    np.testing.assert_allclose(counts / COUNT, 1 / 3, atol=0.015)
+
+
+@given(distributions)
+def test_draws_are_within_the_support(distribution):
+    drawn = distribution.sample(np.random.default_rng(1), 50)
+    low, high = distribution.support
+    assert drawn.shape == (50,)
+    assert ((drawn >= low) & (drawn <= high)).all()
+
+
+@given(distributions)
+def test_a_distribution_is_what_its_dict_describes(distribution):
+    assert read_distribution("field", distribution.to_dict()) == distribution
+
+
+@pytest.mark.parametrize(("operation", "expected"), [("add", [5, 7]), ("scale", [6, 12]), ("abs", [3, 3])])
+def test_operations(operation, expected):
+    np.testing.assert_array_equal(Uniform(0, 9, operation=operation).apply(np.array([2.0, 4.0]), 3.0), expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Uniform(2, 1), "high: is less than low"),
+        (lambda: Uniform("a", 1), "low: must be a number"),
+        (lambda: Uniform(0, math.inf), "high: out of range"),
+        (lambda: Uniform(0, 1, operation="times"), "operation: unknown option"),
+        (lambda: LogUniform(0, 1), "low: out of range"),
+        (lambda: Normal(0, 0), "std: out of range"),
+        (lambda: Normal(0, 1, low=5), "low: and high leave"),
+        (lambda: Choice([]), "values: must be a list of numbers"),
+        (lambda: Choice([math.nan]), "values: out of range"),
+        (lambda: read_distribution("kp", {"gamma": [1, 2]}), "kp: is no distribution.*uniform, log_uniform"),
+        (lambda: read_distribution("kp", {"uniform": [1, 2, 3]}), "kp: is no distribution"),
+        (lambda: read_distribution("kp", {"uniform": 1}), "kp: is no distribution: uniform needs a list"),
+        (lambda: read_distribution("kp", {"uniform": [0, 1], "mode": "add"}), "kp: .*operation, shared"),
+        (lambda: read_distribution("kp", {"uniform": [2, 1]}), "kp: high is less than low"),
+    ],
+)
+def test_what_is_no_distribution_is_refused(make, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        make()

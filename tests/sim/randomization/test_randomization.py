@@ -1,0 +1,188 @@
+"""Randomization: draws depend on seed, env, episode and field alone, and results are in range."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from robots import load_bundled
+
+from batchpid import make_actuators
+from batchpid.errors import InvalidArgumentError
+from sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
+from sim.randomization.checks import check_params, check_robot, prepared_actuators
+
+PANDA = load_bundled("panda")
+FIELDS = {
+    "payload": Uniform(0, 2),
+    "link_mass": Uniform(0.8, 1.2, operation="scale"),
+    "friction": {"panda_joint1": LogUniform(0.1, 1.0), "panda_joint4": Normal(0.5, 0.1, low=0.0)},
+    "armature": Choice([0.0, 0.1], shared=True),
+    "qpos": Uniform(-0.1, 0.1),
+    "params": {"kp": LogUniform(0.5, 2.0, operation="scale")},
+    "actuators": {"command_delay": Uniform(0, 0.005, shared=True)},
+}
+counts = st.integers(0, 2**63 - 1)
+episodes = st.lists(st.tuples(counts, counts), min_size=1, max_size=5)
+
+
+def drawn(randomization, rows):
+    return randomization.draw(PANDA, np.array(rows, np.int64)).values
+
+
+@given(rows=episodes, seed=counts, order=st.randoms())
+def test_an_env_draws_the_same_in_any_company(rows, seed, order):
+    randomization, shuffled = Randomization(seed=seed, **FIELDS), order.sample(range(len(rows)), len(rows))
+    together, alone = drawn(randomization, rows), [drawn(randomization, [row]) for row in rows]
+    mixed = drawn(randomization, [rows[row] for row in shuffled])
+    for name, values in together.items():
+        np.testing.assert_array_equal(values, np.concatenate([each[name] for each in alone]), name)
+        np.testing.assert_array_equal(values[shuffled], mixed[name], name)
+
+
+@given(names=st.sets(st.sampled_from(sorted(FIELDS)), min_size=1), seed=counts)
+def test_a_field_draws_the_same_with_any_other_fields(names, seed):
+    rows = [(0, 0), (3, 7)]
+    everything = drawn(Randomization(seed=seed, **FIELDS), rows)
+    some = drawn(Randomization(seed=seed, **{name: FIELDS[name] for name in names}), rows)
+    assert some
+    for name, values in some.items():
+        np.testing.assert_array_equal(values, everything[name], name)
+
+
+def test_draws_are_those_of_philox_with_the_documented_key_and_counter():
+    randomization = Randomization(seed=5, qpos=Uniform(-1, 1))
+    key = [5, int.from_bytes(hashlib.blake2b(b"qpos", digest_size=8).digest(), "little")]
+    for stream, episode in ((0, 0), (7, 2)):
+        generator = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, episode, stream]))
+        expected = generator.uniform(-1, 1, PANDA.dof)
+        np.testing.assert_array_equal(drawn(randomization, [(stream, episode)])["qpos"][0], expected)
+
+
+def test_seeds_streams_episodes_and_fields_are_independent():
+    randomization = Randomization(payload=Uniform(0, 1), friction=Uniform(0, 1), damping=Uniform(0, 1))
+    rows = [(stream, episode) for stream in range(40) for episode in range(40)]
+    values = drawn(randomization, rows)
+    table = np.column_stack([values["payload"], values["friction"], values["damping"]])
+    assert len(np.unique(table)) == table.size
+    correlation = np.corrcoef(table.T) - np.eye(table.shape[1])
+    assert np.abs(correlation).max() < 5 / np.sqrt(len(rows))
+    np.testing.assert_allclose(table.mean(0), 0.5, atol=0.03)
+    np.testing.assert_allclose(table.std(0), 1 / np.sqrt(12), rtol=0.08)
+    other = drawn(Randomization(seed=1, payload=Uniform(0, 1)), rows)["payload"]
+    assert abs(np.corrcoef(other[:, 0], values["payload"][:, 0])[0, 1]) < 0.1
+
+
+def test_shared_and_named_draws():
+    values = drawn(Randomization(**FIELDS), [(env, 0) for env in range(20)])
+    assert (np.ptp(values["actuators.command_delay"], axis=1) == 0).all()
+    assert (np.ptp(values["link_mass"], axis=1) > 0).all()
+    named = ~np.isnan(values["friction"]).all(0)
+    assert [PANDA.joint_names[joint] for joint in np.flatnonzero(named)] == ["panda_joint1", "panda_joint4"]
+    assert values["payload"].shape == (20, 1)
+
+
+def test_what_is_drawn_once_for_each_env_does_not_depend_on_the_episode():
+    values = drawn(Randomization(each="env", **FIELDS), [(2, 0), (2, 9), (3, 0)])
+    for name, rows in values.items():
+        np.testing.assert_array_equal(rows[0], rows[1], name)
+    assert values["payload"][0] != values["payload"][2]
+
+
+def test_a_redraw_changes_the_envs_of_its_mask_alone():
+    randomization = Randomization(**FIELDS)
+    first = randomization.first(PANDA, 4)
+    mask = np.array([True, False, False, True])
+    second = randomization.redraw(PANDA, first, mask, None)
+    assert second.episodes.tolist() == [[0, 1], [1, 0], [2, 0], [3, 1]]
+    reseeded = randomization.redraw(PANDA, second, mask, 10)
+    assert reseeded.episodes.tolist() == [[10, 0], [1, 0], [2, 0], [13, 0]]
+    listed = randomization.redraw(PANDA, second, mask, [5, 5, 5, 5])
+    for draws in (second, reseeded, listed):
+        for name, rows in draws.values.items():
+            np.testing.assert_array_equal(rows[1:3], first.values[name][1:3], name)
+        assert (draws.values["payload"][mask] != first.values["payload"][mask]).all()
+    np.testing.assert_array_equal(listed.values["payload"][0], listed.values["payload"][3])
+
+
+def test_draws_are_applied_by_their_operation():
+    randomization = Randomization(**FIELDS)
+    draws = randomization.first(PANDA, 3)
+    params = PANDA.params()
+    varied = randomization.randomized_params(params, draws, PANDA)
+    np.testing.assert_array_equal(varied.kp, params.kp * draws.values["params.kp"])
+    assert varied.ki is params.ki
+    ideal = prepared_actuators(randomization, None, PANDA)
+    assert ideal.max_delay == 0.005
+    actuators = randomization.randomized_actuators(ideal, draws, PANDA)
+    np.testing.assert_array_equal(actuators.command_delay, draws.values["actuators.command_delay"])
+    late = prepared_actuators(randomization, make_actuators(PANDA.dof, command_delay=0.001), PANDA)
+    later = randomization.randomized_actuators(late, draws, PANDA)
+    assert late.max_delay == 0.006
+    np.testing.assert_array_equal(later.command_delay, 0.001 + actuators.command_delay)
+    start = np.tile(PANDA.upper, (3, 1))
+    qpos, qvel = randomization.start(start, np.zeros_like(start), draws, PANDA)
+    np.testing.assert_array_equal(qpos, np.clip(start + draws.values["qpos"], PANDA.lower, PANDA.upper))
+    assert not qvel.any()
+
+
+def test_it_is_what_its_dict_describes():
+    randomization = Randomization(seed=3, each="env", payload_link="panda_hand", **FIELDS)
+    assert Randomization.from_dict(randomization.to_dict()) == randomization
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"payload": Uniform(-1, 1)}, "payload: of 'payload' may become -1, but must be >= 0"),
+        ({"payload": Uniform(0, 1, operation="scale")}, "payload: is 0, which cannot be scaled"),
+        ({"payload": Uniform(0, 1), "payload_link": "wheel"}, "payload_link: unknown option"),
+        ({"link_mass": Normal(1, 0.1, operation="scale")}, r"link_mass: of .* must be > 0.*low="),
+        ({"link_mass": {"wheel": Uniform(0, 1)}}, "link_mass: unknown option"),
+        ({"friction": {"panda_joint9": Uniform(0, 1)}}, "friction: unknown option"),
+        ({"damping": Uniform(-0.1, 0.1)}, "damping: of 'panda_joint1' may become -0.097"),
+        ({"qpos": {"panda_joint9": Uniform(0, 1)}}, "qpos: unknown option"),
+        ({"params": {"kq": Uniform(0, 1)}}, "params.kq: is off"),
+        ({"params": {"deadband": Uniform(0, 1)}}, "params.deadband: is off"),
+        ({"params": {"kp": Normal(0, 1)}}, "params.kp, joint 'panda_joint1'"),
+        ({"actuators": {"delay": Uniform(0, 1)}}, "actuators: unknown option"),
+        ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay: out of range"),
+        ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
+        ({"payload": 0.5}, "payload: is no distribution"),
+        ({"payload": {"panda_hand": Uniform(0, 1)}}, "payload: is no distribution"),
+        ({"friction": {}}, "friction: is no distribution"),
+        ({"params": Uniform(0, 1)}, "params: is no mapping"),
+        ({"seed": -1}, "seed: out of range"),
+        ({"each": "tick"}, "each: unknown option"),
+    ],
+)
+def test_what_does_not_fit_is_refused(fields, message):
+    def check():
+        randomization = Randomization(**fields)
+        check_robot(randomization, PANDA)
+        check_params(randomization, PANDA.params(), PANDA)
+        prepared_actuators(randomization, None, PANDA)
+
+    with pytest.raises(InvalidArgumentError, match=message):
+        check()
+
+
+def test_damping_that_the_engine_simulates_is_not_drawn():
+    with pytest.raises(InvalidArgumentError, match="damping: is the engine's"):
+        check_robot(Randomization(damping=Uniform(0, 1)), Robot.load("panda", dissipation="sapien"))
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"load": {"uniform": [0, 1]}}, "randomization: unknown option"),
+        ([1], "randomization: is no mapping"),
+        ({"payload": 0.5}, "payload: is no distribution"),
+        ({"params": {"kp": {"uniform": [2, 1]}}}, "params.kp: high is less than low"),
+        ({"friction": {"panda_joint1": {"normal": [0]}}}, "friction.panda_joint1: is no distribution"),
+    ],
+)
+def test_a_file_that_describes_none_is_refused(known, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Randomization.from_dict(known)
