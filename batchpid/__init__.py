@@ -15,6 +15,7 @@ Params say how to control, a state is carried from step to step, and every array
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.
+- Limits of setpoints: :func:`make_guard` and :mod:`batchpid.guard`.
 - Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.actuators`.
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
   inertia in :mod:`batchpid.computed_torque`, errors in :mod:`batchpid.errors`.
@@ -34,6 +35,7 @@ from batchpid.controller import BatchPID
 from batchpid.design import design_gains
 from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
+from batchpid.guard import Guard, make_guard
 from batchpid.law import advance, init, reset, step
 from batchpid.params import PIDParams, make_params
 from batchpid.serialization import dumps_params, load_about, load_params, loads_params, save_params
@@ -45,6 +47,7 @@ __all__ = [
     "BatchPID",
     "BatchPIDError",
     "Coefficients",
+    "Guard",
     "InvalidArgumentError",
     "MissingDependencyError",
     "PIDParams",
@@ -62,6 +65,7 @@ __all__ = [
     "load_params",
     "loads_params",
     "make_actuators",
+    "make_guard",
     "make_params",
     "presets",
     "reset",

@@ -33,9 +33,9 @@ class Quantity(NamedTuple):
 class Observation(NamedTuple):
     """State of every env after a tick, (envs, dof) in the robot's joint order; ``ok`` is (envs,).
 
-    ``effort`` and ``saturated`` are those of the last sim step; under control "drive" the effort is qf alone, since
-    PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is suspended
-    since an earlier one: see :attr:`sim.Runner.faults`.
+    ``effort``, ``saturated`` and ``guarded`` are those of the last sim step; under control "drive" the effort is qf
+    alone, since PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is
+    suspended since an earlier one: see :attr:`sim.Runner.faults`.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
@@ -43,6 +43,7 @@ class Observation(NamedTuple):
     effort: Annotated[Float32, Quantity(np.float32, "applied joint effort", "N m|N")]
     saturated: Annotated[Bool, Quantity(np.bool_, "effort at its limit")]
     ok: Annotated[Bool, Quantity(np.bool_, "state is finite", per_joint=False)]
+    guarded: Annotated[Bool, Quantity(np.bool_, "setpoint changed by the guard")]
 
     def for_envs(self, envs: slice | Any) -> Observation:
         """Return the observation of some envs (a slice or an index array)."""

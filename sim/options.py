@@ -20,6 +20,7 @@ from sim.cluster import Ray
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
 from sim.randomization.randomization import Randomization
 from sim.robot.actuators import fit_actuators
+from sim.robot.guard import fingerprint, fit_guard
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -129,6 +130,9 @@ class RunnerOptions:
     randomization: Randomization | None = None
     """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
     (docs/randomization.md); default none."""
+    guard: bool | bp.Guard = False
+    """Limits of setpoints, applied at every sim step: True for :meth:`sim.Robot.guard`, or :func:`batchpid.make_guard`.
+    ``obs.guarded`` tells which setpoints were changed."""
     on_invalid_input: InvalidInputAction = "raise"
     """``"raise"`` an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"`` it: the env that
     it is for fails."""
@@ -195,6 +199,7 @@ class RunnerOptions:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
         vars(self).update(checked)
+        vars(self)["guard"] = fit_guard(self.guard, robot, checked["num_envs"], self.control_name, self.sets_positions)
         actuators = robot.actuators if self.actuators is None else self.actuators
         if self.actuators is None and actuators is not None and self.control == "drive":
             actuators = actuators.joint_side()
@@ -315,6 +320,7 @@ class RunnerOptions:
             "ignored_pairs": hashlib.sha256(repr(robot.ignored_pairs).encode()).hexdigest(),
             "fixed_base": robot.fixed_base,
             "merge_fixed": robot.merge_fixed,
+            "guard": hashlib.sha256(fingerprint(self.guard).encode()).hexdigest(),
             "coupling": None if coupling is None else [coupling.matrix.tolist(), coupling.offset.tolist()],
             "randomization": None if self.randomization is None else self.randomization.to_dict(),
         }

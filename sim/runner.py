@@ -141,6 +141,7 @@ class Runner:
         speed_limit: ArrayLike | None = None,
         actuators: bp.Actuators | None = None,
         randomization: Randomization | None = None,
+        guard: bool | bp.Guard = False,
         on_invalid_input: InvalidInputAction = "raise",
         recover: bool = True,
         checkpoint_steps: int | None = 8000,
@@ -167,6 +168,7 @@ class Runner:
             speed_limit=speed_limit,
             actuators=actuators,
             randomization=randomization,
+            guard=guard,
             on_invalid_input=on_invalid_input,
             recover=recover,
             checkpoint_steps=checkpoint_steps,
@@ -181,6 +183,7 @@ class Runner:
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
         self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
+        self._checks_setpoints = options.sets_positions and options.guard is False
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
         self._has_warned = self._has_warned_of_contact = False
@@ -370,7 +373,7 @@ class Runner:
             None if feedforwards is None else read("feedforwards", feedforwards),
         )
         command = self._coupled(command)
-        if self.options.sets_positions:
+        if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
@@ -469,7 +472,8 @@ class Runner:
             acting = randomization.randomized_actuators(actuators, draws, self.robot)
         motors = initial_actuators(acting, *self._shape, self.timestep)
         stiction = self.options.has_stiction(acting)
-        snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, sizes)
+        guarded = self.options.guard is not False
+        snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, guarded, sizes)
         request = Restore(replace(snapshot, actuators=actuators), draws)
 
         def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
@@ -636,7 +640,7 @@ class Runner:
             None if feedforward is None else self._rows("feedforward", feedforward),
         )
         command = self._coupled(command)
-        if self.options.sets_positions:
+        if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint)
         return command.map(lambda rows: rows[None]), count
 

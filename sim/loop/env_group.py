@@ -1,4 +1,7 @@
-"""Group of envs that advance together, and their closed loop."""
+"""Group of envs that advance together, and their closed loop.
+
+Longer than 300 lines because everything that a sim step does, faults included, is read in one place.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from sim.loop.arrays import Arrays, Command
 from sim.loop.compiled_tick import CompiledTick, compiled_tick
 from sim.loop.faults import FaultContainment, finite
 from sim.loop.friction import JointFriction
+from sim.loop.guard import SetpointGuard
 from sim.loop.jitted import make_control
 from sim.loop.snapshot import EnvStates
 from sim.loop.variation import acting_actuators, acting_params, variation
@@ -52,6 +56,10 @@ class EnvGroup:
         self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
         self._steps = 0
         self._actuators: JointActuators | None = None
+        self._guard: SetpointGuard | None = None
+        if isinstance(options.guard, bp.Guard):
+            limits = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
+            self._guard = SetpointGuard(limits, self._coupling, self._qpos, options.timestep)
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
         self._compiled = self._make_compiled()
@@ -126,6 +134,7 @@ class EnvGroup:
         observation.qvel[...] = self.pack.read_qvel(np.float32)
         observation.effort[...] = self._motor
         observation.saturated[...] = self._control.saturated
+        observation.guarded[...] = False if self._guard is None else self._guard.changed
         observation.ok[...] = ~containment.failed
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
@@ -151,6 +160,7 @@ class EnvGroup:
             controller=self._control.read(),
             friction=self._friction.read(),
             actuators={} if self._actuators is None else self._actuators.read(),
+            guard={} if self._guard is None else self._guard.read(),
             containment=self._containment.read(),
         )
 
@@ -170,6 +180,8 @@ class EnvGroup:
         self._control.write(states.controller, states.saturated)
         self._friction = JointFriction(pack, self._control.drive)
         self._friction.write(states.friction)
+        if self._guard is not None:
+            self._guard.write(states.guard)
         self._motor[...] = states.effort
         self._qpos = pack.read_qpos()
         if self._contacts is not None:
@@ -198,10 +210,13 @@ class EnvGroup:
             return
         pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
-        actuators = self._actuators
+        actuators, guard, asked = self._actuators, self._guard, command
         reads_qpos = control.reads_qpos_each_step or self._compensates or actuators is not None
         for step in range(substeps):
             qvel: Any = None
+            if guard is not None:
+                command = guard.advance(asked)
+                control.begin(command, substeps)
             if actuators is None:
                 forward = self._feedforward(command, self._qpos)
                 if not reads_qpos and not self._sound(forward):
@@ -335,3 +350,5 @@ class EnvGroup:
             qpos, _ = self._actuators.measured(qpos, qvel)
         self._control.reset(qpos, mask)
         self._friction.reset(mask)
+        if self._guard is not None:
+            self._guard.reset(mask, self._qpos)

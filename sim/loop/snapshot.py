@@ -23,6 +23,7 @@ from batchpid.choices import CHOICES, Everywhere
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
 from batchpid.friction import FrictionState
+from batchpid.guard import GuardState
 from batchpid.npz import read_npz
 from batchpid.validate import file_path, integer, names
 from sim.loop.faults import CAUSES, FaultContainment
@@ -30,6 +31,8 @@ from sim.loop.tables import flatten, nest, widen
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
+CHANGED = "changed"
+"""Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
 _FORMAT = 5
@@ -59,6 +62,8 @@ class EnvStates:
     """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
     actuators: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.actuators.ActuatorState`, and :data:`EPISODE`; none without actuators."""
+    guard: dict[str, NDArray[Any]]
+    """Leaves of :class:`batchpid.guard.GuardState`, and :data:`CHANGED`; none without guard."""
     containment: dict[str, NDArray[Any]]
     """See :class:`sim.loop.faults.FaultContainment`."""
 
@@ -80,12 +85,13 @@ class EnvStates:
         controller: dict[str, NDArray[Any]],
         friction: bool,
         actuators: dict[str, NDArray[Any]],
+        guard: bool,
         content_sizes: Sequence[int],
     ) -> None:
         """Check that these are states of so many envs and joints, with content of such sizes (envs,).
 
         ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
-        have Coulomb friction.
+        have Coulomb friction, ``guard`` whether there is a guard.
 
         Raises
         ------
@@ -104,6 +110,7 @@ class EnvStates:
             controller=controller,
             friction={**dict.fromkeys(FrictionState._fields, table), AGE: row.astype(np.int64)} if friction else {},
             actuators=actuators,
+            guard={**dict.fromkeys(GuardState._fields, table), CHANGED: table > 0} if guard else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = flatten(vars(expected)), flatten(vars(self))
@@ -249,7 +256,7 @@ class Snapshot:
         motors = initial_actuators(actuators, num_envs, dof, about["timestep"])
         if (about.get("randomization") or {}).get("actuators"):
             motors = states.actuators  # the runner that restores it checks them
-        states.check(num_envs, dof, controller, bool(states.friction), motors, ())
+        states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), ())
         return cls(about, steps, params, states, actuators, episodes)
 
     def __repr__(self) -> str:

@@ -18,6 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from sim.observation import RunInfo
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
+from sim.robot.guard import setpoint_guard
 from sim.robot.parts import Joint, Placement, Settings, Urdf
 from sim.robot.self_collision import SelfContact, Srdf
 
@@ -151,6 +152,25 @@ class RobotDescription(Urdf):
     def friction(self) -> Float64:
         """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien", which has PhysX's own."""
         return np.array([joint.friction for joint in self.joints]) * DISSIPATION[self.dissipation].modelled
+
+    def guard(self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None) -> bp.Guard:
+        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as in the URDF.
+
+        Followers have none: they move with their leaders.
+
+        Parameters
+        ----------
+        rate
+            Largest rate, scalar or (dof,) [rad/s or m/s]; default the URDF's velocity limits.
+        acceleration
+            Largest acceleration, scalar or (dof,) [rad/s^2 or m/s^2]; default none.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A limit is not positive.
+        """
+        return setpoint_guard(self, rate, acceleration)
 
     @property
     def independent(self) -> Bool:

@@ -43,6 +43,8 @@ class Joint:
     upper: float = math.inf
     effort_limit: float = math.inf
     velocity_limit: float = math.inf
+    soft_lower: float = -math.inf
+    soft_upper: float = math.inf
     damping: float = 0.0
     friction: float = 0.0
     mimic: Mimic | None = None

@@ -21,13 +21,13 @@ from sim.robot.link_repair import SHAPES
 _READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
     "robot": {"link", "joint"},
     "link": {"inertial", "collision"},
-    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "safety_controller"},
     "inertial": {"origin", "mass", "inertia"},
     "collision": {"origin", "geometry"},
     "geometry": {*SHAPES},
 }
 _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
-_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration", "safety_controller"}
+_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 _VECTORS = ("xyz", "rpy", "size", "scale")
 
 

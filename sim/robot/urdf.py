@@ -105,6 +105,11 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
             element.remove(limit)
         else:
             fields |= {key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")}
+    for safety in element.findall("safety_controller"):
+        element.remove(safety)
+        soft = [number(safety, f"soft_{key}_limit", "0", where) for key in ("lower", "upper")]
+        if soft[0] < soft[1]:  # both are 0 where they are left out
+            fields |= {"soft_lower": soft[0], "soft_upper": soft[1]}
     for key in ("damping", "friction") if dynamics is not None else ():
         fields[key] = number(dynamics, key, "0", where)
         dynamics.set(key, repr(fields[key]))

@@ -29,6 +29,7 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
             effort=np.ones(shape, np.float32),
             saturated=np.zeros(shape, bool),
             ok=np.ones(shape[:2], bool),
+            guarded=np.zeros(shape, bool),
         ),
         tick=0.01,
         info=panda.run_info(),

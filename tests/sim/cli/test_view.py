@@ -18,7 +18,7 @@ def write(path, robot="panda", envs=1):
     """Write a rollout of two ticks at rest."""
     panda = load_bundled("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
-    seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool))
+    seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
     info = replace(panda.run_info(), robot=robot)
     return write_recording(Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path)
 

@@ -28,6 +28,7 @@ def make(joints=3, ticks=TICKS, envs=ENVS, seed=0, **info):
         effort=random.uniform(-9, 9, shape),
         saturated=random.random(shape) < 0.2,
         ok=np.ones(shape[:2], bool),
+        guarded=np.zeros(shape, bool),
     )
     about = RunInfo(
         robot="arm",

@@ -29,7 +29,7 @@ def draw(jaco2):
         time = np.linspace(0.02, 1.0, 50)
         wave = np.repeat((height * np.sin(9 * time))[:, None, None], jaco2.dof, axis=2).astype(np.float32)
         ok = np.ones((50, 1), bool)
-        seen = Observation(wave, wave, wave, wave > 9e9, ok)
+        seen = Observation(wave, wave, wave, wave > 9e9, ok, wave > 9e9)
         playback = Playback(Rollout(time, 0.0 * wave.astype(float), seen, 0.02, jaco2.run_info()), jaco2)
         playback.seek(1.0)
         gui = Gui()

@@ -1,0 +1,116 @@
+"""The guard of setpoints: within its limits, without overshoot, in the shortest time; and through what is allowed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from law_cases import read_only
+
+import batchpid as bp
+from batchpid import guard
+
+DT = 0.01
+
+
+def run(limits, setpoints, start=0.0):
+    """Return guarded setpoints, their rates and what was changed (steps, 1, joints)."""
+    rows = np.asarray(setpoints, float).reshape(len(setpoints), 1, -1)
+    state, seen = guard.init(limits, np.zeros_like(rows[0]) + start), []
+    for row in rows:
+        state, changed = guard.advance(limits, state, read_only(row, float), DT)
+        seen.append((state.setpoint, state.rate, changed))
+    return tuple(map(np.array, zip(*seen, strict=True)))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_limits_hold_whatever_is_asked(seed):
+    rng = np.random.default_rng(seed)
+    lower, upper, rate, acceleration = -rng.uniform(0.1, 3, 4), rng.uniform(0.1, 3, 4), *rng.uniform(0.1, 20, (2, 4))
+    limits = bp.make_guard(4, lower=lower, upper=upper, rate=rate, acceleration=acceleration)
+    asked = np.repeat(rng.normal(0, 3, (30, 4)), rng.integers(1, 30, 30), axis=0)
+    setpoint, speed, changed = run(limits, asked)
+    assert (setpoint >= lower - 1e-9).all()
+    assert (setpoint <= upper + 1e-9).all()
+    assert (np.abs(speed) <= rate * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(speed, axis=0, prepend=0.0)) <= DT * acceleration * (1 + 1e-9)).all()
+    np.testing.assert_allclose(np.diff(setpoint, axis=0, prepend=0.0), DT * speed, atol=1e-12)
+    np.testing.assert_array_equal(changed, setpoint != asked[:, None])
+
+
+@given(target=st.floats(-5, 5), rate=st.floats(0.1, 5), acceleration=st.floats(0.1, 50))
+def test_a_constant_setpoint_is_reached_without_overshoot_in_the_shortest_time(target, rate, acceleration):
+    """Within three steps of the trapezoid of rates, or of the triangle that does not reach the largest rate."""
+    setpoint, _, changed = run(bp.make_guard(1, rate=rate, acceleration=acceleration), np.full(12_000, target))
+    way, ramp = abs(target), rate**2 / acceleration
+    shortest = way / rate + rate / acceleration if way > ramp else 2 * np.sqrt(way / acceleration)
+    assert not changed[-1]
+    arrival = DT * (np.flatnonzero(changed).max(initial=-1) + 2)
+    assert arrival <= shortest + 3 * DT + 1e-9
+    assert (np.abs(setpoint) <= way + 1e-12).all()
+    assert setpoint[-1] == target
+
+
+def test_what_is_allowed_passes_unchanged():
+    path = 0.5 * np.sin(0.5 * DT * np.arange(1000))[:, None]
+    limits = bp.make_guard(1, lower=-1.0, upper=1.0, rate=1.0, acceleration=100.0)
+    setpoint, _, changed = run(limits, path)
+    np.testing.assert_array_equal(setpoint[:, 0], path)
+    assert not changed.any()
+    assert run(bp.make_guard(1), 9 * path)[2].sum() == 0
+
+
+def test_each_limit_alone():
+    steps = np.full((3, 1), 2.0)
+    np.testing.assert_allclose(run(bp.make_guard(1, upper=1.5), steps)[0].ravel(), [1.5, 1.5, 1.5])
+    np.testing.assert_allclose(run(bp.make_guard(1, rate=20.0), steps)[0].ravel(), [0.2, 0.4, 0.6])
+    np.testing.assert_allclose(run(bp.make_guard(1, acceleration=1000.0), steps)[0].ravel(), [0.1, 0.3, 0.6])
+    both = bp.make_guard(2, rate=[20.0, np.inf], acceleration=[np.inf, 1000.0])
+    np.testing.assert_allclose(run(both, np.full((3, 2), 2.0))[0][:, 0], [[0.2, 0.1], [0.4, 0.3], [0.6, 0.6]])
+
+
+def test_a_continuous_joint_takes_the_short_way_round():
+    limits = bp.make_guard(1, lower=-1.0, upper=1.0, rate=10.0, continuous=True)
+    setpoint, _, changed = run(limits, np.full((4, 1), -3.0), start=3.0)
+    np.testing.assert_allclose(setpoint.ravel(), [3.1, 3.2, -3.0, -3.0])
+    assert changed.ravel().tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-5)])
+def test_jax_agrees_with_numpy(dtype, tolerance, request):
+    if dtype == np.float64:
+        request.getfixturevalue("x64")
+    limits = bp.make_guard(3, lower=-1.0, upper=[1.0, 2.0, np.inf], rate=3.0, acceleration=40.0, dtype=dtype)
+    asked = np.repeat(np.random.default_rng(0).normal(0, 2, (8, 2, 3)), 9, axis=0).astype(dtype)
+
+    @jax.jit
+    def compiled(limits, asked):
+        def step(state, row):
+            state, changed = guard.advance(limits, state, row, DT)
+            return state, (state.setpoint, changed)
+
+        return jax.lax.scan(step, guard.init(limits, asked[0]), asked)[1][0]
+
+    state, ours = guard.init(limits, asked[0]), []
+    for row in asked:
+        state, _ = guard.advance(limits, state, row, DT)
+        ours.append(state.setpoint)
+    theirs = compiled(jax.tree.map(jnp.asarray, limits), jnp.asarray(asked))
+    assert theirs.dtype == ours[0].dtype == dtype
+    np.testing.assert_allclose(theirs, ours, rtol=10 * tolerance, atol=10 * tolerance)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": 0.0}, "rate, joint 0: must be > 0"),
+        ({"acceleration": [1.0, -1.0]}, "acceleration, joint 1"),
+        ({"lower": 1.0, "upper": 0.0}, "setpoint_min"),
+        ({"upper": np.nan}, "setpoint_max"),
+    ],
+)
+def test_bad_limits_are_refused(options, message):
+    with pytest.raises(bp.InvalidArgumentError, match=message):
+        bp.make_guard(2, **options)

@@ -1,0 +1,85 @@
+"""The guard in the loop: limits of the URDF, told in the observation, independent of workers and restores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from identical import assert_identical
+
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner, Snapshot
+
+N = 3
+ARM = """<robot name="arm">
+<link name="base"/>
+<link name="upper">
+<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" effort="50" velocity="3"/>{safety}</joint>
+</robot>"""
+
+
+def load(tmp_path, safety=""):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.format(safety=safety))
+    return Robot.load(path)
+
+
+def test_limits_are_those_of_the_urdf(tmp_path):
+    plain = load(tmp_path).guard()
+    assert [plain.lower.item(), plain.upper.item(), plain.rate.item()] == [-2, 2, 3]
+    assert plain.acceleration is None
+    soft = load(tmp_path, '<safety_controller k_velocity="1" soft_lower_limit="-1.5" soft_upper_limit="2.5"/>')
+    assert [leaf.item() for leaf in soft.guard(rate=1.0, acceleration=9.0)[:4]] == [-1.5, 2, 1, 9]
+    unset = load(tmp_path, '<safety_controller k_velocity="1"/>').guard()
+    assert [unset.lower.item(), unset.upper.item()] == [-2, 2]
+
+
+def test_the_setpoint_ramps_at_the_largest_rate_and_the_observation_tells(tmp_path):
+    robot = load(tmp_path)
+    with Runner(robot, 2, workers=0, guard=True, timestep=0.001, substeps=100) as runner:
+        far = [runner.step([[1.0], [0.0]]) for _ in range(6)]
+        assert [obs.guarded[:, 0].tolist() for obs in far] == [[True, False]] * 3 + [[False, False]] * 3
+        for _ in range(20):
+            obs = runner.step([5.0])  # outside the limits
+        assert obs.guarded.all()
+        np.testing.assert_allclose(obs.qpos, 2.0, atol=0.01)
+    with Runner(robot, 1, workers=0, timestep=0.001, substeps=100) as runner:
+        assert not runner.step([1.0]).guarded.any()
+
+
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_neither_workers_nor_a_restore_show(panda, control, tmp_path):
+    rng = np.random.default_rng(0)
+    table = rng.uniform(-1, 1, (8, N, panda.dof)) + panda.settings.target
+    options = {"control": control, "guard": panda.guard(acceleration=20.0)}
+    with Runner(panda, N, workers=0, on_invalid_input="contain", **options) as runner:
+        first = runner.rollout(np.clip(table[:4], panda.lower, panda.upper))
+        assert first.guarded.any()
+        runner.snapshot().save(tmp_path / "guarded.npz")
+        second = runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:]))
+    with Runner(panda, N, workers=2, **options) as runner:
+        assert_identical(first, runner.rollout(np.clip(table[:4], panda.lower, panda.upper)))
+        runner.restore(Snapshot.load(tmp_path / "guarded.npz"))
+        assert_identical(second, runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:])))
+    with Runner(panda, N, workers=0, control=control) as plain, pytest.raises(InvalidArgumentError, match="guard"):
+        plain.restore(Snapshot.load(tmp_path / "guarded.npz"))
+
+
+def test_a_reset_starts_at_rest_at_the_pose(panda):
+    with Runner(panda, 1, workers=0, guard=panda.guard(rate=0.5)) as runner:
+        first = runner.rollout(panda.settings.target[None].repeat(5, 0)).observation
+        runner.reset()
+        assert_identical(first, runner.rollout(panda.settings.target[None].repeat(5, 0)).observation)
+
+
+def test_a_guard_that_does_not_fit_is_refused(panda, tmp_path):
+    for guard, control, message in (
+        (True, "effort", "limits positions"),
+        (load(tmp_path).guard(), "pid", r"has shape \(1, 1\)"),
+        ("safe", "pid", "must be a Guard"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            Runner(panda, 1, workers=0, guard=guard, control=control)
+    with pytest.raises(InvalidArgumentError, match="rate, joint 'panda_joint1'"):
+        panda.guard(rate=-1.0)
