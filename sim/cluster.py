@@ -22,8 +22,9 @@ class Ray:
     """
 
     address: str | None = None
-    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it. Default: the environment variable RAY_ADDRESS,
-    else a cluster that runs on this machine, else a new one of this machine alone, which ends with this process."""
+    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it, or "local" for a new one of this machine alone,
+    which ends with this process. Default: the environment variable RAY_ADDRESS, else a cluster that runs on this
+    machine, else "local"."""
     _: KW_ONLY
     nodes: int | None = None
     """Largest number of machines. Default: all that have enough CPUs."""
@@ -43,7 +44,7 @@ class Ray:
         if self.address is not None and (not isinstance(self.address, str) or "://" in self.address):
             raise InvalidArgumentError(
                 "address",
-                "must be HOST:PORT",
+                "must be HOST:PORT, 'auto' or 'local'",
                 value=self.address,
                 remedy="pass the address that ray start printed, on a machine that belongs to the cluster",
             )

@@ -101,7 +101,7 @@ class Cluster:
         if index not in self._has_started:
             self._has_started.add(index)
             return self._homes[index], self._homes[index].workers
-        left = [one for one in self._machines() if one.node_id not in self._unlike and _answers(one.address, one.port)]
+        left = [machine for machine in self._machines() if machine.node_id not in self._unlike]
         if not left:
             raise WorkerError(f"the cluster has no machine left for node {index}; restore a snapshot in a new Runner")
         others = Counter(machine.node_id for node, machine in self._homes.items() if node != index)
@@ -150,13 +150,14 @@ class Cluster:
             )
 
     def _machines(self) -> list[Machine]:
-        """Return the machines that Ray has, those with most CPUs first."""
+        """Return the machines that answer, those with most CPUs first."""
         wanted, found = self.options.cpus_per_node, []
         for node in BACKGROUND.call(self.ray.nodes):
             cpus = int(node["Resources"].get("CPU", 0))
-            if node["Alive"] and cpus >= (wanted or 1):
-                workers = wanted or cpus
-                found.append(Machine(node["NodeID"], node["NodeManagerAddress"], node["NodeManagerPort"], workers))
+            machine = Machine(node["NodeID"], node["NodeManagerAddress"], node["NodeManagerPort"], wanted or cpus)
+            # Ray takes a quarter of a minute to notice that a machine is gone.
+            if node["Alive"] and cpus >= (wanted or 1) and _answers(machine.address, machine.port):
+                found.append(machine)
         return sorted(found, key=lambda machine: (-machine.workers, machine.address, machine.node_id))
 
 
@@ -181,7 +182,8 @@ def _connect(options: Ray) -> Any:
             remedy="start it with ray start --head, or leave the address out",
         )
     try:
-        ray.init(address, **quiet)
+        if address != "local":
+            ray.init(address, **quiet)
     except ConnectionError as error:
         if address != "auto":
             raise InvalidArgumentError(
@@ -189,6 +191,7 @@ def _connect(options: Ray) -> Any:
                 f"at {address} cannot be joined: {error}",
                 remedy="run ray start --address=... on this machine first",
             ) from error
+    if not ray.is_initialized():
         ray.init("local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **quiet)
     return ray
 

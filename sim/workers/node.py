@@ -34,6 +34,15 @@ class NodeInfo(NamedTuple):
     """Digest of the canonical episode (:mod:`sim.loop.canonical`)."""
 
 
+class Share(NamedTuple):
+    """Part of a runner's envs that the pool of a node has."""
+
+    first_env: int
+    num_envs: int
+    ticks: int
+    """Most ticks of a request."""
+
+
 class Answer(NamedTuple):
     """Answer of a node to a request."""
 
@@ -54,17 +63,17 @@ class Node:
     def start(self, message: bytes, workers: int, address: str) -> Answer:
         """Start the pool; return a :class:`NodeInfo`.
 
-        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs and the params of the canonical
-        episode.
+        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, the most ticks of a request, and
+        the params of the canonical episode.
         """
         return _answer(lambda: Answer(self._start(pickle.loads(message), workers, address)))
 
-    def _start(self, message: tuple[Any, Start, bp.PIDParams], workers: int, address: str) -> NodeInfo:
-        pool_type, start, canonical = message
+    def _start(self, message: tuple[Any, Start, int, bp.PIDParams], workers: int, address: str) -> NodeInfo:
+        pool_type, start, ticks, canonical = message
         # The caller replaces a node that has lost a worker: it keeps the requests to replay.
         options = replace(start.options, workers=workers, cluster=None, recover=False)
         envs = start.envs
-        self._pool = pool_type(options, start.params, envs.start, envs.stop - envs.start)
+        self._pool = pool_type(options, start.params, Share(envs.start, envs.stop - envs.start, ticks))
         self._pool.open()
         digest = self._run(ReadDigest(canonical))
         pids = tuple(worker.pid for worker in self._pool.workers)

@@ -28,8 +28,9 @@ class NodeWorker(Worker):
 
     def __init__(self, cluster: Cluster, start: Start, shared: SharedArrays) -> None:
         self._cluster, self._index, self._envs = cluster, start.index, start.envs
-        self._message = pickled((cluster.pool_type, start, cluster.canonical))
         self._arrays = Arrays.from_fields(shared.arrays)
+        ticks = len(self._arrays.observation.ok)
+        self._message = pickled((cluster.pool_type, start, ticks, cluster.canonical))
         self._bell = _Bell()
         self._actor: Any = None
         self._call: Future[Answer] | None = None

@@ -26,7 +26,7 @@ from sim.options import RunnerOptions
 from sim.workers.background import BACKGROUND
 from sim.workers.cluster import NODE_STEPS, Cluster
 from sim.workers.memory import check_memory
-from sim.workers.node import NodeInfo
+from sim.workers.node import NodeInfo, Share
 from sim.workers.node_worker import NodeWorker
 from sim.workers.placement import pinned_cores, split_envs
 from sim.workers.requests import Request, Start
@@ -65,22 +65,20 @@ class _Slot:
 class WorkerPool:
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    ``params`` are those that the loops start with. The workers start with :meth:`open`. The pool of a node has some of
-    the envs, from ``first_env`` on, and that of the caller has nodes for workers, with ``options.cluster``.
+    ``params`` are those that the loops start with. The workers start with :meth:`open`. With ``options.cluster`` they
+    are nodes, whose pools have a ``share`` of the envs.
     """
 
-    def __init__(
-        self, options: RunnerOptions, params: bp.PIDParams, first_env: int = 0, num_envs: int | None = None
-    ) -> None:
-        self._options, self._params, self._first_env = options, params, first_env
+    def __init__(self, options: RunnerOptions, params: bp.PIDParams, share: Share | None = None) -> None:
+        self._options, self._params = options, params
         self.messages: dict[type[Warning], str] = {}
         """Latest message of each category, for warnings."""
-        self.num_envs = options.num_envs if num_envs is None else num_envs
+        self._first_env, num_envs, ticks = share or (0, options.num_envs, None)
         count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
         self.is_local = not count
         """True if the loop runs in this process."""
         self._make_worker: Callable[[Start, SharedArrays], Worker] = ProcessWorker if count else LocalWorker
-        self._slices = split_envs(self.num_envs, count, options.inseparable_envs)
+        self._slices = split_envs(num_envs, count, options.inseparable_envs)
         self._cores = pinned_cores(len(self._slices))
         widest, most_steps = max(envs.stop - envs.start for envs in self._slices), _MAX_STEPS
         self.cluster: Cluster | None = None
@@ -90,7 +88,7 @@ class WorkerPool:
             self._slices, self._make_worker, self._cores = cluster.slices, partial(NodeWorker, cluster), []
             widest, most_steps = cluster.widest, NODE_STEPS
         else:
-            check_memory(options, self.num_envs, len(self._slices), self.is_local)
+            check_memory(options, num_envs, len(self._slices), self.is_local)
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
         self._poller = select.poll()
@@ -101,8 +99,8 @@ class WorkerPool:
         """Error that a loop raised in the last request; of several, one that left its state undefined."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
-        ticks = max(1, most_steps // (options.substeps * widest))
-        layout = Arrays.layout(ticks, self.num_envs, options.robot.dof)
+        ticks = ticks or max(1, most_steps // (options.substeps * widest))
+        layout = Arrays.layout(ticks, num_envs, options.robot.dof)
         self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""

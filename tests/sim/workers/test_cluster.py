@@ -3,72 +3,30 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
+from clusters import FILTERS, ROBOT, SMALL, Machines, N, left_in_memory, make_runner, pids_of, setpoints
 from identical import assert_identical
 from processes import have_ended
-from robots import load_bundled
 
-from sim import Ray, Runner
+from batchpid.errors import InvalidArgumentError
+from sim import ClusterWarning, Ray, RecoveryWarning, Runner
 
 ray = pytest.importorskip("ray")
-pytestmark = [
-    # Ray's own: files and sockets that it leaves to the collector, and calls that its dependencies deprecate.
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:ray"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-
-ROBOT = load_bundled("panda")
-N = 12
-SMALL = {"object_store_memory": 80 << 20, "include_dashboard": False}
-
-
-class Machines:
-    """Ray nodes on this machine, one CPU each, and a head without."""
-
-    def __init__(self):
-        from ray.cluster_utils import Cluster
-
-        self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **SMALL})
-        self.nodes = []
-
-    def ensure(self, count):
-        while len(self.nodes) < count:
-            self.nodes.append(self.cluster.add_node(num_cpus=1, **SMALL))
-        return self
-
-    def raylet(self, index):
-        return self.nodes[index].all_processes["raylet"][0].process
-
-    def kill(self, index):
-        process = self.raylet(index)
-        process.kill()
-        process.wait()
-        return self.nodes.pop(index)
-
-    def options(self, nodes=None, **options):
-        return Ray(self.cluster.address, nodes=nodes, **options)
+pytestmark = FILTERS
+LONG = 64
 
 
 @pytest.fixture(scope="module")
 def machines():
-    before = set(os.listdir("/dev/shm"))
     made = Machines()
     yield made
-    ray.shutdown()
-    made.cluster.shutdown()
-    assert set(os.listdir("/dev/shm")) <= before
-
-
-def setpoints(ticks, seed=1):
-    noise = np.random.default_rng(seed).uniform(-0.3, 0.3, (ticks, N, ROBOT.dof))
-    return np.clip(ROBOT.settings.target + noise, ROBOT.lower, ROBOT.upper)
-
-
-def make_runner(**options):
-    return Runner(ROBOT, N, **{"params": ROBOT.params(), "checkpoint_steps": 300, "pack_size": 1, **options})
+    made.close()
 
 
 class Tape:
@@ -116,6 +74,154 @@ def test_results_are_bit_identical_for_any_number_of_nodes(nodes, machines, expe
         assert len(runner.nodes) == nodes
         assert [info.envs for info in runner.nodes][-1].stop == N
         assert_same(expected, program(runner))
-        pids = [pid for info in runner.nodes for pid in (info.pid, *info.pids)]
+        pids = pids_of(runner)
         assert len(pids) == 2 * nodes
     assert have_ended(pids)
+
+
+def at_tick(tick, act):
+    """Return a progress bar that calls ``act`` before the given tick."""
+
+    def progress(ticks):
+        for number in ticks:
+            if number == tick:
+                act()
+            yield number
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    with make_runner(workers=0) as runner:
+        return runner.rollout(setpoints(LONG))
+
+
+@pytest.mark.parametrize("lost", ["process", "worker", "machine"])
+def test_what_is_lost_in_a_rollout_is_replaced(lost, machines, undisturbed):
+    def lose():
+        info = runner.nodes[1]
+        if lost == "machine":
+            machines.kill(info.pid)
+            assert have_ended([info.pid])
+        else:
+            os.kill(info.pid if lost == "process" else info.pids[0], signal.SIGKILL)
+
+    with make_runner(cluster=machines.ensure(2).options(2)) as runner:
+        pids = pids_of(runner)
+        with pytest.warns(RecoveryWarning, match=r"node 1 \([\d.]+, envs 6 to 11\)"):
+            rollout = runner.rollout(setpoints(LONG), progress=at_tick(LONG // 2 - 2, lose))
+        assert runner.recoveries == 1
+        pids += pids_of(runner)
+    assert_identical(undisturbed, rollout)
+    assert have_ended(pids)
+
+
+def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monkeypatch):
+    monkeypatch.setattr("sim.workers.node_worker.SILENCE_LIMIT", 3.0)
+    with make_runner(cluster=machines.ensure(2).options(2)) as runner:
+        pids = pids_of(runner)
+        stop = lambda: os.kill(runner.nodes[0].pid, signal.SIGSTOP)  # noqa: E731
+        with pytest.warns(RecoveryWarning, match=r"node 0 .* has not answered for 3 s"):
+            rollout = runner.rollout(setpoints(LONG), progress=at_tick(LONG // 2, stop))
+    assert_identical(undisturbed, rollout)
+    assert have_ended(pids)
+
+
+def odd_controller():
+    """Return a controller that a variable of the environment changes, as a processor might."""
+
+    class Odd:
+        def init(self, robot, num_envs):
+            return None
+
+        def __call__(self, state, setpoint, qpos, qvel, passive):
+            import os
+
+            return state, passive + 50 * (setpoint - qpos) * float(os.environ.get("BATCHPID_TEST_FACTOR", "1"))
+
+    return Odd()
+
+
+@pytest.fixture
+def odd_machine(machines):
+    node = machines.ensure(1).cluster.add_node(num_cpus=1, env_vars={"BATCHPID_TEST_FACTOR": "1.0000001"}, **SMALL)
+    yield
+    machines.cluster.remove_node(node, allow_graceful=False)
+
+
+def test_machines_that_round_differently_are_refused(machines, odd_machine):
+    with pytest.raises(InvalidArgumentError, match=r"do not round alike.*accept_differences"):
+        make_runner(cluster=machines.options(), control=odd_controller())
+
+
+@pytest.mark.slow
+def test_machines_that_round_differently_are_accepted_on_request(machines, odd_machine):
+    with (
+        pytest.warns(ClusterWarning, match="do not round alike"),
+        make_runner(cluster=machines.options(accept_differences=True), control=odd_controller()) as runner,
+    ):
+        assert len({info.digest for info in runner.nodes}) == 2
+
+
+def test_steps_whose_time_are_messages_are_warned_of(machines):
+    with Runner(ROBOT, 1, params=ROBOT.params(), substeps=1, cluster=machines.ensure(1).options(1)) as runner:
+        for _ in range(49):
+            runner.step(ROBOT.start)
+        with pytest.warns(ClusterWarning, match=r"takes [\d.]+ ms, of which \d+ % are simulation.*rollout"):
+            runner.step(ROBOT.start)
+
+
+DRIVER = """
+import sys, psutil
+from sim import Ray, Robot, Runner
+robot = Robot.load("panda")
+runner = Runner(robot, 2, params=robot.params(), cluster=Ray({address!r}, nodes=1))
+pids = [pid for info in runner.nodes for pid in (info.pid, *info.pids)]
+# Ray's agents notice the end of their cluster after a minute.
+pids += [child.pid for child in psutil.Process().children(recursive=True) if "Agent" not in child.name()]
+print(*pids, flush=True)
+while True:
+    runner.step(robot.settings.target)
+"""
+
+
+@pytest.mark.parametrize("local", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_nothing_is_left_of_a_program_that_is_killed(local, machines):
+    shared = set(os.listdir("/dev/shm"))
+    address = "local" if local else machines.ensure(1).cluster.address
+    process = subprocess.Popen(
+        [sys.executable, "-c", DRIVER.format(address=address)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [os.getcwd(), *sys.path]))},
+    )
+    with process:
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        time.sleep(0.3)
+        process.kill()
+    assert len(pids) > (4 if local else 1)
+    assert have_ended(pids, seconds=20.0)
+    assert left_in_memory(shared) == set()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cluster": "slurm"}, "cluster: must be a Ray"),
+        ({"cluster": "ray", "workers": 2}, "workers: is not for a cluster"),
+        ({"cluster": Ray("127.0.0.1:9")}, "cluster: does not answer at 127.0.0.1:9"),
+    ],
+)
+def test_bad_options_are_refused(options, message, monkeypatch):
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(InvalidArgumentError, match=message):
+        make_runner(**options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5}, {"placement": "WIDE"}]
+)
+def test_bad_options_of_a_cluster_are_refused(options):
+    with pytest.raises(InvalidArgumentError, match=next(iter(options))):
+        Ray(**options)

@@ -1,0 +1,105 @@
+"""Machines and processes of a cluster, killed or stopped at random moments of many rollouts."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+import time
+import warnings
+
+import numpy as np
+import pytest
+from clusters import FILTERS, ROBOT, Machines, make_runner, pids_of, setpoints
+from identical import assert_identical
+from processes import have_ended
+
+from sim import RecoveryWarning
+from sim.tuning.moves import Moves
+from sim.tuning.search import tune
+
+ray = pytest.importorskip("ray")
+pytestmark = [*FILTERS, pytest.mark.slow]
+
+TICKS = 1500
+MACHINE_KILLS, PROCESS_KILLS, SEEDS = (
+    int(os.environ.get(f"BATCHPID_SOAK_{name}", count))
+    for name, count in (("MACHINE_KILLS", 20), ("PROCESS_KILLS", 10), ("SEEDS", 20))
+)
+
+
+@pytest.fixture(scope="module")
+def machines():
+    made = Machines()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    with make_runner(workers=0, checkpoint_steps=4000) as runner:
+        return runner.rollout(setpoints(TICKS))
+
+
+def disturbed_rollout(machines, disturb, after):
+    """Return a rollout on two machines, ``disturb`` is called so many seconds after its start; and what was lost."""
+    with make_runner(cluster=machines.ensure(2).options(2), checkpoint_steps=4000) as runner:
+        pids = pids_of(runner)
+        timer = threading.Timer(after, disturb, [runner.nodes])
+        timer.start()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RecoveryWarning)
+            rollout = runner.rollout(setpoints(TICKS))
+        timer.join()
+        pids += pids_of(runner)
+        recoveries = runner.recoveries
+    assert have_ended(pids, 20.0)
+    return rollout, recoveries
+
+
+def test_kills_of_machines(machines, undisturbed):
+    chance, recovered = random.Random(1), 0
+    for _ in range(MACHINE_KILLS):
+        kill = lambda nodes: machines.kill(chance.choice(nodes).pid)  # noqa: E731
+        rollout, recoveries = disturbed_rollout(machines, kill, chance.uniform(0.1, 3.0))
+        assert_identical(undisturbed, rollout)
+        recovered += recoveries
+    assert recovered >= MACHINE_KILLS // 2  # the others ended before their machine's end was noticed
+
+
+def test_kills_of_processes(machines, undisturbed):
+    chance, recovered = random.Random(2), 0
+    for _ in range(PROCESS_KILLS):
+        kill = lambda nodes: os.kill(chance.choice(nodes).pid, signal.SIGKILL)  # noqa: E731
+        rollout, recoveries = disturbed_rollout(machines, kill, chance.uniform(0.1, 3.0))
+        assert_identical(undisturbed, rollout)
+        recovered += recoveries
+    assert recovered == PROCESS_KILLS
+
+
+def test_a_machine_that_is_stopped_for_a_while(machines, undisturbed):
+    def stop(nodes):
+        _, raylet = machines.raylet(nodes[1].pid)
+        os.kill(raylet.pid, signal.SIGSTOP)
+        continued = threading.Timer(20.0, lambda: os.kill(raylet.pid, signal.SIGCONT))
+        continued.start()
+        timers.append(continued)
+
+    timers, began = [], time.monotonic()
+    rollout, _ = disturbed_rollout(machines, stop, 1.0)
+    assert_identical(undisturbed, rollout)
+    for timer in timers:
+        timer.join()
+    assert time.monotonic() - began < 120
+
+
+def test_tuning_is_bit_identical(machines):
+    target = np.tile(ROBOT.settings.target, (3, 1))
+    moves = Moves(0.7 * ROBOT.start + 0.3 * target, target, ("a", "b", "c"))
+    options = {"generations": 2, "population": 4, "seconds": 0.1, "moves": moves}
+    for seed in range(SEEDS):
+        ours = tune(ROBOT, seed=seed, workers=0, **options)
+        theirs = tune(ROBOT, seed=seed, cluster=machines.ensure(3).options(1 + seed % 3), **options)
+        assert ours.history == theirs.history
+        np.testing.assert_array_equal(ours.params.kp, theirs.params.kp)
