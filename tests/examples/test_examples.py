@@ -1,10 +1,12 @@
 """Every example runs with the flags of its docstring, and its results support its claims."""
 
+import importlib.util
 import re
 import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -82,3 +84,46 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
     assert max(errors["PID, no compensation"]) < 2e-3
     assert max(errors["PID, compensated"]) < 1e-3
     assert picture.stat().st_size > 10_000
+
+
+needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs the extra [train]")
+SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", "--updates", "2", "--minibatches", "2")
+
+
+@needs_training
+def test_a_short_training_ends_with_a_picture(run, tmp_path):
+    picture = tmp_path / "curve.png"
+    text = run("train_reach.py", *SMALL, "--epochs", "1", "--picture", str(picture))
+    assert "of 4 episodes end at the goal" in text
+    assert picture.stat().st_size > 10_000
+
+
+@needs_training
+def test_the_advantages_of_the_training_are_those_of_the_definition():
+    """The sum over later steps of the same episode, written out (arXiv:1506.02438, equation 16)."""
+    module = runpy.run_path(str(EXAMPLES / "train_reach.py"))
+    config, rng, steps = module["Config"](), np.random.default_rng(0), 7
+    value, reward = rng.normal(size=(2, steps, 2)).astype(np.float32)
+    done = rng.random((steps, 2)) < 0.3
+    terminated, last = done & (rng.random((steps, 2)) < 0.5), np.ones(2, np.float32)
+    batch = module["Batch"](None, None, None, value, reward, terminated, done, None)
+    found = module["advantages"](batch, last, config)
+    later = np.concatenate([value[1:], last[None]])
+    delta = reward + config.discount * later * ~terminated - value
+    for env in range(2):
+        for step in range(steps):
+            total, factor = 0.0, 1.0
+            for each in range(step, steps):
+                total += factor * delta[each, env]
+                factor *= config.discount * config.gae_lambda * (not done[each, env])
+            assert found[step, env] == pytest.approx(total, rel=1e-4, abs=1e-5)
+
+
+@needs_training
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", ["0", "1", "2"])
+def test_the_trained_policy_reaches_nine_goals_of_ten(run, seed):
+    share = re.search(r"exploration ([\d.]+)% of 64", run("train_reach.py", "--seed", seed))
+    assert share is not None
+    assert float(share[1]) >= 90

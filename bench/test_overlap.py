@@ -1,0 +1,72 @@
+"""Step and policy at once: halves of the envs in turns by send and recv, over step and then policy.
+
+The policy takes as long as half a tick. It waits, as for an accelerator, while the workers have two cores; or it
+computes on one core of two, while each runner has one worker.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from time import perf_counter, sleep
+
+import numpy as np
+import pytest
+
+from sim import Robot, Runner
+
+ENVS, TICKS, ROUNDS, ATTEMPTS, FLOOR = 32, 20, 5, 3, 1.25
+
+
+def compute(seconds: float) -> None:
+    """Use a core for so many seconds."""
+    end = perf_counter() + seconds
+    while perf_counter() < end:
+        pass
+
+
+def in_turn(runner: Runner, policy, seconds: float) -> None:
+    """Step, then let the policy compute for all envs."""
+    for _ in range(TICKS):
+        runner.step(runner.robot.start)
+        policy(seconds)
+
+
+def at_once(halves: list[Runner], policy, seconds: float) -> None:
+    """Let the policy compute for one half while the other steps."""
+    for half in halves:
+        half.send(half.robot.start)
+    for tick in range(TICKS):
+        for half in halves:
+            half.recv()
+            policy(seconds / 2)
+            if tick < TICKS - 1:
+                half.send(half.robot.start)
+
+
+def seconds_of(act, *arguments) -> float:
+    begin = perf_counter()
+    act(*arguments)
+    return perf_counter() - begin
+
+
+@pytest.mark.check
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+@pytest.mark.parametrize(("policy", "workers"), [(sleep, 2), (compute, 1)], ids=["waits", "computes"])
+def test_step_and_policy_at_once_are_faster_than_one_after_the_other(policy, workers):
+    with ExitStack() as stack:
+        whole, *halves = (
+            stack.enter_context(Runner(Robot.load("panda"), envs, workers=workers))
+            for envs in (ENVS, ENVS // 2, ENVS // 2)
+        )
+        for _ in range(ATTEMPTS):
+            ratios = []
+            for _ in range(ROUNDS):
+                tick = seconds_of(in_turn, whole, lambda _: None, 0.0) / TICKS
+                one_by_one = seconds_of(in_turn, whole, policy, tick / 2)
+                ratios.append(one_by_one / seconds_of(at_once, halves, policy, tick / 2))
+            found = float(np.median(ratios))
+            print(f"\ntick {1e3 * tick:.1f} ms: {found:.2f} times the throughput, rounds {np.round(ratios, 2)}")
+            if found >= FLOOR:
+                return
+    pytest.fail(f"{found:.2f} times the throughput of step and then policy, floor {FLOOR}")
