@@ -26,7 +26,7 @@ SETUPS = {
     "jaco2-accurate": "jaco2, accurate",
     "jaco2-fast": "jaco2, fast",
 }
-OURS, ENGINE, OTHER, FAST = "#2f6f9f", "#8a8a8a", "#c9b48a", "#e08a3c"
+OURS, ENGINE, OTHER, FAST, FREE = "#2f6f9f", "#8a8a8a", "#c9b48a", "#e08a3c", "#5aa469"
 PHASES = {
     "step": "#8a8a8a",
     "passive": "#2f6f9f",
@@ -34,6 +34,14 @@ PHASES = {
     "read": "#5aa469",
     "write": "#b45f82",
     "waiting": "#d9d9d9",
+}
+PRESETS = {"accurate": "accurate", "fast": "fast", "free": "free, no shapes"}
+"""Presets in the table of their errors, and how they are labelled; the cost of "free" is that without shapes."""
+MOTIONS = {
+    "tutorial": "the tutorial's",
+    "start pose held": "holding the start pose, gripper closed",
+    "median": "seeded moves and these: median",
+    "slowest": "the slowest of them",
 }
 SCALING = {
     # group of the benchmark: (its parameter, label of the axis)
@@ -68,12 +76,12 @@ def main(options: Options) -> None:
         write_atomically(path, json.dumps(figures, indent=1) + "\n")
     save(draw_speed(figures), DOCS / "images" / "performance.png")
     save(draw_accuracy(figures["accuracy"]), DOCS / "images" / "accuracy.png")
-    page = DOCS / "performance.md"
-    text = page.read_text()
-    for name, table in tables(figures).items():
-        marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
-        text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
-    write_atomically(page, text)
+    for page in (DOCS / "performance.md", DOCS.parent / "README.md"):
+        text = page.read_text()
+        for name, table in tables(figures).items():
+            marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
+            text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
+        write_atomically(page, text)
 
 
 # -- figures -----------------------------------------------------------------------------------------------------
@@ -89,7 +97,13 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
             new["cases"][name] = {
                 "rates": {case: round(row["median"]) for case, row in measured["cases"].items()},
                 "ratios": {case: round(row["closed_loop_over_case"], 3) for case, row in measured["cases"].items()},
+                "per_process": {
+                    case: round(row["closed_loop_over_case_per_process"], 3) for case, row in measured["cases"].items()
+                },
                 "phases": {phase: round(us, 2) for phase, us in measured["microseconds_per_env_step"].items()},
+                "free_phases": {
+                    phase: round(us, 2) for phase, us in measured["microseconds_per_env_step_free"].items()
+                },
             }
     if (path := folder / "pytest.json").is_file():
         benchmarks = json.loads(path.read_text())["benchmarks"]
@@ -106,6 +120,13 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
             if row["group"] == "resources":
                 robot = new["resources"].setdefault(row["params"]["workload"], {})
                 robot |= {key: value for key, value in row["extra_info"].items() if key in RESOURCES}
+        new["few"] = {}
+        for row in benchmarks:
+            if "over_tutorial" in row["extra_info"]:
+                case = f"{row['params']['name']}, {row['params']['physics']}"
+                new["few"].setdefault(case, {})[str(row["params"]["num_envs"])] = row["extra_info"]["over_tutorial"]
+    if (path := folder / "motions.json").is_file():
+        new["motions"] = json.loads(path.read_text())
     if (path := folder / "accuracy.json").is_file():
         new["accuracy"] = json.loads(path.read_text())["accuracy"]
     return new
@@ -196,7 +217,8 @@ def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
         axes = panels[robots.index(row["robot"])][motions.index(row["motion"])]
         spacing, errors = row["over_time"]["seconds"], row["over_time"]["max"]
         time = [spacing * (index + 1) for index in range(len(errors))]
-        colour, dotted = OURS if row["physics"] == "accurate" else FAST, row["reference"].startswith("TGS")
+        colour = {"accurate": OURS, "fast": FAST, "free": FREE}[row["physics"]]
+        dotted = row["reference"].startswith("TGS")
         axes.semilogy(
             time,
             errors,
@@ -235,6 +257,8 @@ def tables(figures: dict[str, Any]) -> dict[str, str]:
         "phases": phases_table(figures["cases"]),
         "presets": presets_table(figures),
         "resources": resources_table(figures["resources"]),
+        **({"motions": motions_table(figures["motions"])} if "motions" in figures else {}),
+        **({"few": few_table(figures["few"])} if "few" in figures else {}),
     }
 
 
@@ -247,17 +271,17 @@ def machine(about: dict[str, Any]) -> str:
 
 
 def cases_table(cases: dict[str, Any]) -> str:
-    """Return the table of rates, and of the closed loop over each."""
-    rows = [
-        [case]
-        + [
-            f"{cases[name]['rates'][case] / 1e3:.1f} ({cases[name]['ratios'][case]:.2f})"
-            if case in cases[name]["rates"]
-            else ""
-            for name in SETUPS
-        ]
-        for case in cases["panda-accurate"]["rates"]
-    ]
+    """Return the table of rates, and of the closed loop over each, also per process where that is another ratio."""
+
+    def cell(figures: dict[str, Any], case: str) -> str:
+        if case not in figures["rates"]:
+            return ""
+        ratio = figures["ratios"][case]
+        alike = figures.get("per_process", {}).get(case, ratio)
+        both = f"{ratio:.2f}" if abs(alike - ratio) < 0.01 else f"{ratio:.2f}; {alike:.2f} per process"
+        return f"{figures['rates'][case] / 1e3:.1f} ({both})"
+
+    rows = [[case, *(cell(cases[name], case) for name in SETUPS)] for case in cases["panda-accurate"]["rates"]]
     return markdown(["thousand env-steps/s (closed loop / case)", *SETUPS.values()], rows)
 
 
@@ -270,17 +294,47 @@ def phases_table(cases: dict[str, Any]) -> str:
 def presets_table(figures: dict[str, Any]) -> str:
     """Return the table of cost and errors of each preset."""
     rows = []
-    for name, label in SETUPS.items():
-        phases = figures["cases"][name]["phases"]
-        all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
-        first = [label, f"{phases['step']:.1f} / {all_work:.1f}"]
+    for robot, physics in dict.fromkeys((row["robot"], row["physics"]) for row in figures["accuracy"]):
+        cases = figures["cases"]
+        free = physics == "free"
+        phases = cases[f"{robot}-fast"].get("free_phases") if free else cases[f"{robot}-{physics}"]["phases"]
+        cost = ""
+        if phases is not None:
+            all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
+            cost = f"{phases['step']:.1f} / {all_work:.1f}"
+        first = [f"{robot}, {PRESETS[physics]}", cost]
         for row in figures["accuracy"]:
-            if f"{row['robot']}-{row['physics']}" == name:
+            if (row["robot"], row["physics"]) == (robot, physics):
                 errors = [f"{row[kind]:.1e}" for kind in ("max", "rms")]
                 rows.append([*first, row["motion"], row["reference"], *errors])
                 first = ["", ""]
     headers = ["", "µs per env step: engine / all", "motion", "against", "max [rad]", "RMS [rad]"]
     return markdown(headers, rows)
+
+
+def motions_table(measured: dict[str, Any]) -> str:
+    """Return the table of the speed over the tutorial's loop, by motion, one process each."""
+    columns = {
+        f"{robot}, {variant}": found
+        for robot, variants in measured["motions"].items()
+        for variant, found in variants.items()
+    }
+    rows = [
+        [
+            f"{measured['moves']} {label}" if motion == "median" else label,
+            *(f"{found[motion]:.1f}" for found in columns.values()),
+        ]
+        for motion, label in MOTIONS.items()
+    ]
+    return markdown(["times as fast as the tutorial's loop", *columns], rows)
+
+
+def few_table(few: dict[str, dict[str, float]]) -> str:
+    """Return the table of the speed of few robots over the tutorial's loop, both in the caller's process."""
+    counts = list(next(iter(few.values())))
+    rows = [[case, *(f"{ratios[count]:.2f}" for count in counts)] for case, ratios in few.items()]
+    headers = [f"{count} robot{'s' if count != '1' else ''}" for count in counts]
+    return markdown(["times as fast as the tutorial's loop", *headers], rows)
 
 
 def resources_table(resources: dict[str, dict[str, float]]) -> str:

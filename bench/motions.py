@@ -1,23 +1,29 @@
 """Time the closed loop over several motions: the tutorial's, holding the start pose, and seeded moves.
 
-    python bench/motions.py
+    python bench/motions.py [--no-isolation] [--json FILE]
 
 The speed depends on the motion: the engine steps shapes that are near each other slower, such as those of a closed
 gripper, and the loop has to look at their contacts. Everything runs in this process, in interleaved rounds: the
 tutorial's loop, the closed loop, and the closed loop without isolation of robots that are about to be touched
-(:mod:`sim.engine.contact_prediction`), which shows what the isolation costs.
+(:mod:`sim.engine.contact_prediction`), which shows what the isolation costs. Times are processor times, which another
+program disturbs less.
 """
 
 from __future__ import annotations
 
+import json
 import statistics
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
 
+from batchpid.files import write_atomically
 from sim import Robot, Runner
 from sim.benchmark.tutorial import TutorialLoop
 from sim.engine.native import status
@@ -27,6 +33,12 @@ from sim.tuning.moves import Moves, random_moves, tutorial_move
 NUM_ENVS, SUBSTEPS = 32, 20
 HOLD = "start pose held"
 CASES = "tutorial's loop", "isolating", "not isolating"
+VARIANTS: dict[str, dict[str, Any]] = {
+    "accurate": {"physics": "accurate"},
+    "fast": {"physics": "fast"},
+    "free, no shapes": {"physics": "free", "collisions": False},
+}
+"""Options of the runner; the moves touch nothing."""
 
 
 @contextmanager
@@ -52,49 +64,90 @@ def motions(robot: Robot, count: int) -> Moves:
     return tutorial_move(robot) + hold + drawn._replace(names=tuple(f"move {number}" for number in range(count)))
 
 
-def main(robots: tuple[str, ...] = ("panda", "jaco2"), moves: int = 20, ticks: int = 50, rounds: int = 3) -> None:
-    """Print what a joint moved by, an env step's time, the speed over the tutorial's loop, and what isolation costs.
+@dataclass(frozen=True)
+class Options:
+    """Time the closed loop over several motions.
 
-    In rad or m, microseconds, and the ratio to the time without isolation.
+    Prints what a joint moved by [rad or m], the time of an env step [us], and two ratios, per process: the speed over
+    that of the tutorial's loop, and the time over that without isolation.
     """
+
+    robots: tuple[str, ...] = ("panda", "jaco2")
+    moves: int = 20
+    ticks: int = 50
+    rounds: int = 3
+    isolation: bool = True
+    """Measure without isolation, too."""
+    json: Path | None = None
+    """File for the figures."""
+
+
+def main(options: Options) -> None:
+    """Print the table and write the figures."""
     print(f"{status()}\n\n| robot, solver, motion | moved | us | tutorial's loop | isolation |\n{'| --- ' * 5}|")
-    for name in robots:
+    figures: dict[str, dict[str, dict[str, float]]] = {}
+    for name in options.robots:
         robot = Robot.load(name, dissipation="sapien")
-        chosen = motions(robot, moves)
-        for physics in ("accurate", "fast"):
-            runners = {}
-            for case, enabled in zip(CASES[1:], (True, False), strict=True):
-                with isolation(enabled):
-                    runners[case] = Runner(robot, NUM_ENVS, params=robot.params(), workers=0, physics=physics)
-            over, costs = [], []
-            for start, target, motion in zip(*chosen, strict=True):
-                seconds: dict[str, list[float]] = {case: [] for case in CASES}
-                tutorial = TutorialLoop(robot, target, start=start)
-                for _ in range(rounds):
-                    tutorial.reset()
-                    began = time.perf_counter()
-                    tutorial.run(ticks * SUBSTEPS)
-                    seconds[CASES[0]].append(NUM_ENVS * (time.perf_counter() - began))
-                    for case, runner in runners.items():
-                        runner.reset(start)
-                        began = time.perf_counter()
-                        qpos = runner.rollout(np.broadcast_to(target, (ticks, robot.dof))).qpos
-                        seconds[case].append(time.perf_counter() - began)
-                        moved = np.abs(qpos[-1] - start).max()
-                        # Friction holds some short moves: they are timed, too, and the table tells.
-                        if motion in (HOLD, "tutorial"):
-                            assert (moved > 0.01) == (motion != HOLD), f"{motion}: the robots moved by {moved:g} rad"
-                paired = list(zip(*seconds.values(), strict=True))
-                over.append(statistics.median(first / loop for first, loop, _ in paired))
-                costs.append(statistics.median(loop / off for _, loop, off in paired))
-                us = statistics.median(seconds[CASES[1]]) / (NUM_ENVS * ticks * SUBSTEPS) * 1e6
-                row = f"{name}, {physics}, {motion}", f"{moved:.2g}", f"{us:.1f}", f"{over[-1]:.2f}", f"{costs[-1]:.3f}"
-                print(f"| {' | '.join(row)} |", flush=True)
-            for case, pick in (("median", statistics.median), ("slowest", min)):
-                print(f"| **{name}, {physics}, {case}** | | | **{pick(over):.2f}** | {statistics.median(costs):.3f} |")
-            for runner in runners.values():
-                runner.close()
+        chosen = motions(robot, options.moves)
+        for variant, ours in VARIANTS.items():
+            rows = [*measure(robot, chosen, ours, options)]
+            for motion, row in zip(chosen.names, rows, strict=True):
+                cost = "" if row.cost is None else f"{row.cost:.3f}"
+                cells = f"{name}, {variant}, {motion}", f"{row.moved:.2g}", f"{row.us:.1f}", f"{row.over:.2f}", cost
+                print(f"| {' | '.join(cells)} |", flush=True)
+            over = [row.over for row in rows]
+            found = dict(zip(chosen.names[:2], over, strict=False))
+            found |= {"median": statistics.median(over), "slowest": min(over)}
+            for case in ("median", "slowest"):
+                print(f"| **{name}, {variant}, {case}** | | | **{found[case]:.2f}** | |")
+            figures.setdefault(name, {})[variant] = {motion: round(ratio, 2) for motion, ratio in found.items()}
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(options.json, json.dumps({"motions": figures, "moves": options.moves}) + "\n")
+
+
+class Row(NamedTuple):
+    """Figures of one motion."""
+
+    moved: float
+    us: float
+    over: float
+    """Speed over that of the tutorial's loop, both in one process."""
+    cost: float | None
+    """Time over that without isolation."""
+
+
+def measure(robot: Robot, chosen: Moves, ours: dict[str, Any], options: Options) -> Iterator[Row]:
+    """Yield the figures of each of the motions, under the options ``ours`` of the runner."""
+    runners = {}
+    for case, enabled in zip(CASES[1 : 3 if options.isolation else 2], (True, False), strict=False):
+        with isolation(enabled):
+            runners[case] = Runner(robot, NUM_ENVS, params=robot.params(), workers=0, **ours)
+    for start, target, motion in zip(*chosen, strict=True):
+        seconds: dict[str, list[float]] = {case: [] for case in (CASES[0], *runners)}
+        tutorial = TutorialLoop(robot, target, start=start)
+        for _ in range(options.rounds):
+            tutorial.reset()
+            began = time.process_time()
+            tutorial.run(options.ticks * SUBSTEPS)
+            seconds[CASES[0]].append(NUM_ENVS * (time.process_time() - began))
+            for case, runner in runners.items():
+                runner.reset(start)
+                began = time.process_time()
+                qpos = runner.rollout(np.broadcast_to(target, (options.ticks, robot.dof))).qpos
+                seconds[case].append(time.process_time() - began)
+                moved = float(np.abs(qpos[-1] - start).max())
+                # Friction holds some short moves: they are timed, too, and the table tells.
+                if motion in (HOLD, "tutorial"):
+                    assert (moved > 0.01) == (motion != HOLD), f"{motion}: the robots moved by {moved:g} rad"
+        times = list(zip(*seconds.values(), strict=True))
+        us = statistics.median(seconds[CASES[1]]) / (NUM_ENVS * options.ticks * SUBSTEPS) * 1e6
+        over = statistics.median(each[0] / each[1] for each in times)
+        cost = statistics.median(each[1] / each[2] for each in times) if options.isolation else None
+        yield Row(moved, us, over, cost)
+    for runner in runners.values():
+        runner.close()
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Options))

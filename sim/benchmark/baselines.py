@@ -26,11 +26,12 @@ from sim.workers.worker import ONE_THREAD
 Float64 = NDArray[np.float64]
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 ENGINES = {
-    # case: (scenes to a PhysX system, whether all systems are stepped in turn)
-    "drive, a scene a robot": (1, True),
-    "bare engine, packs of 8": (8, True),
-    "bare engine": (4, True),  # as in the Runner: the fastest of 1, 2, 4, 8 and 16
-    "bare engine, pack by pack": (4, False),
+    # case: (scenes to a PhysX system, whether all systems are stepped in turn, with collisions)
+    "drive, a scene a robot": (1, True, True),
+    "bare engine, packs of 8": (8, True, True),
+    "bare engine": (4, True, True),  # as in the Runner: the fastest of 1, 2, 4, 8 and 16
+    "bare engine, pack by pack": (4, False, True),
+    "bare engine, no shapes": (64, False, False),
 }
 
 
@@ -76,7 +77,7 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
             finals = [connection.recv() for connection in used]
             return finals[0]
 
-        return Case(workload.steps * envs, reset, run, close)
+        return Case(workload.steps * envs, reset, run, close, len(used))
 
     return {name: case(name) for name in (*TUTORIALS, *ENGINES)}
 
@@ -125,8 +126,8 @@ class _DriveLoop:
     """Scenes under PhysX's drive without control, and without gravity, so that the drive reaches the PID's place."""
 
     def __init__(self, name: str, workload: Workload, share: int) -> None:
-        spec, settings = workload.scene(gravity=False), tutorial_settings(workload.robot)
-        size, self._in_turn = ENGINES[name]
+        size, self._in_turn, collisions = ENGINES[name]
+        spec, settings = workload.scene(gravity=False, collisions=collisions), tutorial_settings(workload.robot)
         self._start, self._substeps = workload.start, workload.substeps
         sizes = [min(size, share - first) for first in range(0, share, size)]
         self._packs = [Pack(spec, count, system_size=size, isolates=False) for count in sizes]

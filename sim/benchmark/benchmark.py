@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sim.benchmark.baselines import make_baselines
 from sim.benchmark.peers import make_peers
+from sim.benchmark.policy import ResidualPolicy
 from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.native import python_calls
 from sim.engine.pack import Pack
@@ -38,9 +39,14 @@ CASES = {
     "bare engine": "the same, 4 robots to a system, as the Runner packs them",
     "bare engine, pack by pack": "the same, each pack stepped for a tick while it is in the cache",
     "closed loop, Python calls": "the closed loop without the native extension: the same as below, if there is none",
+    "bare engine, no shapes": "the same without collision shapes, 64 robots to a system, as the Runner packs those",
     "closed loop, tick by tick": "PID, gravity and Coriolis compensation at every sim step: Runner.step, tick by tick",
     "closed loop": "the same by Runner.rollout: as all of the above, the workers never wait for each other",
+    "closed loop, policy network": "the same with a network of 64 x 64 units in the law, by NumPy: a Controller",
+    "closed loop, no shapes": "the closed loop for free motion: Runner(collisions=False)",
+    "closed loop, no shapes, free": "the same with physics 'free'",
 }
+OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 PHASES = {
     # phase of a sim step: the calls on the pack that it consists of
     "read": ("read_qpos", "read_qvel"),
@@ -52,54 +58,81 @@ PHASES = {
 
 @dataclass(frozen=True)
 class Result:
-    """Figures of one case: env-steps per second of every round, and the final positions of the first env (dof,)."""
+    """Figures of one case: env-steps per second of every round, the final positions of the first env (dof,), and the
+    number of processes that stepped.
+    """
 
     rates: tuple[float, ...]
     final: Float64
+    processes: int
 
     @property
     def rate(self) -> float:
         """Median env-steps per second."""
         return statistics.median(self.rates)
 
+    def over(self, other: Result) -> float:
+        """Return the median over the rounds, which are paired, of our rate over the other's."""
+        return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
 
-def make_closed_loops(workload: Workload) -> dict[str, Case]:
-    """Return the cases of the Runner, by name; all but that of Python's calls share one runner."""
-    runner, target, ticks = workload.runner(), workload.target, workload.ticks
-    with python_calls():
-        python = workload.runner()
 
-    def tick_by_tick() -> NDArray[np.float32]:
-        for _ in range(ticks):
-            final = runner.step(target).qpos[0]
-        return final
+def make_closed_loops(workload: Workload, names: Collection[str] = tuple(CASES)) -> dict[str, Case]:
+    """Return those cases of the Runner that are among ``names``; a case by ticks shares the runner of the rollouts."""
+    target, ticks, shared = workload.target, workload.ticks, dict[str, Runner]()
+
+    def runner(name: str) -> Runner:
+        if name == PYTHON:
+            with python_calls():
+                return workload.runner()
+        return workload.runner(**_options(workload)[name])
 
     def rollout(runner: Runner) -> NDArray[np.float32]:
         return runner.rollout(np.broadcast_to(target, (ticks, *target.shape))).qpos[-1, 0]
 
-    def case(runner: Runner, run: Callable[[], NDArray[Any]]) -> Case:
-        return Case(workload.num_envs * workload.steps, lambda: runner.reset(workload.start), run, runner.close)
+    def tick_by_tick(runner: Runner) -> NDArray[np.float32]:
+        for _ in range(ticks):
+            final = runner.step(target).qpos[0]
+        return final
 
+    def case(name: str, run: Callable[[Runner], NDArray[Any]]) -> Case:
+        kind = OURS if name == BY_TICKS else name
+        if kind not in shared:
+            shared[kind] = runner(kind)
+        ours = shared[kind]
+        env_steps = workload.num_envs * workload.steps
+        return Case(env_steps, lambda: ours.reset(workload.start), lambda: run(ours), ours.close, workload.processes)
+
+    kinds = [PYTHON, BY_TICKS, *_options(workload)]
+    return {name: case(name, tick_by_tick if name == BY_TICKS else rollout) for name in kinds if name in names}
+
+
+def _options(workload: Workload) -> dict[str, dict[str, Any]]:
+    """Return the options of the runner in each case of a rollout."""
     return {
-        "closed loop, Python calls": case(python, lambda: rollout(python)),
-        "closed loop, tick by tick": case(runner, tick_by_tick),
-        "closed loop": case(runner, lambda: rollout(runner)),
+        OURS: {},
+        "closed loop, policy network": {"control": ResidualPolicy(workload.robot)},
+        "closed loop, no shapes": {"collisions": False},
+        "closed loop, no shapes, free": {"collisions": False, "physics": "free"},
     }
 
 
 def measure_rates(
-    workload: Workload, progress: Callable[[str], None] = lambda case: None, peers: Collection[str] = ()
+    workload: Workload,
+    progress: Callable[[str], None] = lambda case: None,
+    peers: Collection[str] = (),
+    names: Collection[str] = tuple(CASES),
 ) -> dict[str, Result]:
-    """Measure every case and ``peers`` ``workload.rounds`` times in turn; the rounds of different cases are paired.
+    """Measure the cases ``names`` and ``peers`` ``workload.rounds`` times in turn, so that their rounds are paired.
 
     ``progress`` is called with the case's name before every round. Raises BatchPIDError where the robots of a case did
     not move or ended elsewhere, and MissingDependencyError where the package of a peer is not installed.
     """
     with ExitStack() as stack:
-        cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload)
+        cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload, names)
         for case in cases.values():
             stack.callback(case.close)
-        seconds: dict[str, list[float]] = {name: [] for name in (*CASES, *peers)}
+        order = [*(name for name in CASES if name in names), *peers]
+        seconds: dict[str, list[float]] = {name: [] for name in order}
         final = {}
         for _ in range(workload.rounds):
             for name, rounds in seconds.items():
@@ -109,12 +142,12 @@ def measure_rates(
     for name, place in final.items():
         workload.check_motion(name, place)
     return {
-        name: Result(tuple(cases[name].env_steps / took for took in rounds), final[name])
+        name: Result(tuple(cases[name].env_steps / took for took in rounds), final[name], cases[name].processes)
         for name, rounds in seconds.items()
     }
 
 
-def measure_phases(workload: Workload) -> dict[str, float]:
+def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
     Measured in this process with a worker's share of the envs. "control" is everything but calls on the engine. The
@@ -124,7 +157,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     share = max(1, workload.num_envs // workload.processes)
     robot = Robot.load(workload.robot.path, dissipation="sapien")
     shared = SharedArrays(Arrays.layout(1, share, robot.dof))
-    options = RunnerOptions(robot, share, physics=workload.physics)
+    options = RunnerOptions(robot, share, physics=workload.physics, collisions=collisions)
     loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
     loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, workload.robot.dof)))
     loop.ticks[0].command.setpoint[...] = workload.target
@@ -136,7 +169,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     shared.close()
     env_steps = workload.steps * share
     spent["control"] = total - sum(spent.values())
-    spent["waiting"] = _waiting(workload) * env_steps
+    spent["waiting"] = _waiting(workload, collisions) * env_steps
     return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
 
 
@@ -157,9 +190,9 @@ def _time_calls(pack: Pack, spent: dict[str, float]) -> None:
             setattr(pack, name, timed(phase, getattr(pack, name)))
 
 
-def _waiting(workload: Workload) -> float:
+def _waiting(workload: Workload, collisions: bool) -> float:
     """Return the mean seconds per env step between the end of a worker's work and the next tick."""
-    with workload.runner() as runner:
+    with workload.runner(collisions=collisions) as runner:
         runner.step(workload.target)
         idle = 0.0
         for _ in range(workload.ticks):

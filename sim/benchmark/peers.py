@@ -45,7 +45,7 @@ def _async_vector(workload: Workload, count: int) -> Case:
             qpos = envs.step(actions)[0]
         return qpos[0]
 
-    return Case(workload.steps * count, envs.reset, run, envs.close)
+    return Case(workload.steps * count, envs.reset, run, envs.close, min(count, workload.processes))
 
 
 def _tutorial_env(workload: Workload) -> Any:
@@ -115,7 +115,7 @@ def _mujoco_rollout(workload: Workload) -> Case:
         mujoco.mj_setState(model, data[0], state[0], kind)
         return data[0].qpos[columns]
 
-    return Case(workload.num_envs * workload.steps, reset, run, pool.close)
+    return Case(workload.num_envs * workload.steps, reset, run, pool.close, workload.processes)
 
 
 PEERS = {

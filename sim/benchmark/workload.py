@@ -70,17 +70,18 @@ class Workload:
         """Number of processes that step: the workers, or this process."""
         return max(self.workers, 1)
 
-    def scene(self, gravity: bool) -> SceneSpec:
+    def scene(self, gravity: bool, collisions: bool = True) -> SceneSpec:
         """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
         robot, physics = self.robot, PHYSICS[self.physics]
-        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, physics, dissipation="sapien")
+        options: dict[str, Any] = {"dissipation": "sapien", "collisions": collisions, "ground": collisions}
+        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, physics, **options)
         return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
 
-    def runner(self) -> Runner:
+    def runner(self, **options: Any) -> Runner:
         """Return a runner of the robots with the tutorial's gains and SAPIEN's default friction and damping."""
         robot = Robot.load(self.robot.path, dissipation="sapien")
-        options: dict[str, Any] = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP}
-        return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **options)
+        ours: dict[str, Any] = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP}
+        return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **ours | options)
 
     def check_motion(self, case: str, final: Float64) -> None:
         """Raise BatchPIDError unless the robot at ``final`` (dof,) has moved from the start towards the target."""
@@ -103,6 +104,8 @@ class Case(NamedTuple):
     """Steps one round; returns the final positions of the first env (dof,) [rad or m]."""
     close: Callable[[], None]
     """Frees processes and scenes; may be called again."""
+    processes: int
+    """Processes, or threads, that step."""
 
 
 def run_round(case: Case) -> tuple[float, Float64]:

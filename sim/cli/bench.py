@@ -6,11 +6,9 @@ import json
 import os
 import platform
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from batchpid.files import write_atomically
 from batchpid.validate import integer
@@ -25,7 +23,8 @@ class BenchCommand:
     """Measure the speed of the closed loop and its phases, of the tutorial's loop and of the bare engine.
 
     All cases move the same robots the same way, in turn, in several rounds; rates are medians, ratios are medians of
-    the rounds' ratios. An error is raised if the robots of a case do not move as they should.
+    the rounds' ratios, of all processes together and per process. An error is raised if the robots of a case do not
+    move as they should.
     """
 
     robot: flags.RobotName = "panda"
@@ -48,7 +47,7 @@ class BenchCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
+        from sim.benchmark.benchmark import CASES, OURS, measure_phases, measure_rates
         from sim.benchmark.peers import PEERS, installed_peers
         from sim.benchmark.workload import Workload
         from sim.cli.report import table
@@ -71,20 +70,24 @@ class BenchCommand:
         results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers)
         next(advance, None)  # close the bar
         phases = measure_phases(workload)
+        free_phases = measure_phases(replace(workload, physics="free"), collisions=False)
 
         print(
             f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, "
             f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds, {native_status()}\n"
         )
-        ours = results["closed loop"].rates
-        ratios = {case: float(np.median(np.divide(ours, result.rates))) for case, result in results.items()}
+        ours = results[OURS]
+        ratios = {case: ours.over(result) for case, result in results.items()}
+        alike = {case: ratios[case] * result.processes / ours.processes for case, result in results.items()}
         rows = [
-            [case, f"{result.rate / 1e3:,.1f}", f"{ratios[case]:.2f}", descriptions[case]]
+            [case, f"{result.rate / 1e3:,.1f}", f"{ratios[case]:.2f}", f"{alike[case]:.2f}", descriptions[case]]
             for case, result in results.items()
         ]
-        print(table(rows, ["case", "thousand env-steps/s", "closed loop / case", "description"], "lrrl"))
-        print("\nclosed loop, microseconds per env step in a worker:")
-        print(table([[f"{value:.2f}" for value in phases.values()]], list(phases), "r" * len(phases)))
+        print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process", "description"], "lrrrl"))
+        print("\nmicroseconds per env step in a worker:")
+        both = {OURS: phases, "no shapes, free": free_phases}
+        figures = [[name, *(f"{value:.2f}" for value in spent.values())] for name, spent in both.items()]
+        print(table(figures, ["", *phases], "l" + "r" * len(phases)))
         absent = sorted({peer.package for name, peer in PEERS.items() if self.peers and name not in peers})
         if absent:
             print(f"\nnot installed: {', '.join(absent)} (pip install 'batchpid[peers]')")
@@ -94,18 +97,21 @@ class BenchCommand:
                     "env_steps_per_second": result.rates,
                     "median": result.rate,
                     "closed_loop_over_case": ratios[case],
+                    "closed_loop_over_case_per_process": alike[case],
+                    "processes": result.processes,
                     "final_qpos": result.final.tolist(),
                 }
                 for case, result in results.items()
             }
-            figures = {
+            measured = {
                 "setup": vars(workload) | {"robot": workload.robot.name},
                 "machine": machine(),
                 "cases": cases,
                 "microseconds_per_env_step": phases,
+                "microseconds_per_env_step_free": free_phases,
             }
             out.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(out, json.dumps(figures, indent=2) + "\n")
+            write_atomically(out, json.dumps(measured, indent=2) + "\n")
             print(f"\nwritten: {out}")
 
 

@@ -1,0 +1,51 @@
+"""Few robots in the caller's process, beside the tutorial's own loop: the time of an env step of both, in turn.
+
+Processor time: another program disturbs it less.
+"""
+
+import statistics
+import time
+
+import numpy as np
+import pytest
+
+from sim import Robot
+from sim.benchmark.tutorial import TutorialLoop
+from sim.benchmark.workload import Workload
+
+TICKS, ROUNDS = 50, 7
+COUNTS = (1, 4, 16)
+
+
+def few_robots(name, num_envs, physics, rounds=ROUNDS):
+    """Return the seconds per env step of our loop and of the tutorial's in each round (rounds, 2)."""
+    workload = Workload(Robot.load(name), num_envs=num_envs, workers=0, physics=physics, ticks=TICKS)
+    tutorial = TutorialLoop(workload.robot, workload.target, start=workload.start)
+    setpoints = np.broadcast_to(workload.target, (TICKS, *workload.target.shape))
+    seconds = []
+    with workload.runner() as runner:
+        for _ in range(rounds + 1):
+            tutorial.reset()
+            runner.reset(workload.start)
+            began = time.process_time()
+            qpos = runner.rollout(setpoints).qpos[-1]
+            between = time.process_time()
+            final = tutorial.run(workload.steps)
+            ended = time.process_time()
+            seconds.append(((between - began) / (workload.steps * num_envs), (ended - between) / workload.steps))
+    for place in (*qpos, final):
+        assert np.abs(place - workload.start)[workload.moving].max() > 0.05, "the robots did not move"
+    return seconds[1:]
+
+
+@pytest.mark.parametrize("num_envs", COUNTS)
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_few_robots(benchmark, name, physics, num_envs):
+    benchmark.group = "few robots in the caller's process"
+    seconds = []
+    benchmark.pedantic(lambda: seconds.extend(few_robots(name, num_envs, physics)), rounds=1)
+    ours = [both[0] for both in seconds]
+    benchmark.stats.stats.data[:] = ours
+    benchmark.extra_info["env_steps_per_second"] = round(1 / statistics.median(ours))
+    benchmark.extra_info["over_tutorial"] = round(statistics.median(theirs / ours for ours, theirs in seconds), 3)

@@ -1,0 +1,46 @@
+"""Controller of the caller's own for the benchmark: a policy network that is evaluated at every sim step."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.benchmark.tutorial import tutorial_settings
+from sim.robot.robot import Robot
+
+Float32 = NDArray[np.float32]
+
+HIDDEN = 64
+"""Units of each of the two hidden layers."""
+RESIDUAL = 0.01
+"""Largest share of the effort limits that the network adds."""
+
+
+class ResidualPolicy:
+    """PD law with the tutorial's gains plus a residual by a network with two hidden layers of random weights, in NumPy.
+
+    The residual is small, so that the robots move as in the other cases: the network costs the same as a trained one.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        settings, rng, dof = tutorial_settings(robot), np.random.default_rng(0), robot.dof
+        self._kp, self._kd = 2 * settings.kp, settings.kd  # it lacks the integral
+        self._scale = (RESIDUAL * robot.effort_limit).astype(np.float32)
+        sizes = (3 * dof, HIDDEN, HIDDEN, dof)
+        self._layers = [rng.normal(0, n**-0.5, (n, m)).astype(np.float32) for n, m in pairwise(sizes)]
+
+    def init(self, robot: Robot, num_envs: int) -> None:
+        """Return no state."""
+
+    def __call__(
+        self, state: None, setpoint: NDArray[Any], qpos: NDArray[Any], qvel: NDArray[Any], passive: NDArray[Any]
+    ) -> tuple[None, NDArray[Any]]:
+        """Return the state, None, and the efforts (envs, dof) [N m or N]."""
+        error = setpoint - qpos
+        units: Float32 = np.concatenate([error, qpos, qvel], axis=1, dtype=np.float32)
+        for layer in self._layers:
+            units = np.tanh(units @ layer)
+        return None, passive + self._kp * error - self._kd * qvel + self._scale * units
