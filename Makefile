@@ -5,7 +5,7 @@
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
-# make figures  measure and redraw docs/performance.md (5 minutes, on an idle machine)
+# make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
 # make soak     the minutes-long tests
 #
 # Each builds .venv if it is missing or older than pyproject.toml. Another Python: make PYTHON=/path/to/python3.12
@@ -60,14 +60,17 @@ bench-check: $(VENV)/.dev
 	@$(RUN) -m pytest bench -m check -s --timeout 1200 $(ARGS)
 
 MEASURED := out/bench
-bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json $(3)
+bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json \
+	--ticks 60 --rounds 3 --xla $(3)
 
 figures: $(VENV)/.dev
 	$(call bench_case,panda,accurate,--peers)
 	$(call bench_case,panda,fast)
 	$(call bench_case,jaco2,accurate)
 	$(call bench_case,jaco2,fast)
-	@$(RUN) -m pytest bench/test_scaling.py bench/test_resources.py --benchmark-json $(MEASURED)/pytest.json
+	@$(RUN) bench/motions.py --no-isolation --ticks 20 --rounds 2 --json $(MEASURED)/motions.json
+	@$(RUN) -m pytest bench/test_few_robots.py bench/test_scaling.py bench/test_resources.py \
+		--benchmark-json $(MEASURED)/pytest.json
 	@$(RUN) bench/draw.py $(MEASURED)
 
 # The errors of the physics presets depend on physics and gains, not on the machine's speed.

@@ -62,7 +62,7 @@ def test_ratios_keep_their_floors(name, physics):
     names = {case for floor in floors for case in (floor.case, floor.over)}
 
     def measure():
-        workload = Workload(Robot.load(name), num_envs=48, physics=physics, rounds=3)
+        workload = Workload(Robot.load(name), num_envs=48, physics=physics, ticks=60, rounds=3)
         results = measure_rates(workload, names=names)
         return {
             f"{floor.case} / {floor.over}": (results[floor.case].over(results[floor.over]), getattr(floor, physics))

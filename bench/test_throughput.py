@@ -9,13 +9,13 @@ import pytest
 
 from sim import Robot
 from sim.benchmark.baselines import make_baselines
-from sim.benchmark.benchmark import CASES, make_closed_loops
+from sim.benchmark.benchmark import CASES, XLA_CASES, make_closed_loops
 from sim.benchmark.workload import Workload
 
 ROUNDS = 3
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", CASES | XLA_CASES)
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_case(benchmark, name, physics, case):

@@ -46,6 +46,11 @@ CASES = {
     "closed loop, no shapes": "the closed loop for free motion: Runner(collisions=False)",
     "closed loop, no shapes, free": "the same with physics 'free'",
 }
+XLA_CASES = {
+    "closed loop, XLA": "law and sim steps of a tick in one program of XLA: Runner(backend='jax')",
+    "closed loop, no shapes, free, XLA": "the same without collision shapes, with physics 'free'",
+}
+"""Cases of the Runner that compile for some seconds first."""
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 PHASES = {
     # phase of a sim step: the calls on the pack that it consists of
@@ -108,11 +113,14 @@ def make_closed_loops(workload: Workload, names: Collection[str] = tuple(CASES))
 
 def _options(workload: Workload) -> dict[str, dict[str, Any]]:
     """Return the options of the runner in each case of a rollout."""
+    free = {"collisions": False, "physics": "free"}
     return {
         OURS: {},
         "closed loop, policy network": {"control": ResidualPolicy(workload.robot)},
         "closed loop, no shapes": {"collisions": False},
-        "closed loop, no shapes, free": {"collisions": False, "physics": "free"},
+        "closed loop, no shapes, free": free,
+        "closed loop, XLA": {"backend": "jax"},
+        "closed loop, no shapes, free, XLA": free | {"backend": "jax"},
     }
 
 
@@ -124,14 +132,15 @@ def measure_rates(
 ) -> dict[str, Result]:
     """Measure the cases ``names`` and ``peers`` ``workload.rounds`` times in turn, so that their rounds are paired.
 
-    ``progress`` is called with the case's name before every round. Raises BatchPIDError where the robots of a case did
-    not move or ended elsewhere, and MissingDependencyError where the package of a peer is not installed.
+    ``names`` are among CASES and XLA_CASES. ``progress`` is called with the case's name before every round. Raises
+    BatchPIDError where the robots of a case did not move or ended elsewhere, and MissingDependencyError where the
+    package of a peer is not installed.
     """
     with ExitStack() as stack:
         cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload, names)
         for case in cases.values():
             stack.callback(case.close)
-        order = [*(name for name in CASES if name in names), *peers]
+        order = [*(name for name in CASES | XLA_CASES if name in names), *peers]
         seconds: dict[str, list[float]] = {name: [] for name in order}
         final = {}
         for _ in range(workload.rounds):

@@ -38,6 +38,8 @@ class BenchCommand:
     """Measurements of each case."""
     peers: flags.Switch = False
     """Measure MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop, too, where installed."""
+    xla: flags.Switch = False
+    """Measure the closed loop in XLA, too."""
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
@@ -47,7 +49,7 @@ class BenchCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from sim.benchmark.benchmark import CASES, OURS, measure_phases, measure_rates
+        from sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_phases, measure_rates
         from sim.benchmark.peers import PEERS, installed_peers
         from sim.benchmark.workload import Workload
         from sim.cli.report import table
@@ -65,9 +67,10 @@ class BenchCommand:
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
         peers = installed_peers() if self.peers else ()
-        descriptions = CASES | {name: PEERS[name].description for name in peers}
+        names = CASES | XLA_CASES if self.xla else CASES
+        descriptions = names | {name: PEERS[name].description for name in peers}
         advance = iter(bar("bench")(range(workload.rounds * len(descriptions))))
-        results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers)
+        results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers, names=names)
         next(advance, None)  # close the bar
         phases = measure_phases(workload)
         free_phases = measure_phases(replace(workload, physics="free"), collisions=False)

@@ -13,7 +13,7 @@ from sim.benchmark.workload import Workload, run_round
 
 @pytest.fixture(scope="module")
 def workload(panda):
-    return Workload(panda, num_envs=4, workers=1, ticks=100, rounds=1)
+    return Workload(panda, num_envs=4, workers=0, ticks=60, rounds=1)
 
 
 def test_every_case_moves_and_has_a_rate(workload):

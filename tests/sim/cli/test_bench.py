@@ -3,7 +3,7 @@ import json
 
 def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     path = tmp_path / "new" / "bench.json"
-    flags = ["--num-envs", 1, "--workers", 1, "--ticks", 100, "--rounds", 1]
+    flags = ["--num-envs", 1, "--workers", 0, "--ticks", 50, "--rounds", 1]
     status, out, err = batchpid("bench", *flags, "--out", path)
     assert status == 0, err
     assert "closed loop" in out
