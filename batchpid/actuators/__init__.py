@@ -10,6 +10,7 @@ Build parameters with :func:`make_actuators`; thread a state through :func:`deli
 See docs/actuators.md.
 """
 
+from batchpid.actuators import presets
 from batchpid.actuators.dynamics import (
     Coefficients,
     advance_effort,
@@ -40,6 +41,7 @@ __all__ = [
     "load_actuators",
     "make_actuators",
     "measure",
+    "presets",
     "reset",
     "save_actuators",
 ]

@@ -12,7 +12,7 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return why the sim steps of a tick cannot be one program of XLA, under backend "jax"; or nothing."""
     if options.robot.coupling is not None:
         return "coupled joints take constraint efforts of NumPy"
-    if options.randomization is not None or actuators is not None:
+    if options.randomization is not None or actuators is not None or options.robot.actuators is not None:
         return "actuators and randomizations are in NumPy"
     if options.guard is not False:
         return "the guard of setpoints is in NumPy"

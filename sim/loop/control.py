@@ -18,6 +18,7 @@ from sim.engine.pack import Pack
 from sim.loop.arrays import Command
 from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, acting_params, half_way
 from sim.options import ControlMode
+from sim.robot.actuators import KnownJoints
 from sim.robot.mimics import coupling_of
 
 Float64 = NDArray[np.float64]
@@ -54,8 +55,8 @@ class Control:
     limits: tuple[Any, Any] = None, None
     drive: tuple[Any, Any] = 0.0, 0.0
 
-    def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
-        self._scene, self._plant, self.params = scene, plant, params
+    def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant, known: KnownJoints | None = None) -> None:
+        self._scene, self._plant, self.params, self._known = scene, plant, params, known
         self._coupling = coupling_of(scene.joints)
         qpos = plant.read_qpos()
         self.saturated: NDArray[np.bool_] = np.zeros(qpos.shape, bool)
@@ -120,6 +121,8 @@ class PIDControl(Control):
         """Change gains, limits and times; the state carries on, with the integral in the unit of the new gains."""
         self.law = PIDLaw.of(params)
         damping = np.array([joint.damping for joint in self._scene.joints])
+        if self._known is not None:
+            damping = damping + self._known.viscous
         if self.law.whole != PIDLaw.of(self.params).whole:
             matrix = self._mass_matrix(self._plant.read_qpos(), damping)
             self._state = convert_integral(self._state, self.params, params, matrix)
@@ -166,6 +169,8 @@ class PIDControl(Control):
         if self._dynamics is None:
             self._dynamics = scene_dynamics(self._scene)
         matrix = self._dynamics.mass_matrix(qpos)
+        if self._known is not None:
+            matrix = matrix + np.diag(self._known.armature)
         if damping is not None:
             matrix = matrix + self._scene.timestep * np.diag(damping)
         return matrix if self._coupling is None else self._coupling.mass_matrix(matrix)

@@ -26,6 +26,7 @@ from sim.loop.snapshot import EnvStates
 from sim.loop.variation import acting_actuators, acting_params, variation
 from sim.options import RunnerOptions
 from sim.randomization.draws import Draws
+from sim.robot.actuators import known_joints
 
 Float64 = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class EnvGroup:
         self._params, self._own_actuators = params, options.actuators  # before the randomization
         self._control = make_control(options, pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
-        self._friction = JointFriction(pack, self._control.drive)
+        self._friction = JointFriction(pack, self._control.drive, known_joints(self._options.robot).coulomb)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._qpos = pack.read_qpos()
         self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
@@ -178,7 +179,7 @@ class EnvGroup:
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
         self._control.write(states.controller, states.saturated)
-        self._friction = JointFriction(pack, self._control.drive)
+        self._friction = JointFriction(pack, self._control.drive, known_joints(self._options.robot).coulomb)
         self._friction.write(states.friction)
         if self._guard is not None:
             self._guard.write(states.guard)

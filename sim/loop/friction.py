@@ -52,12 +52,14 @@ class JointFriction:
         Damping and stiffness of the engine's drives, (1, dof) or (M, dof) [N m s/rad, N m/rad].
     """
 
-    def __init__(self, pack: Pack, drive: tuple[Any, Any] = (0.0, 0.0)) -> None:
+    def __init__(self, pack: Pack, drive: tuple[Any, Any] = (0.0, 0.0), coulomb: Any = 0.0) -> None:
+        """``coulomb`` (dof,) is known to the controller in addition to the description's."""
         self._pack, self.drive = pack, drive
         self._coupling = coupling_of(pack.spec.joints)
         joints = pack.spec.joints
         modelled = DISSIPATION[pack.spec.dissipation].modelled
-        self._known = np.array([joint.friction * modelled for joint in joints])  # the controller knows the URDF's
+        # The controller knows the URDF's.
+        self._known = np.array([joint.friction * modelled for joint in joints]) + coulomb
         self._band = np.array([BAND[joint.unit] for joint in joints])
         turns = np.array([joint.continuous / TURN for joint in joints])
         self._turns = turns if turns.any() else None

@@ -18,6 +18,7 @@ from sim.loop.control import CONTROLS, Control, PIDControl
 from sim.loop.custom import CustomControl
 from sim.loop.pid_law import PIDLaw
 from sim.options import Precision, RunnerOptions
+from sim.robot.actuators import known_joints
 
 Float64 = NDArray[np.float64]
 ROWS = 16
@@ -64,7 +65,9 @@ def make_control(options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams,
         kind = JittedCustomControl if jitted else CustomControl
         control: Control = kind(options.control, options.robot, scene, params, plant)
     else:
-        control = (CONTROLS | {"pid": JittedPIDControl} if jitted else CONTROLS)[options.control](scene, params, plant)
+        known = None if options.robot.actuators is None else known_joints(options.robot)
+        of_name = CONTROLS | {"pid": JittedPIDControl} if jitted else CONTROLS
+        control = of_name[options.control](scene, params, plant, known)
     if isinstance(control, JittedPIDControl | JittedCustomControl):
         control.options = options
     return control

@@ -3,12 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.actuators import JOINT_SIDE, check_actuators
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import instance
 from sim.robot.description import RobotDescription
+
+FRICTION_SHARE = 0.8
+"""Share of the robot's own actuators' Coulomb friction that is compensated.
+
+Friction that is compensated by more than there is lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust
+control for servo-mechanisms under inexact friction compensation", Automatica 29, 1993), and figures from a log are
+inexact, other than those of a description, by which the joint is simulated.
+"""
+
+
+class KnownJoints(NamedTuple):
+    """Joints as a controller knows them, in addition to the robot's description, (dof,)."""
+
+    coulomb: NDArray[np.float64]
+    """Coulomb friction to compensate [N m or N]."""
+    viscous: NDArray[np.float64]
+    """Viscous damping [N m s/rad or N s/m]."""
+    armature: NDArray[np.float64]
+    """Reflected inertia of the motors [kg m^2 or kg]."""
+
+
+def known_joints(robot: RobotDescription) -> KnownJoints:
+    """Return friction, damping and armature of the robot's own actuators, which its controller knows."""
+    own = bp.Actuators() if robot.actuators is None else robot.actuators
+    coulomb, viscous, armature = (
+        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+        for leaf in (own.coulomb, own.viscous, own.armature)
+    )
+    return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
 
 def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescription) -> bp.Actuators:

@@ -91,6 +91,32 @@ def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
     np.testing.assert_allclose(ours[within], newton[within], rtol=1e-12, atol=1e-12 * stall.max())
 
 
+def test_presets_are_named_as_their_models():
+    line = {"saturation_effort": 10.0, "no_load_speed": 5.0, "effort_limit": 8.0}
+    motor = bp.make_actuators(2, **line, armature=0.1)
+    table = [[-1.0, 9.0, 4.0], [1.0, 8.0, 6.0]]
+    same = [
+        (actuators.presets.dc_motor(2, 10.0, 5.0, 8.0, armature=0.1), motor),
+        (
+            actuators.presets.newton(
+                2, saturation_effort=10.0, velocity_limit=5.0, max_motor_effort=8.0, max_effort=9.0, armature=0.1
+            ),
+            motor,
+        ),
+        (
+            actuators.presets.remotized(2, table),
+            actuators.presets.newton(2, lookup_positions=[-1.0, 1.0], lookup_efforts=[4.0, 6.0]),
+        ),
+        (
+            actuators.presets.mujoco_joint(2, armature=0.1, frictionloss=0.2, damping=0.3, forcerange=4.0),
+            bp.make_actuators(2, armature=0.1, coulomb=0.2, viscous=0.3, effort_limit=4.0),
+        ),
+    ]
+    for ours, expected in same:
+        for mine, other in zip(ours, expected, strict=True):
+            np.testing.assert_array_equal(mine, other)
+
+
 @pytest.mark.parametrize(
     ("velocity", "low", "high"),
     [

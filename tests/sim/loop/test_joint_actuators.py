@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -185,7 +186,7 @@ def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
     with Runner(robot, N, workers=0) as runner:
         assert runner.actuators.command_delay is not None
         by_default = runner.rollout(table)
-    with Runner(panda, N, workers=0, actuators=robot.actuators) as runner:
+    with Runner(robot, N, workers=0, actuators=robot.actuators) as runner:
         assert_identical(by_default, runner.rollout(table))
     with Runner(robot, 1, workers=0, control="drive") as runner:
         assert runner.actuators.command_delay is None
@@ -193,3 +194,16 @@ def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
     bp.save_actuators(path, bp.make_actuators(9, strength=np.full((2, 9), 0.5)), panda.joint_names)
     with pytest.raises(InvalidArgumentError, match="one row"):
         Robot.load("panda", actuators=path)
+
+
+def test_the_controller_knows_the_actuators_of_its_robot(panda):
+    """Their armature, damping and friction are compensated; those of the runner alone are not."""
+    worn = bp.make_actuators(9, armature=0.2, viscous=3.0, coulomb=[1.0] * 7 + [0.0] * 2)
+    known = dataclasses.replace(panda, actuators=worn)
+    errors = []
+    for robot, options in ((panda, {}), (known, {}), (panda, {"actuators": worn})):
+        with Runner(robot, 1, workers=0, params=panda.designed().replace(ki=None), **options) as runner:
+            rollout = runner.rollout(np.tile(panda.settings.target, (60, 1)))
+        errors.append(np.abs(rollout.qpos[:, 0, :7] - panda.settings.target[:7]).sum())
+    ideal, compensated, uncompensated = errors
+    assert compensated - ideal < 0.3 * (uncompensated - ideal)
