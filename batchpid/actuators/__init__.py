@@ -19,6 +19,7 @@ from batchpid.actuators.dynamics import (
     discretise,
     init,
     measure,
+    measurement_noise,
     reset,
 )
 from batchpid.actuators.fields import JOINT_SIDE
@@ -41,6 +42,7 @@ __all__ = [
     "load_actuators",
     "make_actuators",
     "measure",
+    "measurement_noise",
     "presets",
     "reset",
     "save_actuators",

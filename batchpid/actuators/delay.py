@@ -78,7 +78,6 @@ def push(history: Any, value: Any, xp: Any) -> Any:
 
 def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
     """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
-    values = history.reshape(-1).take(k.index)
-    if k.fraction is None:
-        return values[0]
-    return values[0] + k.fraction * wrap(values[1] - values[0], turns, xp)
+    values = history.take(k.index)
+    later = values[0]
+    return later if k.fraction is None else later + k.fraction * wrap(values[1] - later, turns, xp)

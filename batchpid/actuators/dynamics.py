@@ -51,6 +51,8 @@ class Coefficients(NamedTuple):
     velocity_noise: Any = None
     turns: Any = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
+    sensor_turns: Any = None
+    """The same for positions and velocities (1 | envs, 2 joints)."""
 
     def __repr__(self) -> str:
         return array_summary(self._replace(command=None, sensor=None, envelope=None), "envs", "joints")
@@ -89,20 +91,20 @@ def init(
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
     asked = zeros if effort is None else zeros + effort
-    command = positions = velocities = encoder = key = step = None
+    command = sensor = encoder = key = step = None
     if actuators.max_delay is not None:
         samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
         if actuators.command_delay is not None:
             command = delay.start(asked, samples)
         if actuators.sensor_delay is not None:
-            positions, velocities = delay.start(position, samples), delay.start(velocity, samples)
+            sensor = delay.start(xp.concatenate((position, velocity), axis=1), samples)
     if actuators.backlash is not None:
         encoder = position
     if actuators.seed is not None:
         numbers = xp.arange(len(zeros)) if envs is None else envs
         key = noise.keys(actuators.seed, numbers, xp.zeros(len(zeros), xp.uint32) + xp.asarray(episode), xp)
         step = xp.zeros(len(zeros), xp.uint32)
-    state = ActuatorState(command, None, positions, velocities, encoder, key, step)
+    state = ActuatorState(command, None, sensor, encoder, key, step)
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
@@ -115,9 +117,10 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster.
     """
     a, xp = actuators, namespace(*actuators)
+    turns = None if a.continuous is None else a.continuous / TURN
     k = Coefficients(
         command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
-        sensor=None if a.sensor_delay is None else delay.discretise(a.sensor_delay, dt, state.position),
+        sensor=None if a.sensor_delay is None else delay.discretise(_twice(a.sensor_delay, xp), dt, state.sensor),
         envelope=envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
         strength=a.strength,
@@ -127,7 +130,8 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         velocity_resolution=_step(a.velocity_resolution, xp),
         position_noise=a.position_noise,
         velocity_noise=a.velocity_noise,
-        turns=None if a.continuous is None else a.continuous / TURN,
+        turns=turns,
+        sensor_turns=None if turns is None else xp.concatenate((turns, 0 * turns), axis=1),
     )
     if num_envs is None:
         return k
@@ -179,32 +183,44 @@ def advance_effort(
 
 
 def advance_measurement(
-    k: Coefficients, state: ActuatorState, qpos: Any, qvel: Any, normals: tuple[Any, Any] | None = None
+    k: Coefficients, state: ActuatorState, qpos: Any, qvel: Any, drawn: tuple[Any, Any] | None = None
 ) -> tuple[ActuatorState, Any, Any]:
     """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
 
-    ``normals`` are those of :func:`batchpid.actuators.noise.normals` at ``state.step``, if they are known already.
+    ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
     """
     xp = namespace(qpos, qvel)
-    command, effort, positions, velocities, encoder, key, step = state
+    command, effort, sensor, encoder, key, step = state
     if k.play is not None:
         behind = wrap(encoder - qpos, k.turns, xp)
         offset = clip(behind, -k.play, k.play, xp)
         encoder, qvel = qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
         qpos = encoder
     if k.sensor is not None:
-        positions, velocities = delay.push(positions, qpos, xp), delay.push(velocities, qvel, xp)
-        qpos, qvel = delay.read(positions, k.sensor, k.turns, xp), delay.read(velocities, k.sensor, None, xp)
+        sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
+        seen, joints = delay.read(sensor, k.sensor, k.sensor_turns, xp), qpos.shape[1]
+        qpos, qvel = seen[:, :joints], seen[:, joints:]
     if key is not None:
-        both = noise.normals(key, step, qpos.shape[1], qpos.dtype, xp) if normals is None else normals
-        qpos = qpos if k.position_noise is None else qpos + k.position_noise * both[0]
-        qvel = qvel if k.velocity_noise is None else qvel + k.velocity_noise * both[1]
+        more = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
+        qpos = qpos if more[0] is None else qpos + more[0]
+        qvel = qvel if more[1] is None else qvel + more[1]
         step = step + _ONE
     if k.position_resolution is not None:
         qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
     if k.velocity_resolution is not None:
         qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
-    return ActuatorState(command, effort, positions, velocities, encoder, key, step), qpos, qvel
+    return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
+
+
+def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) -> tuple[Any, Any]:
+    """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
+
+    ``key`` is that of the state, and ``like`` an array (envs, joints) of the same dtype.
+    """
+    both = noise.normals(key, step, like.shape[1], like.dtype, xp)
+    deviations = k.position_noise, k.velocity_noise
+    position, velocity = (None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True))
+    return position, velocity
 
 
 def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorState:
@@ -222,6 +238,10 @@ def _motor(k: Coefficients, effort: Any) -> Any:
     """Return s u + b."""
     effort = effort if k.strength is None else k.strength * effort
     return effort if k.bias is None else effort + k.bias
+
+
+def _twice(delay: Any, xp: Any) -> Any:
+    return xp.concatenate((delay, delay), axis=1)
 
 
 def _step(resolution: Any, xp: Any) -> Any:

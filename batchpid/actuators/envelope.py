@@ -12,7 +12,7 @@ ClampingDCMotor of Newton (newton/actuators) up to that speed, beyond which Newt
 A limit that depends on the position q, as of a linkage, is given at points x_k, linear between them and constant
 outside, as in RemotizedPDActuator of Isaac Lab and ClampingPositionBased of Newton::
 
-    L(q) = L_0 + sum_k (L_{k+1} - L_k) / (x_{k+1} - x_k) min(max(q - x_k, 0), x_{k+1} - x_k)
+    L(q) = L_0 + sum_k (L_{k+1} - L_k) / (x_{k+1} - x_k) (min(max(q, x_k), x_{k+1}) - x_k)
 """
 
 from __future__ import annotations
@@ -28,16 +28,18 @@ class Envelope(NamedTuple):
 
     stall: Any = None
     """S."""
+    reverse: Any = None
+    """-S."""
     slope: Any = None
     """S / v0."""
     limit: Any = None
     """L."""
-    first: Any = None
-    """L_0 (1 | envs, joints)."""
+    offset: Any = None
+    """What does not depend on q in L(q) (1 | envs, joints)."""
     left: Any = None
     """x_k (segments, 1 | envs, joints)."""
-    width: Any = None
-    """x_{k+1} - x_k."""
+    right: Any = None
+    """x_{k+1}."""
     rise: Any = None
     """(L_{k+1} - L_k) / (x_{k+1} - x_k)."""
 
@@ -51,23 +53,25 @@ def envelope(actuators: Actuators) -> Envelope:
         finite = xp.isfinite(stall)
         slope = xp.where(finite, xp.where(finite, stall, 0.0) / actuators.no_load_speed, 0.0)
     if points is None:
-        return Envelope(stall, slope, actuators.effort_limit)
+        return Envelope(stall, None if stall is None else -stall, slope, actuators.effort_limit)
     points, efforts = (xp.moveaxis(table, 2, 0) for table in (points, efforts))
     width, finite = points[1:] - points[:-1], xp.isfinite(efforts[1:])
     rise = xp.where(finite, efforts[1:], 0.0) - xp.where(finite, efforts[:-1], 0.0)
     rise = xp.where(width > 0, rise / xp.where(width > 0, width, 1.0), 0.0)
-    return Envelope(stall, slope, actuators.effort_limit, efforts[0], points[:-1], width, rise)
+    reverse = None if stall is None else -stall
+    offset = efforts[0] - (rise * points[:-1]).sum(0)
+    return Envelope(stall, reverse, slope, actuators.effort_limit, offset, points[:-1], points[1:], rise)
 
 
 def limits(k: Envelope, qpos: Any, velocity: Any) -> tuple[Any, Any]:
     """Return the least and the largest effort at ``qpos`` and ``velocity`` (envs, joints), None for none."""
     xp = namespace(qpos, velocity)
     limit = k.limit
-    if k.first is not None:
-        limit = k.first + (k.rise * xp.minimum(xp.maximum(qpos[None] - k.left, 0.0), k.width)).sum(0)
+    if k.offset is not None:
+        limit = k.offset + (k.rise * xp.minimum(xp.maximum(qpos[None], k.left), k.right)).sum(0)
         limit = limit if k.limit is None else xp.minimum(limit, k.limit)
     least = None if limit is None else -limit
     if k.stall is None:
         return least, limit
     lost = k.slope * velocity
-    return clip(-k.stall - lost, least, limit, xp), clip(k.stall - lost, least, limit, xp)
+    return clip(k.reverse - lost, least, limit, xp), clip(k.stall - lost, least, limit, xp)

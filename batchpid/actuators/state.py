@@ -14,10 +14,8 @@ class ActuatorState(NamedTuple):
     """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
     effort: Any = None
     """Effort behind the lag (envs, joints) [N m or N]."""
-    position: Any = None
-    """Positions that the sensor was at, latest first (envs, samples, joints) [rad or m]."""
-    velocity: Any = None
-    """Velocities of the sensor, latest first (envs, samples, joints) [rad/s or m/s]."""
+    sensor: Any = None
+    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2 joints)."""
     encoder: Any = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Any = None

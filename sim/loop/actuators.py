@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.actuators import ActuatorState, advance_effort, advance_measurement, discretise
+from batchpid.actuators import ActuatorState, advance_effort, advance_measurement, discretise, measurement_noise
 from batchpid.actuators.envelope import limits
-from batchpid.actuators.noise import normals
 from sim.loop.snapshot import EPISODE
 
 Float64 = NDArray[np.float64]
@@ -43,13 +42,13 @@ class JointActuators:
         self._state = self._state.matched_to(self._init(qpos))
         self._coefficients = discretise(actuators, self._state, self._timestep, len(qpos))
         self._drawn = 0
-        self._normals: tuple[Any, Any] | None = None
+        self._noise_block: tuple[Any, Any] | None = None
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, effort: Float64 | None) -> None:
         """Reset the envs of ``mask`` (M,), at ``qpos`` and ``qvel``, with motors that were asked for ``effort``."""
         self._episode[mask] += 1
         self._state = bp.actuators.reset(self._state, self._init(qpos, qvel=qvel, effort=effort), mask)
-        self._normals = None
+        self._noise_block = None
 
     def measured(self, qpos: Float64, qvel: Float64) -> tuple[Float64, Float64]:
         """Return the measurement that :meth:`measure` would return, and change nothing."""
@@ -80,18 +79,21 @@ class JointActuators:
         """Set the state."""
         leaves = dict(state)
         self._episode = leaves.pop(EPISODE).copy()
-        self._state, self._normals = ActuatorState(**leaves), None
+        self._state, self._noise_block = ActuatorState(**leaves), None
 
     def _init(self, qpos: Float64, **since: Any) -> ActuatorState:
         numbers: dict[str, Any] = {"envs": self._envs, "episode": self._episode}
         return bp.actuators.init(self.actuators, qpos, self._timestep, **numbers, **since)
 
     def _noise(self) -> tuple[Any, Any] | None:
-        """Return the normal numbers of the next measurement, None without noise; they are drawn in blocks."""
+        """Return the noise of the next measurement, None without; it is drawn in blocks."""
         state = self._state
         if state.key is None:
             return None
-        if self._normals is None or self._drawn == BLOCK:
+        if self._noise_block is None or self._drawn == BLOCK:
             steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
-            self._normals, self._drawn = normals(state.key, steps, self._dof, np.float64, np), 0
-        return self._normals[0][self._drawn], self._normals[1][self._drawn]
+            like = np.zeros((len(self._envs), self._dof))
+            self._noise_block, self._drawn = measurement_noise(self._coefficients, state.key, steps, like, np), 0
+        position, velocity = self._noise_block
+        now = self._drawn
+        return None if position is None else position[now], None if velocity is None else velocity[now]
