@@ -1,4 +1,4 @@
-"""Build of the optional extension; everything else about the package stands in pyproject.toml."""
+"""Build of the optional extensions; everything else about the package stands in pyproject.toml."""
 
 from setuptools import Extension, setup
 
@@ -13,7 +13,16 @@ setup(
             define_macros=[("Py_LIMITED_API", "0x030B0000")],
             py_limited_api=True,
             optional=True,  # without a compiler batchpid works as well, only slower
-        )
+        ),
+        Extension(
+            "sim.loop._law_program",
+            ["sim/loop/law_program.cpp"],
+            extra_compile_args=["-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno"],  # rounded as NumPy rounds
+            language="c++",
+            define_macros=[("Py_LIMITED_API", "0x030B0000")],
+            py_limited_api=True,
+            optional=True,
+        ),
     ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

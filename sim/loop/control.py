@@ -16,6 +16,7 @@ from sim.engine.building import SceneSpec
 from sim.engine.dynamics import Dynamics, scene_dynamics
 from sim.engine.pack import Pack
 from sim.loop.arrays import Command
+from sim.loop.law_program import LawProgram
 from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, acting_params, half_way
 from sim.options import ControlMode
 from sim.robot.actuators import KnownJoints
@@ -129,7 +130,8 @@ class PIDControl(Control):
         super().set_params(params)
         self.damping = damping if self.law.whole and damping.any() else None
         params = acting_params(params, self._coupling)
-        self.coefficients = self._scaled = bp.discretise(params, self._scene.timestep, len(self.saturated))
+        self.coefficients = bp.discretise(params, self._scene.timestep, len(self.saturated))
+        self._scale(self.coefficients)
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Advance the law by one sim step."""
@@ -151,18 +153,27 @@ class PIDControl(Control):
             k = k._replace(effort_min=low, effort_max=high)
         new = self._advance(k, command, qpos, qvel, feedforward, matrix, viscous, terms=last)
         if last:
-            self.saturated = new[2].saturated
+            self.saturated = new[2]
         self._state, effort = new[:2]
         return effort
 
+    def _scale(self, k: Coefficients) -> None:
+        """Set the coefficients in use."""
+        self._scaled, self._program = k, LawProgram(self.law, k) if LawProgram.available(k) else None
+
     def _advance(self, k: Coefficients, *inputs: Any, terms: bool) -> Any:
-        return partial(self.law.advance, terms=terms)(k, self._state, *inputs)
+        """Return the new state and the effort, with ``terms`` also the mask of their saturation."""
+        if self._program is not None and k is self._scaled:
+            return self._program.advance(self._state, *inputs, terms=terms)
+        new, effort, *shown = partial(self.law.advance, terms=terms)(k, self._state, *inputs)
+        return new, effort, *(each.saturated for each in shown)
 
     def _update_mass_matrix(self, qpos: Float64, steps: int, qvel: Float64 | None) -> None:
         """Set the mass matrix, and the gains that depend on it, for so many sim steps from ``qpos``."""
         qvel = self._plant.read_qvel() if qvel is None else qvel
         self._matrix = self._mass_matrix(half_way(qpos, qvel, steps, self._scene.timestep), self.damping)
-        self._scaled = self.law.scaled(self.coefficients, np.diagonal(self._matrix, axis1=1, axis2=2))
+        if self.law.per_inertia:
+            self._scale(self.law.scaled(self.coefficients, np.diagonal(self._matrix, axis1=1, axis2=2)))
 
     def _mass_matrix(self, qpos: Float64, damping: Float64 | None) -> Float64:
         """Return M + dt B (M, dof, dof), B being the viscous ``damping`` of the joints."""

@@ -80,7 +80,8 @@ class JittedPIDControl(PIDControl):
 
     def _advance(self, k: Coefficients, *inputs: Any, terms: bool) -> Any:
         arguments = (k, self._state, *inputs)
-        return _call(_law(self.law, terms), self.options.dtype, len(self.saturated), *arguments)
+        new, effort, *shown = _call(_law(self.law, terms), self.options.dtype, len(self.saturated), *arguments)
+        return new, effort, *(each.saturated for each in shown)
 
 
 class JittedCustomControl(CustomControl):
