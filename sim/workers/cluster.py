@@ -11,8 +11,6 @@ import logging
 import os
 import socket
 from collections import Counter
-from collections.abc import Sequence
-from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import batchpid as bp
@@ -21,6 +19,7 @@ from sim.cluster import ClusterWarning, Ray
 from sim.options import RunnerOptions
 from sim.workers.background import BACKGROUND
 from sim.workers.node import NodeInfo
+from sim.workers.placement import split_in_shares
 
 NODE_STEPS = 25_000
 """Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
@@ -77,7 +76,7 @@ class Cluster:
         if self.options.placement == "PACK":
             enough = [sum(machine.workers for machine in machines[:count]) >= packs for count in range(len(machines))]
             machines = machines[: max(1, enough.index(True))] if True in enough else machines
-        parts = _split(options.num_envs, [machine.workers for machine in machines], options.inseparable_envs)
+        parts = split_in_shares(options.num_envs, [machine.workers for machine in machines], options.inseparable_envs)
         used = [(envs, machine) for envs, machine in zip(parts, machines, strict=True) if envs.stop > envs.start]
         self.slices = [envs for envs, _ in used]
         """Envs of each node."""
@@ -203,10 +202,3 @@ def _answers(host: str, port: int) -> bool:
     except OSError:
         return False
     return True
-
-
-def _split(num_envs: int, shares: Sequence[int], pack_size: int) -> list[slice]:
-    """Return contiguous slices of envs in proportion to ``shares`` that do not split a pack; some can be empty."""
-    packs, total = -(-num_envs // pack_size), sum(shares)
-    cuts = [min(num_envs, pack_size * (packs * part // total)) for part in accumulate(shares, initial=0)]
-    return [slice(low, high) for low, high in pairwise(cuts)]

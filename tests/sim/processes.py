@@ -17,7 +17,14 @@ def have_ended(pids: Iterable[int], seconds: float = 5.0) -> bool:
     """Wait for processes to end, so long at most; return whether they have."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        if not any(psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie" for pid in pids):
+        if not any(map(_runs, pids)):
             return True
         time.sleep(0.02)
     return False
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != "zombie"
+    except psutil.NoSuchProcess:
+        return False

@@ -6,16 +6,20 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 from clusters import FILTERS, ROBOT, SMALL, Machines, N, left_in_memory, make_runner, pids_of, setpoints
+from hypothesis import given
+from hypothesis import strategies as st
 from identical import assert_identical
 from processes import have_ended
 
 from batchpid.errors import InvalidArgumentError
 from sim import ClusterWarning, Ray, RecoveryWarning, Runner
+from sim.workers.placement import split_in_shares
 
 ray = pytest.importorskip("ray")
 pytestmark = FILTERS
@@ -128,6 +132,25 @@ def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monke
     assert have_ended(pids)
 
 
+def test_an_interrupted_tick_is_finished_before_the_next_call(machines):
+    results = []
+    for interrupted in (False, True):
+        where = {"cluster": machines.ensure(2).options(2)} if interrupted else {"workers": 0}
+        with make_runner(**where) as runner:
+            runner.rollout(setpoints(5))
+            if interrupted:
+                timer = threading.Timer(0.05, signal.raise_signal, [signal.SIGINT])
+                timer.start()
+                with pytest.raises(KeyboardInterrupt):
+                    runner.step(setpoints(1)[0], substeps=1200)
+                timer.join()
+            else:
+                runner.step(setpoints(1)[0], substeps=1200)
+            assert runner.recoveries == 0
+            results.append((runner.observe(), runner.rollout(setpoints(5))))
+    assert_same(*results)
+
+
 def odd_controller():
     """Return a controller that a variable of the environment changes, as a processor might."""
 
@@ -217,6 +240,15 @@ def test_bad_options_are_refused(options, message, monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     with pytest.raises(InvalidArgumentError, match=message):
         make_runner(**options)
+
+
+@given(st.integers(1, 300), st.lists(st.integers(1, 64), min_size=1, max_size=9), st.integers(1, 8))
+def test_envs_are_shared_in_proportion_and_packs_stay_whole(num_envs, shares, pack_size):
+    slices = split_in_shares(num_envs, shares, pack_size)
+    assert [env for envs in slices for env in range(num_envs)[envs]] == list(range(num_envs))
+    for envs, share in zip(slices, shares, strict=True):
+        assert envs.start % pack_size == 0 or envs.start == num_envs
+        assert abs((envs.stop - envs.start) - num_envs * share / sum(shares)) <= 2 * pack_size
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,76 @@
+"""Time a rollout on a Ray cluster of this machine against the local pool, in pairs.
+
+    python bench/cluster.py
+
+64 pandas at 20 substeps a tick: two workers of the local pool, one node with two workers, and two nodes with one worker
+each, in turns; the ratios are medians over the turns. Then single steps. Prints the table of docs/cluster.md.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from sim import Ray, Robot, Runner
+
+NUM_ENVS = 64
+SMALL = {"object_store_memory": 100 << 20, "include_dashboard": False}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Options."""
+
+    turns: int = 10
+    ticks: int = 160
+    """Ticks of a rollout, of 20 sim steps each."""
+    steps: int = 100
+    """Single ticks for the latency."""
+
+    def run(self) -> None:
+        from ray.cluster_utils import Cluster
+
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **SMALL})
+        for cpus in (2, 1):
+            cluster.add_node(num_cpus=cpus, **SMALL)
+        robot = Robot.load("panda")
+        setpoints = np.tile(robot.settings.target, (self.ticks, 1))
+        where = {
+            "local, 2 workers": {"workers": 2},
+            "1 node of 2 workers": {"cluster": Ray(cluster.address, nodes=1)},
+            "2 nodes of 1 worker": {"cluster": Ray(cluster.address, nodes=2, cpus_per_node=1)},
+        }
+        with ExitStack() as stack:
+            runners = {
+                name: stack.enter_context(Runner(robot, NUM_ENVS, params=robot.params(), **options))
+                for name, options in where.items()
+            }
+            rollouts, latencies = (np.zeros((turns, len(runners))) for turns in (self.turns, self.steps))
+            for turn in range(-1, self.turns):  # the first is a warm-up
+                for column, runner in enumerate(runners.values()):
+                    runner.reset()
+                    began = time.perf_counter()
+                    runner.rollout(setpoints)
+                    rollouts[turn, column] = time.perf_counter() - began
+            for turn in range(self.steps):
+                for column, runner in enumerate(runners.values()):
+                    began = time.perf_counter()
+                    runner.step(setpoints[0], substeps=1)
+                    latencies[turn, column] = time.perf_counter() - began - runner.work_seconds.max()
+        cluster.shutdown()
+        ratios = np.median(rollouts / rollouts[:, :1], axis=0)
+        print(
+            f"| | rollout, {self.ticks} ticks | ratio | ratio to one node | messages of a step |\n|---|---|---|---|---|"
+        )
+        apart = np.median(rollouts / rollouts[:, 1:2], axis=0)
+        for column, name in enumerate(runners):
+            seconds, message = np.median(rollouts[:, column]), 1e3 * np.median(latencies[:, column])
+            print(f"| {name} | {seconds:.2f} s | {ratios[column]:.3f} | {apart[column]:.3f} | {message:.2f} ms |")
+
+
+if __name__ == "__main__":
+    tyro.cli(Bench).run()
