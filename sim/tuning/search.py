@@ -45,6 +45,8 @@ from sim.tuning.weights import Weights
 Float64 = NDArray[np.float64]
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
+VARIED_MOVES, VARIED_SPREAD = 12, 0.3
+"""Random moves, and first standard deviation, for robots that differ from the model: their gains lie farther away."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Candidates of the final, besides the designed gains, and its moves."""
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
@@ -104,7 +106,9 @@ def tune(
     weights
         Of the terms of the cost.
     moves
-        Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Moves that are
+        Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Robots with
+        actuators or a randomization are searched on VARIED_MOVES random ones: the hardest of those that the effort
+        limits allow the model ask too much of them, and would decide alone. Moves that are
         given are the final as well, and are searched on with the physics of the final, since they may touch something.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
@@ -137,7 +141,9 @@ def tune(
     seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
-    moves = search_moves(robot, seed) if moves is None else moves
+    is_varied = randomization is not None or robot.actuators is not None
+    if moves is None:
+        moves = random_moves(robot, VARIED_MOVES, seed) if is_varied else search_moves(robot, seed)
     count = len(moves.start)
     is_free = final is not None and robot.fixed_base and runner_options.get("build") is None
     settings: dict[str, Any] = {
@@ -158,7 +164,8 @@ def tune(
     }
     record = _History(history, settings)
     search = Candidates(robot, gain_units, per_joint, moves, seconds, weights)
-    optimizer = CMA(mean=np.zeros(search.dimension), sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+    spread = VARIED_SPREAD if is_varied else INITIAL_SPREAD
+    optimizer = CMA(mean=np.zeros(search.dimension), sigma=spread, seed=seed, population_size=population)
     start = search.params(np.zeros((1, search.dimension)))
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E40
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
-from sim import FaultWarning, Robot, Runner  # noqa: E402
+from sim import FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
 from sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
@@ -29,7 +29,8 @@ def test_gymnasiums_own_checks_pass():
 @pytest.mark.parametrize("actions", ["setpoint", "increment"])
 def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mode, actions):
     """Equal observations, rewards, flags and infos through time limits, success and resets."""
-    options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6}
+    drawn = Randomization(payload=Uniform(0, 1), qvel=Uniform(-0.1, 0.1), params={"kp": Uniform(-5, 5)})
+    options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6, "randomization": drawn}
     ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=7, **options)
     theirs = SyncVectorEnv([lambda: gymnasium.make(ID, max_episode_steps=7, **options)] * 3, autoreset_mode=mode)
     assert ours.unwrapped.spec.id == "batchpid/Reach-v0"
@@ -37,6 +38,7 @@ def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mod
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert same(ours.reset(seed=5), theirs.reset(seed=5))
+    assert ours.unwrapped.runner.episodes.tolist() == [[5, 0], [6, 0], [7, 0]]
     ours.action_space.seed(1)
     ends = np.zeros(3, int)
     for _ in range(24):

@@ -42,6 +42,7 @@ def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_p
         ("--dissipation", "sapien"),
         ("--timestep", "0.001"),
         ("--spread", "0.1"),
+        ("--randomize", "payload"),
         ("--setpoint", "0", "-0.5", "0", "-1", "0", "1", "0", "0", "0"),
     ],
     ids=lambda flags: flags[0],
