@@ -1,0 +1,98 @@
+"""Random actuators in the runner: no crash, and no NaN that goes unnoticed; lost workers leave no trace."""
+
+from __future__ import annotations
+
+import os
+import signal
+import warnings
+
+import numpy as np
+import pytest
+from identical import assert_identical
+
+import batchpid as bp
+from sim import Runner
+from sim.loop.faults import FaultWarning
+from sim.workers.pool import RecoveryWarning
+
+ENVS = 10
+SCALES = {
+    "command_delay": 0.01,
+    "sensor_delay": 0.01,
+    "lag": 0.01,
+    "strength": 1.0,
+    "bias": 1.0,
+    "effort_limit": 50.0,
+    "saturation_effort": 80.0,
+    "no_load_speed": 3.0,
+    "coulomb": 0.5,
+    "viscous": 1.0,
+    "armature": 0.1,
+    "backlash": 0.01,
+    "position_resolution": 1e-3,
+    "velocity_resolution": 1e-2,
+    "position_noise": 1e-3,
+    "velocity_noise": 1e-2,
+}
+
+
+def random_actuators(seed, dof):
+    """Return actuators of ENVS settings over five decades, with about half of the effects on."""
+    rng = np.random.default_rng(seed)
+    on = {name for name in SCALES if rng.random() < 0.5}
+    on = on | {"saturation_effort"} if "no_load_speed" in on else on - {"saturation_effort"}
+    options = {name: SCALES[name] * 10.0 ** rng.uniform(-4, 1, (ENVS, dof)) for name in sorted(on)}
+    if "coulomb" in on and rng.random() < 0.5:
+        options["static"] = options["coulomb"] * rng.uniform(1, 3, (ENVS, dof))
+    if rng.random() < 0.5:
+        options["position_limit"] = np.sort(rng.normal(size=5)), rng.uniform(0, 90, 5)
+    return bp.make_actuators(dof, **options, seed=seed)
+
+
+def check(robot, seeds):
+    rng = np.random.default_rng(seeds[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FaultWarning)
+        with Runner(robot, ENVS, workers=0, speed_limit=1e4, substeps=10) as runner:
+            for seed in seeds:
+                runner.actuators = random_actuators(seed, robot.dof)
+                runner.reset()
+                rollout = runner.rollout(np.clip(rng.normal(0, 1, (4, ENVS, robot.dof)), robot.lower, robot.upper))
+                for rows in (rollout.qpos, rollout.qvel, rollout.effort):
+                    assert np.isfinite(rows[rollout.ok]).all(), seed
+                if (limit := runner.actuators.effort_limit) is not None:
+                    assert (np.abs(rollout.effort) <= np.float32(limit) * (1 + 1e-6)).all(), seed
+
+
+def test_30_random_settings(panda):
+    check(panda, range(3))
+
+
+@pytest.mark.slow
+def test_1000_random_settings(panda, jaco2):
+    check(panda, range(100, 150))
+    check(jaco2, range(200, 250))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_100_kills_leave_no_trace(panda):
+    actuators = random_actuators(8, panda.dof).replace(command_delay=0.004, position_noise=1e-4)
+    rng = np.random.default_rng(0)
+    table = np.clip(panda.settings.target + rng.uniform(-0.3, 0.3, (300, ENVS, panda.dof)), panda.lower, panda.upper)
+
+    def run(workers, kills):
+        seen = []
+        with Runner(panda, ENVS, workers=workers, actuators=actuators, checkpoint_steps=100, substeps=5) as runner:
+            for tick, setpoint in enumerate(table):
+                if kills and tick % 3 == 1:
+                    os.kill(runner.pids[tick % workers], signal.SIGKILL)
+                seen.append(runner.step(setpoint))
+            assert runner.recoveries == (len(table) // 3 if kills else 0)
+        return seen
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecoveryWarning)
+        disturbed = run(2, kills=True)
+    for ours, theirs in zip(run(0, kills=False), disturbed, strict=True):
+        assert_identical(ours, theirs)
