@@ -51,6 +51,7 @@ class CompiledTick:
         self._carry: Carry | None = None
         self._matrix: Any = None
         self._constants: tuple[tuple[Any, ...], Constants] | None = None
+        self._zero: Any = None
         self._native: NativeStep | None = None
         self._bound: tuple[Any, bool] | None = None
 
@@ -67,11 +68,14 @@ class CompiledTick:
         assert native is not None
         with precision(self._options.dtype):
             carry = self._take_over() if self._carry is None else self._carry
-            carry = carry._replace(progress=np.array([begin, 0], np.int32))
-            address = np.array([native.prepare()], np.uint64).view(np.uint32)
-            commands = command._replace(feedforward=self._feedforward(command)).map(padded)
+            span = np.array([begin, end, 0, 0], np.int32)
+            span[2:].view(np.uint64)[0] = native.prepare()
+            command = command.map(padded)
+            extra = self._zero if command.feedforward is None else put(command.feedforward)
+            # A JAX array either way: with another kind the program would be compiled again.
+            command = command._replace(feedforward=extra)
             try:
-                carry = compiled(self._layout)(address, constants, carry, commands, np.int32(end))
+                carry = compiled(self._layout)(span, constants, carry, command)
             except BatchPIDError as error:  # of the caller's controller, while it is traced
                 error.__notes__ = []  # JAX's, on its own frames
                 raise
@@ -106,9 +110,6 @@ class CompiledTick:
         """Return the rows of the envs, a new array."""
         return np.array(array, dtype)[: self._pack.size]
 
-    def _feedforward(self, command: Command) -> Any:
-        return np.zeros_like(command.setpoint) if command.feedforward is None else command.feedforward
-
     def _read(self) -> dict[str, Any]:
         """Return positions, velocities and passive force of the robots."""
         pack = self._pack
@@ -130,6 +131,7 @@ class CompiledTick:
             shape = (*shape, shape[1]) if law.whole else shape
             matrix = np.zeros(shape) if matrix is None or matrix.shape != shape else matrix
         own = {
+            "progress": np.zeros(2, np.int32),
             "law": {name: padded(leaf) for name, leaf in self._control.read().items()},
             "friction": FrictionState(**{name: padded(rows) for name, rows in state.items()}),
             "age": padded(age.astype(np.int32)),
@@ -137,7 +139,7 @@ class CompiledTick:
             "motor": np.zeros((program_rows(self._pack.size), self._pack.dof)),
             "saturated": padded(self._control.saturated),
         }
-        return Carry(progress=None, qpos_before=read["qpos"], **read, **put(own))
+        return Carry(qpos_before=read["qpos"], **read, **put(own))
 
     @property
     def _needs_qvel(self) -> bool:
@@ -181,6 +183,7 @@ class CompiledTick:
         )
         with precision(self._options.dtype):
             self._constants = sources, put(constants)
+            self._zero = put(np.zeros((program_rows(pack.size), pack.dof)))
         return self._constants[1]
 
 

@@ -75,11 +75,16 @@ class Carry(NamedTuple):
     saturated: Any
 
 
-def tick(layout: Layout, address: Any, constants: Constants, carry: Carry, command: Command, end: Any) -> Carry:
-    """Return the state at step ``end`` of the tick, or after the first step that has a status."""
+def tick(layout: Layout, span: Any, constants: Constants, carry: Carry, command: Command) -> Carry:
+    """Return the state after some sim steps of a tick, or after the first of them that has a status.
+
+    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the group in two parts, as
+    each array from NumPy costs a call some microseconds.
+    """
     import jax
     from jax import lax
 
+    end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
     xp, law, model = jax.numpy, layout.law, constants.friction
 
     def mass_matrix(qpos: Any) -> Any:
@@ -131,6 +136,7 @@ def tick(layout: Layout, address: Any, constants: Constants, carry: Carry, comma
         progress = xp.stack([carry.progress[0] + 1, status])
         return Carry(progress, state, rubbing, age, matrix, carry.qpos, qpos, qvel, passive, motor, saturated)
 
+    carry = carry._replace(progress=xp.stack([span[0], xp.zeros_like(end)]))
     return lax.while_loop(lambda carry: (carry.progress[0] < end) & (carry.progress[1] == 0), body, carry)
 
 

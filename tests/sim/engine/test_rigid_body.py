@@ -28,7 +28,7 @@ def mass_matrices(arm, qpos, dtype=np.float64):
         return np.asarray(jax.jit(dynamics.mass_matrix)(jax.numpy.asarray(qpos, dtype)))
 
 
-@pytest.mark.parametrize("name", ["panda", "jaco2", 0, 1, 2, 3])
+@pytest.mark.parametrize("name", ["panda", "jaco2", 0, 1])
 def test_it_is_pinocchios(name, tmp_path):
     arm = load(name, tmp_path)
     qpos = np.random.default_rng(0).uniform(np.maximum(arm.lower, -3), np.minimum(arm.upper, 3), (40, arm.dof))
