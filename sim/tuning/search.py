@@ -34,6 +34,7 @@ from batchpid.versions import package_versions
 from sim.cluster import Ray
 from sim.loop.contact_log import MissedContactWarning
 from sim.randomization.randomization import Randomization
+from sim.robot.dissipation import DISSIPATION
 from sim.robot.robot import Robot
 from sim.runner import Runner
 from sim.tuning.candidates import HEADROOM, Candidates
@@ -121,8 +122,8 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`sim.Runner`, e.g. ``physics="fast"``. With ``build``, and on a floating base, the search
-        has collisions, too.
+        More options of :class:`sim.Runner`, e.g. ``physics="fast"``. The search has collisions, too, and
+        this physics, with ``build``, on a floating base, and where the solver has the drives or SAPIEN's friction.
 
     Raises
     ------
@@ -145,7 +146,9 @@ def tune(
     if moves is None:
         moves = random_moves(robot, VARIED_MOVES, seed) if is_varied else search_moves(robot, seed)
     count = len(moves.start)
-    is_free = final is not None and robot.fixed_base and runner_options.get("build") is None
+    own = final is not None and robot.fixed_base and runner_options.get("build") is None
+    # One iteration is enough where the loop computes friction, and not the solver.
+    is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
     settings: dict[str, Any] = {
         "robot": robot.name,
         "seed": seed,
