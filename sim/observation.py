@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.actuators import Actuators
 from batchpid.params import PIDParams
 
 Float32 = NDArray[np.float32]
@@ -116,6 +117,8 @@ class RunInfo:
     """False if the robots had no collision shapes."""
     params: PIDParams | None = None
     """PID parameters at the start."""
+    actuators: Actuators | None = None
+    """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: NDArray[Any] | None = None
     """Positions before the first tick (envs, joints) [rad or m]."""
     seed: int | None = None
@@ -148,6 +151,7 @@ class RunInfo:
         return replace(
             self,
             params=None if self.params is None else self.params.for_envs(envs),
+            actuators=None if self.actuators is None else self.actuators.for_envs(envs),
             start=None if self.start is None else self.start[envs],
             draws=None if self.draws is None else {name: values[envs] for name, values in self.draws.items()},
             episodes=None if self.episodes is None else self.episodes[envs],

@@ -512,6 +512,7 @@ class Runner:
             physics=str(self.options.physics),
             collisions=self.options.collisions,
             params=self.params,
+            actuators=self.actuators,
             start=self.observe().qpos,
             versions=self._versions,
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),

@@ -24,7 +24,7 @@ from batchpid.actuators.dynamics import (
 )
 from batchpid.actuators.fields import JOINT_SIDE
 from batchpid.actuators.model import Actuators, check_actuators, make_actuators
-from batchpid.actuators.serialization import dumps_actuators, load_actuators, save_actuators
+from batchpid.actuators.serialization import dumps_actuators, load_actuators, loads_actuators, save_actuators
 from batchpid.actuators.state import ActuatorState
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "dumps_actuators",
     "init",
     "load_actuators",
+    "loads_actuators",
     "make_actuators",
     "measure",
     "measurement_noise",

@@ -93,7 +93,17 @@ def load_actuators(
     FileNotFoundError
         The file does not exist.
     """
-    source, document = str(path), documents.read(path)
+    return _build(str(path), documents.read(path), joint_names)
+
+
+def loads_actuators(text: str, joint_names: Sequence[str] | None = None) -> tuple[Actuators, list[str]]:
+    """Return the actuators in a text, JSON if it begins with a brace and else YAML; otherwise as the file's."""
+    format = "json" if text.lstrip().startswith("{") else "yaml"
+    return _build("text", documents.parse("text", text, format), joint_names)
+
+
+def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tuple[Actuators, list[str]]:
+    """Return the actuators of a document and the names of their joints."""
     tables = _take_tables(source, document)
     joints = documents.check(source, document, _SCHEMA)
     order = list(joints) if joint_names is None else names("joint_names", joint_names)

@@ -236,6 +236,8 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
     if info.params is not None:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
+    if info.actuators is not None:
+        known["actuators"] = bp.actuators.dumps_actuators(info.actuators, info.joint_names, format="json")
     for name in ("versions", "randomization"):
         if name in known:
             known[name] = json.dumps(dict(known[name]))
@@ -264,6 +266,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         "substeps": int,
         **dict.fromkeys(("complete", "merge_fixed", "collisions"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
+        "actuators": lambda text: bp.actuators.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
         **dict.fromkeys(("versions", "randomization"), lambda text: dict(json.loads(str(text)))),
         "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),

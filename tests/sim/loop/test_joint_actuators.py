@@ -13,7 +13,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner, Snapshot
+from sim import Robot, Runner, Snapshot, read_recording, write_recording
 from sim.workers.pool import RecoveryWarning
 
 N = 5
@@ -207,3 +207,13 @@ def test_the_controller_knows_the_actuators_of_its_robot(panda):
         errors.append(np.abs(rollout.qpos[:, 0, :7] - panda.settings.target[:7]).sum())
     ideal, compensated, uncompensated = errors
     assert compensated - ideal < 0.3 * (uncompensated - ideal)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_a_recording_holds_the_actuators(panda, suffix, tmp_path):
+    with Runner(panda, N, workers=0, actuators=actuators(panda)) as runner:
+        write_recording(runner.rollout(commands(panda, 2)), tmp_path / f"run{suffix}")
+        expected = runner.actuators
+    loaded = read_recording(tmp_path / f"run{suffix}").info.actuators
+    for mine, other in zip(loaded, expected, strict=True):
+        np.testing.assert_array_equal(mine, other)
