@@ -1,8 +1,9 @@
 """Every code block of the pages runs; every command, link and make target in their text exists.
 
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
-which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf`` and ``gains.yaml``; commands that
-would take minutes or wait for a person are cut short or only parsed, and so are commands within the text.
+which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``gains.yaml`` and
+``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
+within the text.
 """
 
 from __future__ import annotations
@@ -108,6 +109,7 @@ def test_commands_run(page, tmp_path, monkeypatch, capsys):
     panda = Robot.load("panda")
     shutil.copy(panda.path, "arm.urdf")
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
+    bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
     for match in blocks(page, "sh"):
         for line in match["code"].splitlines():
             words = shlex.split(line, comments=True)
