@@ -144,7 +144,8 @@ class EnvGroup:
         if containment.suspended.any():
             envs = containment.suspended
             observation.qpos[envs] = containment.suspended_qpos[envs]
-            observation.qvel[envs] = observation.effort[envs] = observation.saturated[envs] = 0
+            observation.qvel[envs] = observation.effort[envs] = 0
+            observation.saturated[envs] = observation.guarded[envs] = False
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""

@@ -233,3 +233,19 @@ def test_a_lost_worker_is_replaced_bit_identically(tmp_path):
             assert runner.recoveries == kill
             courses.append(runner.observe())
     assert_identical(*courses)
+
+
+def test_actuators_and_guard_act_on_leaders_and_keep_the_coupling(tmp_path):
+    robot = arm(tmp_path, multiplier=0.5, offset=0.01, joints=3)
+    followers = ~robot.independent
+    options = {"bias": 0.05, "strength": 0.9, "coulomb": 0.1, "armature": 0.05, "command_delay": 0.001}
+    actuators = bp.make_actuators(robot.dof, **options, position_noise=1e-5)
+    target = np.clip(robot.start + 0.3, robot.lower, robot.upper)
+    with Runner(robot, 2, workers=0, actuators=actuators, guard=True) as runner:
+        assert not runner.actuators.bias[0, followers].any()
+        assert not runner.actuators.armature[0, followers].any()
+        rollout = runner.rollout(np.tile(target, (100, 1)))
+    assert rollout.ok.all()
+    assert not rollout.effort[..., followers].any()
+    assert constraint_error(robot, rollout.qpos) < 1e-4
+    np.testing.assert_array_equal(rollout.guarded[..., robot.joint_names.index("right")], rollout.guarded[..., 3])
