@@ -31,6 +31,8 @@ from sim.engine.pack import Pack
 from sim.tuning.moves import Moves, random_moves, tutorial_move
 
 NUM_ENVS, SUBSTEPS = 32, 20
+REPEATS = 4
+"""Runs of the tutorial's loop in a round: one robot alone is soon done."""
 HOLD = "start pose held"
 CASES = "tutorial's loop", "isolating", "not isolating"
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -89,8 +91,9 @@ def main(options: Options) -> None:
     for name in options.robots:
         robot = Robot.load(name, dissipation="sapien")
         chosen = motions(robot, options.moves)
+        tutorials = [TutorialLoop(robot, target, start=start) for start, target in zip(*chosen[:2], strict=True)]
         for variant, ours in VARIANTS.items():
-            rows = [*measure(robot, chosen, ours, options)]
+            rows = [*measure(robot, chosen, tutorials, ours, options)]
             for motion, row in zip(chosen.names, rows, strict=True):
                 cost = "" if row.cost is None else f"{row.cost:.3f}"
                 cells = f"{name}, {variant}, {motion}", f"{row.moved:.2g}", f"{row.us:.1f}", f"{row.over:.2f}", cost
@@ -117,20 +120,22 @@ class Row(NamedTuple):
     """Time over that without isolation."""
 
 
-def measure(robot: Robot, chosen: Moves, ours: dict[str, Any], options: Options) -> Iterator[Row]:
-    """Yield the figures of each of the motions, under the options ``ours`` of the runner."""
+def measure(
+    robot: Robot, chosen: Moves, tutorials: list[TutorialLoop], ours: dict[str, Any], options: Options
+) -> Iterator[Row]:
+    """Yield the figures of each of the motions, with its tutorial's loop, under the options ``ours`` of the runner."""
     runners = {}
     for case, enabled in zip(CASES[1 : 3 if options.isolation else 2], (True, False), strict=False):
         with isolation(enabled):
             runners[case] = Runner(robot, NUM_ENVS, params=robot.params(), workers=0, **ours)
-    for start, target, motion in zip(*chosen, strict=True):
+    for start, target, motion, tutorial in zip(*chosen, tutorials, strict=True):
         seconds: dict[str, list[float]] = {case: [] for case in (CASES[0], *runners)}
-        tutorial = TutorialLoop(robot, target, start=start)
         for _ in range(options.rounds):
-            tutorial.reset()
             began = time.process_time()
-            tutorial.run(options.ticks * SUBSTEPS)
-            seconds[CASES[0]].append(NUM_ENVS * (time.process_time() - began))
+            for _ in range(REPEATS):
+                tutorial.reset()
+                tutorial.run(options.ticks * SUBSTEPS)
+            seconds[CASES[0]].append(NUM_ENVS / REPEATS * (time.process_time() - began))
             for case, runner in runners.items():
                 runner.reset(start)
                 began = time.process_time()
