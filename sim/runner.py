@@ -533,7 +533,7 @@ class Runner:
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
-        """First contact that each robot would have had since it was placed, without collisions; latest last."""
+        """First contact that each robot would have had since its reset, without collisions; latest last."""
         contacts = self._books.contacts
         return () if contacts is None else tuple(contacts.contacts)
 

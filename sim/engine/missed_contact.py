@@ -23,31 +23,26 @@ DEPTH = 1e-3
 
 
 class MissedContacts:
-    """First contact that each of ``size`` robots of ``spec`` would have had since it was placed.
-
-    ``ground`` says whether there would be one at height 0. ``first`` (size,) is the sim step after which it was found,
-    0 where there was none.
-    """
+    """Contacts that ``size`` robots of ``spec`` would have had, with a ground at height 0 or without."""
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
         self._model = scene_dynamics(replace(spec, collisions=True, ground=ground, build=None))
         self._predictor = self._model.contact_predictor
         pairs, dof = self._predictor.arms.shape
         self._centers, self._sizes = np.zeros((size, dof)), np.zeros((size, pairs))
-        self.first = np.zeros(size, np.int64)
 
     def place(self, mask: NDArray[np.bool_]) -> None:
-        """Forget the contacts of the robots of ``mask`` (size,), which were placed."""
-        self.first[mask], self._sizes[mask] = 0, 0.0
+        """Drop the regions of the robots of ``mask`` (size,), which were placed."""
+        self._sizes[mask] = 0.0
 
-    def look(self, qpos: Float64, step: int) -> None:
-        """Look for contacts at ``qpos`` (size, dof), after sim step ``step``."""
+    def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
+        """Write ``step`` into ``first`` (size,), where that is 0, for robots that overlap at ``qpos`` (size, dof)."""
         closed = np.abs(qpos - self._centers) @ self._predictor.arms.T
-        for row in np.flatnonzero((closed >= self._sizes).any(1) & (self.first == 0)):
+        for row in np.flatnonzero((closed >= self._sizes).any(1) & (first == 0)):
             self._sizes[row], touches = self._region(qpos[row])
             self._centers[row] = qpos[row]
             if touches:
-                self.first[row] = step
+                first[row] = step
 
     def _region(self, qpos: Float64) -> tuple[Float64, bool]:
         """Return how far the links of each pair may close from ``qpos`` (dof,) until one touches, and if one does."""

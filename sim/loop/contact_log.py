@@ -21,7 +21,7 @@ class MissedContactWarning(UserWarning):
 
 
 class MissedContact(NamedTuple):
-    """First contact that an env's robot would have had since it was placed."""
+    """First contact that an env's robot would have had since its reset."""
 
     env: int
     time: float

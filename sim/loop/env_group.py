@@ -126,7 +126,7 @@ class EnvGroup:
             if not finite(self._qpos, self.pack.read_qvel()):
                 self._contain(self._qpos, substeps)
         if self._contacts is not None:
-            self._contacts.look(self._qpos, steps + substeps)
+            self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
@@ -139,8 +139,7 @@ class EnvGroup:
         observation.ok[...] = ~containment.failed
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
-        if self._contacts is not None:
-            fault.missed_contact[...] = self._contacts.first
+        fault.missed_contact[...] = containment.missed_contact
         if containment.suspended.any():
             envs = containment.suspended
             observation.qpos[envs] = containment.suspended_qpos[envs]

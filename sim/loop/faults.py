@@ -99,21 +99,26 @@ class FaultContainment:
         State to which each env is reset, and pose in which it is suspended (M, dof).
     step, joint, cause
         Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
+    missed_contact
+        Sim step of the first missed contact of each env since its reset (M,); 0: none, as with collisions.
     """
 
-    _STATE = ("suspended", "failed", "start_qpos", "start_qvel", "suspended_qpos", "step", "joint", "cause")
+    _STATE = (
+        *("suspended", "failed", "start_qpos", "start_qvel", "suspended_qpos"),
+        *("step", "joint", "cause", "missed_contact"),
+    )
 
     def __init__(self, size: int, dof: int, action: FaultAction) -> None:
         self.suspends = action == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
         self.start_qpos, self.start_qvel, self.suspended_qpos = (np.zeros((size, dof)) for _ in range(3))
         self.step = np.full(size, -1)
-        self.joint, self.cause = np.zeros(size, int), np.zeros(size, int)
+        self.joint, self.cause, self.missed_contact = (np.zeros(size, int) for _ in range(3))
 
     def clear(self, mask: Bool) -> None:
-        """Clear the faults of the envs of ``mask`` (M,), which are reset."""
+        """Clear the faults and missed contacts of the envs of ``mask`` (M,), which are reset."""
         self.suspended[mask] = self.failed[mask] = False
-        self.step[mask] = -1
+        self.step[mask], self.missed_contact[mask] = -1, 0
 
     def fail(self, bad: Bool, cause: str, step: int, qpos: NDArray[np.float64]) -> None:
         """Note a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at ``qpos`` (M, dof)."""

@@ -1,6 +1,8 @@
 """Robots without collision shapes: the same free motion, for any packing, and the contacts that they would have had."""
 
 import functools
+import os
+import signal
 import warnings
 
 import numpy as np
@@ -9,8 +11,9 @@ import tiny_urdf
 from identical import assert_identical
 from robots import RUBBING, load_bundled
 
+import batchpid
 from batchpid.errors import InvalidArgumentError
-from sim import MissedContactWarning, Robot, Runner
+from sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
 from sim.engine.building import SceneSpec
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.missed_contact import DEPTH
@@ -55,6 +58,26 @@ def test_free_motion_is_bit_identical_to_that_of_the_shaped_robot(name, control,
     assert np.abs(bare.qpos[-1] - moves.start).max() > 0.01
     assert_identical(bare, shaped)
     assert not missed
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {
+            "randomization": Randomization(
+                payload=Uniform(0.0, 1.0), link_mass=Uniform(1.0, 2.0), friction=Uniform(0, 1)
+            )
+        },
+        {"guard": True},
+        {"actuators": batchpid.make_actuators(9, command_delay=0.002)},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_free_motion_is_bit_identical_with_other_options_too(panda, options):
+    moves = free_moves("panda")
+    shaped, _ = roll_out(panda, moves.start, moves.target, physics="fast", **options)
+    bare, _ = roll_out(panda, moves.start, moves.target, physics="fast", collisions=False, **options)
+    assert_identical(bare, shaped)
 
 
 @pytest.mark.parametrize("options", [{"pack_size": 1}, {"workers": 2, "pack_size": 3}], ids=str)
@@ -110,6 +133,25 @@ def test_one_warning_names_envs_and_links(falling):
         runner.reset([[0.0], [1.5], [0.0]])
         runner.rollout(np.zeros((40, 1)))  # no further warning, which would be an error
         assert [contact.env for contact in runner.missed_contacts] == [1, 1]
+
+
+def test_checkpoints_and_lost_workers_do_not_change_what_was_missed(jaco2):
+    start, target = jaco2.sample(8, seed=2), jaco2.sample(8, seed=3)
+
+    def missed(**options):
+        with Runner(jaco2, 8, collisions=False, physics="free", **options) as runner, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            runner.reset(start)
+            for tick in range(12):
+                runner.step(target)
+                if options["workers"] and tick == 7:
+                    os.kill(runner.pids[0], signal.SIGKILL)
+            return runner.missed_contacts
+
+    expected = missed(workers=0)
+    assert expected
+    assert missed(workers=0, checkpoint_steps=60) == expected
+    assert missed(workers=1, checkpoint_steps=60) == expected
 
 
 def test_snapshots_continue_bit_identically(jaco2):
