@@ -48,7 +48,8 @@ CASES = {
 }
 XLA_CASES = {
     "closed loop, XLA": "law and sim steps of a tick in one program of XLA: Runner(backend='jax')",
-    "closed loop, no shapes, free, XLA": "the same without collision shapes, with physics 'free'",
+    "closed loop, policy network, XLA": "the same with a network of 64 x 64 units in the law",
+    "closed loop, no shapes, free, XLA": "the closed loop in XLA without collision shapes, with physics 'free'",
 }
 """Cases of the Runner that compile for some seconds first."""
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
@@ -120,6 +121,7 @@ def _options(workload: Workload) -> dict[str, dict[str, Any]]:
         "closed loop, no shapes": {"collisions": False},
         "closed loop, no shapes, free": free,
         "closed loop, XLA": {"backend": "jax"},
+        "closed loop, policy network, XLA": {"control": ResidualPolicy(workload.robot), "backend": "jax"},
         "closed loop, no shapes, free, XLA": free | {"backend": "jax"},
     }
 

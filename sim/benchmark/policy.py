@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.elementwise import namespace
 from sim.benchmark.tutorial import tutorial_settings
 from sim.robot.robot import Robot
-
-Float32 = NDArray[np.float32]
 
 HIDDEN = 64
 """Units of each of the two hidden layers."""
@@ -20,9 +19,9 @@ RESIDUAL = 0.01
 
 
 class ResidualPolicy:
-    """PD law with the tutorial's gains plus a residual by a network with two hidden layers of random weights, in NumPy.
+    """PD law with the tutorial's gains plus a residual by a network with two hidden layers of random weights.
 
-    The residual is small, so that the robots move as in the other cases: the network costs the same as a trained one.
+    It is for NumPy and JAX. The residual is small, so that the robots move as in the other cases: the network costs the same as a trained one.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -40,7 +39,8 @@ class ResidualPolicy:
     ) -> tuple[None, NDArray[Any]]:
         """Return the state, None, and the efforts (envs, dof) [N m or N]."""
         error = setpoint - qpos
-        units: Float32 = np.concatenate([error, qpos, qvel], axis=1, dtype=np.float32)
+        xp = namespace(error)
+        units: Any = xp.concatenate([error, qpos, qvel], axis=1).astype(np.float32)
         for layer in self._layers:
-            units = np.tanh(units @ layer)
+            units = xp.tanh(units @ layer)
         return None, passive + self._kp * error - self._kd * qvel + self._scale * units
