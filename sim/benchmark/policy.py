@@ -21,7 +21,8 @@ RESIDUAL = 0.01
 class ResidualPolicy:
     """PD law with the tutorial's gains plus a residual by a network with two hidden layers of random weights.
 
-    It is for NumPy and JAX. The residual is small, so that the robots move as in the other cases: the network costs the same as a trained one.
+    It is for NumPy and JAX. The residual is small, so that the robots move as in the other cases: the network costs the
+    same as a trained one.
     """
 
     def __init__(self, robot: Robot) -> None:

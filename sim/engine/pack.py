@@ -5,7 +5,8 @@ the shapes of each scene are in a collision group to themselves, so that scenes 
 system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
 (:mod:`sim.engine.contact_prediction`).
 
-The loop uses only the public methods and attributes of :class:`Pack`; another engine has to provide these.
+The loop uses only the public methods and attributes of :class:`Pack`; another engine has to provide these. Longer than
+300 lines because that is the whole interface between loop and engine.
 """
 
 from __future__ import annotations
