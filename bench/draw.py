@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -294,8 +295,9 @@ def phases_table(cases: dict[str, Any]) -> str:
 def presets_table(figures: dict[str, Any]) -> str:
     """Return the table of cost and errors of each preset."""
     rows = []
-    for robot, physics in dict.fromkeys((row["robot"], row["physics"]) for row in figures["accuracy"]):
-        cases = figures["cases"]
+    measured, cases = {(row["robot"], row["physics"]) for row in figures["accuracy"]}, figures["cases"]
+    robots = dict.fromkeys(name.split("-")[0] for name in SETUPS)
+    for robot, physics in [both for both in product(robots, PRESETS) if both in measured]:
         free = physics == "free"
         phases = cases[f"{robot}-fast"].get("free_phases") if free else cases[f"{robot}-{physics}"]["phases"]
         cost = ""
