@@ -32,16 +32,18 @@ class Bench:
     """Single ticks for the latency."""
 
     def run(self) -> None:
+        import ray
         from ray.cluster_utils import Cluster
 
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **SMALL})
-        for cpus in (2, 1):
+        head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}  # as the local pool
+        cluster = Cluster(initialize_head=True, head_node_args=head)
+        for cpus in (4, 1, 1):
             cluster.add_node(num_cpus=cpus, **SMALL)
         robot = Robot.load("panda")
         setpoints = np.tile(robot.settings.target, (self.ticks, 1))
         where = {
             "local, 2 workers": {"workers": 2},
-            "1 node of 2 workers": {"cluster": Ray(cluster.address, nodes=1)},
+            "1 node of 2 workers": {"cluster": Ray(cluster.address, nodes=1, cpus_per_node=2)},
             "2 nodes of 1 worker": {"cluster": Ray(cluster.address, nodes=2, cpus_per_node=1)},
         }
         with ExitStack() as stack:
@@ -61,7 +63,6 @@ class Bench:
                     began = time.perf_counter()
                     runner.step(setpoints[0], substeps=1)
                     latencies[turn, column] = time.perf_counter() - began - runner.work_seconds.max()
-        cluster.shutdown()
         ratios = np.median(rollouts / rollouts[:, :1], axis=0)
         print(
             f"| | rollout, {self.ticks} ticks | ratio | ratio to one node | messages of a step |\n|---|---|---|---|---|"
@@ -70,6 +71,8 @@ class Bench:
         for column, name in enumerate(runners):
             seconds, message = np.median(rollouts[:, column]), 1e3 * np.median(latencies[:, column])
             print(f"| {name} | {seconds:.2f} s | {ratios[column]:.3f} | {apart[column]:.3f} | {message:.2f} ms |")
+        ray.shutdown()
+        cluster.shutdown()
 
 
 if __name__ == "__main__":

@@ -115,7 +115,8 @@ class NodeWorker(Worker):
         if self._beat is None and silence > _BEAT_INTERVAL:
             self._beat = BACKGROUND.call(lambda: self._actor.beat.remote().future())
         if silence > (SILENCE_LIMIT if self._has_beaten else START_LIMIT):
-            raise self._lost(f"has not answered for {silence:.0f} s" if self._has_beaten else "has not started")
+            asleep = f"has not answered for {silence:.0f} s"
+            raise self._lost(asleep if self._has_beaten else "has not started; are its CPUs taken?")
         if now - self._sent_at > limit:
             raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 

@@ -28,7 +28,8 @@ class Machines:
         from ray.cluster_utils import Cluster
 
         self._shared = set(os.listdir("/dev/shm"))
-        self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **SMALL})
+        head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = []
 
     def ensure(self, count):
