@@ -257,7 +257,8 @@ class EnvGroup:
             self.pack.look(compiled.left())
             qpos = self.pack.read_qpos()
             if not self._sound(qpos):
-                self._qpos = compiled.read("qpos_before")
+                if self._control.reads_qpos_each_step or self._compensates:  # as in NumPy's loop
+                    self._qpos = compiled.read("qpos_before")
                 self._contain(qpos, done)
         self._qpos = self.pack.read_qpos()
 

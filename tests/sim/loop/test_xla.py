@@ -270,3 +270,43 @@ def test_jax_is_not_imported_unless_it_is_asked_for():
         "sys.exit('jax' in sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", program], check=True)
+
+
+@pytest.mark.slow
+@needs_extension
+@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+@pytest.mark.parametrize("seed", range(6))
+def test_random_efforts_resets_snapshots_and_faults_are_those_of_the_loop_in_numpy(seed):
+    rng = np.random.default_rng(seed)
+    robot, envs = load_bundled(["panda", "jaco2"][seed % 2]), int(rng.integers(1, 20))
+    options = {
+        "control": "effort",
+        "substeps": int(rng.integers(1, 12)),
+        "pack_size": int(rng.integers(1, 9)),
+        "on_fault": rng.choice(["hold", "reset"]),
+        "speed_limit": rng.choice([20.0, 1000.0]),
+        "on_invalid_input": "contain",
+    }
+    runners = [Runner(robot, envs, backend=backend, workers=0, **options) for backend in ("jax", "numpy")]
+    snapshots = [runner.snapshot() for runner in runners]
+    for _ in range(25):
+        action, mask = rng.choice(["reset", "snapshot", "restore", *["step"] * 5]), rng.random(envs) < 0.4
+        qpos = np.clip(robot.start + rng.uniform(-1, 1, (envs, robot.dof)), robot.lower, robot.upper)
+        efforts = rng.normal(size=(envs, robot.dof)) * np.minimum(robot.effort_limit, 60)
+        if rng.random() < 0.1:
+            efforts[rng.integers(envs), rng.integers(robot.dof)] = np.nan
+        seen = []
+        for index, runner in enumerate(runners):
+            if action == "reset":
+                runner.reset(qpos, mask=mask)
+            elif action == "snapshot":
+                snapshots[index] = runner.snapshot()
+            elif action == "restore":
+                runner.restore(snapshots[index])
+            else:
+                runner.step(efforts)
+            seen.append(runner.observe())
+        assert_identical(*seen)
+    assert list(runners[0].faults) == list(runners[1].faults)
+    for runner in runners:
+        runner.close()
