@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -83,13 +84,13 @@ def test_results_are_bit_identical_for_any_number_of_nodes(nodes, machines, expe
     assert have_ended(pids)
 
 
-def at_tick(tick, act):
-    """Return a progress bar that calls ``act`` before the given tick."""
+def at_tick(acts):
+    """Return a progress bar that calls each of ``acts`` before its tick."""
 
     def progress(ticks):
         for number in ticks:
-            if number == tick:
-                act()
+            if number in acts:
+                acts[number]()
             yield number
 
     return progress
@@ -101,33 +102,47 @@ def undisturbed():
         return runner.rollout(setpoints(LONG))
 
 
-@pytest.mark.parametrize("lost", ["process", "worker", "machine"])
-def test_what_is_lost_in_a_rollout_is_replaced(lost, machines, undisturbed):
-    def lose():
-        info = runner.nodes[1]
-        if lost == "machine":
-            machines.kill(info.pid)
-            assert have_ended([info.pid])
-        else:
-            os.kill(info.pid if lost == "process" else info.pids[0], signal.SIGKILL)
-
+def lossy_rollout(machines, losses):
+    """Return a rollout on two machines with ``losses``, functions of its runner by tick."""
     with make_runner(cluster=machines.ensure(2).options(2)) as runner:
         pids = pids_of(runner)
-        with pytest.warns(RecoveryWarning, match=r"node 1 \([\d.]+, envs 6 to 11\)"):
-            rollout = runner.rollout(setpoints(LONG), progress=at_tick(LONG // 2 - 2, lose))
-        assert runner.recoveries == 1
+        acts = {tick: partial(lose, runner) for tick, lose in losses.items()}
+        rollout = runner.rollout(setpoints(LONG), progress=at_tick(acts))
+        assert runner.recoveries == len(losses)
         pids += pids_of(runner)
-    assert_identical(undisturbed, rollout)
     assert have_ended(pids)
+    return rollout
 
 
+def test_a_killed_process_and_a_killed_worker_are_replaced(machines, undisturbed):
+    losses = {
+        20: lambda runner: os.kill(runner.nodes[1].pid, signal.SIGKILL),
+        50: lambda runner: os.kill(runner.nodes[0].pids[0], signal.SIGKILL),
+    }
+    with pytest.warns(RecoveryWarning, match=r"node [01] \([\d.]+, envs \d+ to \d+\) (died|lost a worker)"):
+        rollout = lossy_rollout(machines, losses)
+    assert_identical(undisturbed, rollout)
+
+
+def test_the_envs_of_a_killed_machine_go_to_another(machines, undisturbed):
+    def kill(runner):
+        pid = runner.nodes[1].pid
+        machines.kill(pid)
+        assert have_ended([pid])
+
+    with pytest.warns(RecoveryWarning, match=r"node 1 \([\d.]+, envs 6 to 11\) died"):
+        rollout = lossy_rollout(machines, {40: kill})
+    assert_identical(undisturbed, rollout)
+
+
+@pytest.mark.slow
 def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monkeypatch):
     monkeypatch.setattr("sim.workers.node_worker.SILENCE_LIMIT", 3.0)
     with make_runner(cluster=machines.ensure(2).options(2)) as runner:
         pids = pids_of(runner)
         stop = lambda: os.kill(runner.nodes[0].pid, signal.SIGSTOP)  # noqa: E731
         with pytest.warns(RecoveryWarning, match=r"node 0 .* has not answered for 3 s"):
-            rollout = runner.rollout(setpoints(LONG), progress=at_tick(LONG // 2, stop))
+            rollout = runner.rollout(setpoints(LONG), progress=at_tick({LONG // 2: stop}))
     assert_identical(undisturbed, rollout)
     assert have_ended(pids)
 
@@ -135,7 +150,7 @@ def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monke
 def test_an_interrupted_tick_is_finished_before_the_next_call(machines):
     results = []
     for interrupted in (False, True):
-        where = {"cluster": machines.ensure(2).options(2)} if interrupted else {"workers": 0}
+        where = {"cluster": machines.ensure(1).options(1)} if interrupted else {"workers": 0}
         with make_runner(**where) as runner:
             runner.rollout(setpoints(5))
             if interrupted:
