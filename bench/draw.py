@@ -36,8 +36,8 @@ PHASES = {
     "write": "#b45f82",
     "waiting": "#d9d9d9",
 }
-PRESETS = {"accurate": "accurate", "fast": "fast", "free": "free, no shapes"}
-"""Presets in the table of their errors, and how they are labelled; the cost of "free" is that without shapes."""
+PRESETS = ("accurate", "fast", "free")
+"""Presets in the table of their errors; the cost of "free" is that without collision shapes."""
 MOTIONS = {
     "tutorial": "the tutorial's",
     "start pose held": "holding the start pose, gripper closed",
@@ -304,7 +304,7 @@ def presets_table(figures: dict[str, Any]) -> str:
         if phases is not None:
             all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
             cost = f"{phases['step']:.1f} / {all_work:.1f}"
-        first = [f"{robot}, {PRESETS[physics]}", cost]
+        first = [f"{robot}, {physics}", cost]
         for row in figures["accuracy"]:
             if (row["robot"], row["physics"]) == (robot, physics):
                 errors = [f"{row[kind]:.1e}" for kind in ("max", "rms")]
