@@ -17,6 +17,7 @@ import numpy as np
 
 import batchpid as bp
 from sim import Robot
+from sim.robot.kinematics import Kinematics
 from sim.tuning.identification.excitation import excite
 
 
@@ -60,66 +61,88 @@ def simulate(
     timestep: float = 1 / 2000,
     every: int = 2,
     compensate: bool = True,
-    seed: int = 0,
     through: bool = False,
-    locked: tuple[int, ...] = (),
+    moving: int | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
-    """Return the columns of a log: time, setpoint, effort, qpos and qvel, (rows, dof)."""
+    """Return the columns of a log: time (rows,), setpoint, effort, qpos and qvel (rows, moving).
+
+    Parameters
+    ----------
+    params
+        Of the PID law, one entry for each joint of ``robot``.
+    every
+        Keep every n-th time step.
+    compensate, through
+        Whether the robot compensates the forces that it has without payload, and whether through its motors.
+    moving
+        Number of joints that move; the others are locked at 0. Default: all.
+    seed
+        Of the encoder noise.
+    """
+    import mujoco
+
+    names = robot.joint_names[:moving]
+    count = len(names)
+    model = _model(robot, truth, names, timestep)
+    unloaded = _model(robot, truth._replace(payload=0.0), names, timestep)
+    data, own = mujoco.MjData(model), mujoco.MjData(unloaded)
+    mujoco.mj_setConst(model, data)
+    order = [int(model.joint(name).qposadr[0]) for name in names]
+    data.qpos[order] = motion.position[0, :count]
+    gains = bp.PIDParams(*(leaf[:, :count] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    controller = bp.BatchPID(gains, 1, dt=timestep, joint_names=names)
+    time = timestep * np.arange(round(motion.time[-1] / timestep))
+    setpoints = np.stack([np.interp(time, motion.time - motion.time[0], q) for q in motion.position.T[:count]], axis=1)
+    strength, bias = truth.strength[:count], truth.bias[:count]
+    whole, part = divmod(truth.delay / timestep, 1.0)
+    asked = np.zeros((len(time), count))
+    rng, rows = np.random.default_rng(seed), []
+    for step, setpoint in enumerate(setpoints):
+        mujoco.mj_forward(model, data)
+        measured = data.qpos[order] + truth.noise * rng.standard_normal(count)
+        own.qpos[:], own.qvel[:] = data.qpos, data.qvel
+        mujoco.mj_fwdPosition(unloaded, own)
+        mujoco.mj_fwdVelocity(unloaded, own)
+        passive = own.qfrc_bias[order] if compensate else np.zeros(count)
+        asked[step] = controller(setpoint, measured[None])[0] + through * passive
+        if step % every == 0:
+            rows.append(np.stack([setpoint, asked[step], measured, data.qvel[order]]))
+        late, later = (asked[step - n] if step >= n else np.zeros(count) for n in (int(whole), int(whole) + 1))
+        delivered = strength * ((1 - part) * late + part * later) + bias
+        data.qfrc_applied[order] = delivered + (not through) * passive
+        mujoco.mj_step(model, data)
+    columns = np.array(rows).transpose(1, 0, 2)
+    return {"time": time[::every], **dict(zip(("setpoint", "effort", "qpos", "qvel"), columns, strict=True))}
+
+
+def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) -> Any:
+    """Return MuJoCo's model of the robot: no contact, and only the joints ``names`` move."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(robot.urdf)
     spec.option.timestep = timestep
-    for joint in robot.all_joints:
-        if joint.moves:
-            index = robot.joint_names.index(joint.name)
-            found = spec.joint(joint.name)
-            for name, value in (
-                ("armature", truth.armature),
-                ("damping", truth.damping),
-                ("frictionloss", truth.friction),
-            ):
-                value = float(value[index])
-                setattr(found, name, value if np.ndim(getattr(found, name)) == 0 else [value, 0, 0])
+    for index, name in enumerate(robot.joint_names):
+        joint = spec.joint(name)
+        if name not in names:
+            spec.delete(joint)
+            continue
+        joint.armature, joint.frictionloss = float(truth.armature[index]), float(truth.friction[index])
+        damping = float(truth.damping[index])
+        joint.damping = damping if np.ndim(joint.damping) == 0 else [damping, 0, 0]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     model = spec.compile()
-    data = mujoco.MjData(model)
-    order = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
-    rng = np.random.default_rng(seed)
-    data.qpos[order] = motion.position[0]
-    controller = bp.BatchPID(params, 1, dt=timestep, joint_names=robot.joint_names)
-    steps = round(motion.time[-1] / timestep)
-    sampled = np.stack(
-        [np.interp(np.arange(steps) * timestep, motion.time - motion.time[0], q) for q in motion.position.T], 1
-    )
-    past = np.zeros((int(np.ceil(truth.delay / timestep)) + 2, robot.dof))
-    whole, part = divmod(truth.delay / timestep, 1.0)
-    rows = []
-    for step in range(steps):
-        mujoco.mj_forward(model, data)
-        measured = data.qpos[order] + truth.noise * rng.standard_normal(robot.dof)
-        asked = controller(sampled[step], measured[None])[0]
-        passive = data.qfrc_bias[order].copy()
-        if compensate and through:
-            asked = asked + passive
-        past = np.roll(past, 1, axis=0)
-        past[0] = asked
-        late = (1 - part) * past[int(whole)] + part * past[int(whole) + 1]
-        effort = truth.strength * late + truth.bias
-        if compensate and not through:
-            effort = effort + passive
-        if step % every == 0:
-            rows.append(np.concatenate([[data.time], sampled[step], asked, measured, data.qvel[order]]))
-        data.qfrc_applied[order] = effort
-        mujoco.mj_step(model, data)
-    table = np.array(rows)
-    parts = np.split(table[:, 1:], 4, axis=1)
-    return {"time": table[:, 0], **dict(zip(("setpoint", "effort", "qpos", "qvel"), parts, strict=True))}
+    if truth.payload:
+        kinematics = Kinematics(robot)
+        model.body(kinematics.links[kinematics.tool]).mass[:] += truth.payload
+    return model
 
 
 def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, ...] = ("setpoint", "qpos")) -> None:
     """Write the columns of ``quantities`` as CSV."""
-    names = ["time", *(f"{quantity}:{name}" for quantity in quantities for name in robot.joint_names)]
+    joints = robot.joint_names[: log["qpos"].shape[1]]
+    names = ["time", *(f"{quantity}:{name}" for quantity in quantities for name in joints)]
     table = np.column_stack([log["time"], *(log[quantity] for quantity in quantities)])
     np.savetxt(path, table, delimiter=",", header=",".join(names), comments="", fmt="%.10g")
 

@@ -29,10 +29,11 @@ SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
+    "excite": ["--duration", "1"],
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
-ONLY_PARSED = ("bench", "tune", "render", "survey")
+ONLY_PARSED = ("bench", "tune", "identify", "render", "survey")
 
 
 def name(page: Path) -> str:

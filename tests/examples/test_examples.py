@@ -127,3 +127,12 @@ def test_the_trained_policy_reaches_nine_goals_of_ten(run, seed):
     share = re.search(r"exploration ([\d.]+)% of 64", run("train_reach.py", "--seed", seed))
     assert share is not None
     assert float(share[1]) >= 90
+
+
+def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path):
+    pytest.importorskip("mujoco")
+    run("mujoco_log.py", "panda", "--seconds", "1", "--out", str(tmp_path / "log.csv"))
+    header = (tmp_path / "log.csv").read_text().partition("\n")[0].split(",")
+    assert header[0] == "time"
+    assert {name.partition(":")[0] for name in header[1:]} == {"setpoint", "qpos"}
+    assert (tmp_path / "log.params.yaml").is_file()

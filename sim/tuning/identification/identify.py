@@ -101,7 +101,7 @@ def identify(
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
     drive = Drive(timestep, params, compensate.removesuffix("+friction"), measured_rate=measured)
-    drive, start, motions = best_start(robot, joints, drive, found)
+    drive, start, motions = best_start(robot, joints, drive, found, payload)
     unknowns = _unknowns(robot, joints, drive, start.motors, motions, payload)
     settings = {
         "robot": robot.name,

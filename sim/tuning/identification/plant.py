@@ -7,7 +7,7 @@ delay d of their motors, and a payload at the tool::
     (M + A + dt B) (v+ - v) = dt (s u(t - d) + b + c - h - B v - f),     f in F Sgn(v+),     q+ = q + dt v+
 
 u is the logged effort, or that of the PID law under the logged setpoints; h gravity and Coriolis forces, and c what the
-robot compensates of them, with the model of the unloaded robot. A robot that sends c through its motors adds it to u.
+robot compensates of them, by a model with or without the payload. A robot that sends c through its motors adds it to u.
 Friction stops a joint within the time T ("stopping"), not at once, because real joints and MuJoCo's yield near rest; in
 steps of dt, with r = (1 / 9) (M^-1)_jj at the pose 0::
 
@@ -79,6 +79,8 @@ class Drive:
     """"gravity+coriolis", "gravity" or "none"."""
     through: bool = False
     """True if the compensation passes through the motors, with their strength and delay."""
+    knows_payload: bool = False
+    """True if the compensation is that of the robot with its payload."""
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
 
@@ -139,12 +141,12 @@ class Plant:
             force[rows] = self.dynamics(kg).inverse_dynamics(whole[rows], rate[rows], still[rows])
         return force if self._spread is None else force @ self._spread
 
-    def compensation(self, qpos: Float64, qvel: Float64) -> Float64 | None:
-        """Return what the robot compensates (n, joints), None for nothing."""
+    def compensation(self, qpos: Float64, qvel: Float64, payload: Float64 | None = None) -> Float64 | None:
+        """Return what the robot compensates (n, joints), None for nothing; it may know its ``payload``."""
         if self.drive.compensate == "none":
             return None
-        unloaded = np.zeros((len(qpos), 1))
-        return self.passive(qpos, qvel if "coriolis" in self.drive.compensate else np.zeros_like(qvel), unloaded)
+        known = payload if self.drive.knows_payload and payload is not None else np.zeros((len(qpos), 1))
+        return self.passive(qpos, qvel if "coriolis" in self.drive.compensate else np.zeros_like(qvel), known)
 
     def _mobility(self, motors: Motors) -> Float64:
         """Return the diagonals of the inverse mass matrices (n, joints) with the logged joints at 0."""
@@ -169,7 +171,7 @@ class Plant:
         part = (delays - whole)[:, None]
         longest = int(whole.max(initial=0)) + 2
         history = np.zeros((longest, *q.shape))
-        if drive.through and (held := self.compensation(q, v)) is not None:
+        if drive.through and (held := self.compensation(q, v, motors.payload)) is not None:
             history[:] = held
         keep = np.maximum(1 - dt / np.maximum(motors.stopping, dt), 0.0)
         creep = np.where(motors.stopping > dt, _CREEP * dt * self._mobility(motors), 0.0)
@@ -178,7 +180,8 @@ class Plant:
         out[:, 0] = q
         implicit = motors.armature + dt * motors.damping
         diagonal = np.arange(q.shape[1])
-        loaded = bool(motors.payload.any())
+        unloaded = drive.params is None or drive.params.gain_units is None or not motors.payload.any()
+        same = drive.compensate == "gravity+coriolis" and (drive.knows_payload or not motors.payload.any())
         with np.errstate(all="ignore"):
             for step in range(steps):
                 if not np.isfinite(q).all():
@@ -187,14 +190,15 @@ class Plant:
                     out[bad, step:] = np.inf
                 matrix = self.mass_matrix(q, motors.payload)
                 h = self.passive(q, v, motors.payload)
-                c = h if drive.compensate == "gravity+coriolis" and not loaded else self.compensation(q, v)
+                c = h if same else self.compensation(q, v, motors.payload)
                 now = past + step
                 if law is None:
                     u = _at(command, now - whole, rows) * (1 - part) + _at(command, now - whole - 1, rows) * part
                     if drive.through and c is not None:
                         u, c = u + c, None
                 else:
-                    asked = law.effort(command[now], q, v, matrix, c if drive.through else None)
+                    known = matrix if unloaded else self.mass_matrix(q, np.zeros_like(motors.payload))
+                    asked = law.effort(command[now], q, v, known, c if drive.through else None)
                     history[now % longest] = asked
                     u = history[(now - whole) % longest, rows] * (1 - part)
                     u += history[(now - whole - 1) % longest, rows] * part

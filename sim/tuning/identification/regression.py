@@ -30,7 +30,10 @@ EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 STOPPING = 5e-3
 _EVERY = 0.005
+PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
+"""Payloads that are tried [kg]."""
 _PRIOR = 0.1
+_WEAK = (0.05**2,) * 3
 
 
 class Motion(NamedTuple):
@@ -64,14 +67,11 @@ def smooth(log: Log, timestep: float) -> Motion:
     return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time))
 
 
-def regress(plant: Plant, logs: list[Log], motions: list[Motion]) -> Start:
-    """Return the motors that explain the filtered efforts best."""
-    from scipy.optimize import lsq_linear
+def regress(plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> Start:
+    """Return the motors, and the payload if asked, that explain the filtered efforts best."""
     from scipy.signal import butter, sosfiltfilt
 
-    drive, joints = plant.drive, len(plant.joints)
-    dt = drive.timestep
-    every = max(1, round(_EVERY / dt))
+    drive, dt = plant.drive, plant.drive.timestep
     period = max(float(np.median(np.diff(log.time))) for log in logs)
     sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
     delays = np.arange(0.0, MAX_DELAY, DELAY_STEP)
@@ -79,68 +79,90 @@ def regress(plant: Plant, logs: list[Log], motions: list[Motion]) -> Start:
     late: list[Float64] = []
     for motion in motions:
         edge = min(round(EDGE / dt), len(motion.qpos) // 5)
-        rows = np.arange(edge, len(motion.qpos) - edge, every)
-        q, v, a = (table[rows] for table in motion[:3])
-        none = np.zeros((len(rows), 1))
-        inertial = (plant.mass_matrix(q, none) @ a[..., None])[..., 0]
-        load = plant.passive(q, v, none)
-        held = plant.compensation(motion.qpos, motion.qvel) if drive.through else plant.compensation(q, v)
+        rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
+        v, a = motion.qvel[rows], motion.qacc[rows]
+        empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
         effort = motion.command if drive.params is None else law_efforts(drive, plant, motion)
-        if drive.through and held is not None:
+        if drive.through and (held := plant.compensation(motion.qpos, motion.qvel)) is not None:
             effort = effort + held
-        elif held is not None:
-            load = load - held
         if drive.params is None:  # the law's efforts are of filtered positions already
             effort = sosfiltfilt(sections, effort, axis=0)
         time = np.arange(len(effort)) * dt
         late.append(
-            np.stack([[np.interp(time[rows] - d, time, column) for column in effort.T] for d in delays]).transpose(
-                0, 2, 1
-            )
+            np.array([np.stack([np.interp(time[rows] - d, time, u) for u in effort.T], axis=1) for d in delays])
         )
         still = 0.01 * np.abs(v).max(0) + 1e-9
         sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
-        blocks.append((inertial + load, v, a, sign))
-    known, v, a, sign = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        blocks.append((empty, loaded - empty, a, v, sign))
+    empty, per_kg, a, v, sign = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     efforts = np.concatenate(late, axis=1)
-    found = np.empty((len(delays), joints, 5))
-    rss = np.empty((len(delays), joints))
-    for joint in range(joints):
-        rms = np.sqrt((efforts[0, :, joint] ** 2).mean()) + 1e-9
-        for index in range(len(delays)):
-            u = efforts[index, :, joint]
-            columns = np.stack([a[:, joint], v[:, joint], sign[:, joint], -u, -np.ones_like(u)], axis=1)
-            size = np.abs(columns).max(0) + 1e-12
-            matrix, target = columns / size, -known[:, joint]
-            prior = _PRIOR * rms * np.sqrt(len(u)) * np.diag([0.05, 0.05, 0.05, 1 / size[3], 0.05])
-            aim = np.array([0, 0, 0, prior[3, 3] * size[3], 0])
-            low = np.array([0, 0, 0, 0.2, -np.inf]) * size
-            high = np.array([np.inf, np.inf, np.inf, 3.0, np.inf]) * size
-            fit = lsq_linear(np.vstack([matrix, prior]), np.concatenate([target, aim]), (low, high))
-            found[index, joint] = fit.x / size
-            rss[index, joint] = ((matrix @ fit.x - target) ** 2).mean()
-    cost = np.log(rss + 1e-30).sum(1)
-    best = int(np.argmin(cost))
-    columns = found[best].T
-    a, b, f, g, h = columns[:, None]
-    motors = Motors(a, b, f, g, h, np.array([[delays[best]]]), np.array([[STOPPING]]), np.zeros((1, 1)))
-    return Start(motors, float(cost[best]))
+
+    def solve(index: int, kg: float) -> tuple[float, Float64]:
+        both = [
+            _solve_joint(empty[:, j] + kg * per_kg[:, j], a[:, j], v[:, j], sign[:, j], efforts[index, :, j])
+            for j in range(len(plant.joints))
+        ]
+        return float(sum(np.log(mean + 1e-30) for mean, _ in both)), np.array([found for _, found in both]).T
+
+    best, kg = min(range(len(delays)), key=lambda index: solve(index, 0.0)[0]), 0.0
+    if payload:
+        for _ in range(2):
+            near = best
+            kg = min(PAYLOADS, key=lambda each: solve(near, each)[0])
+            best = min(range(len(delays)), key=lambda index: solve(index, kg)[0])
+    cost, columns = solve(best, kg)
+    armature, damping, friction, strength, bias = columns[:, None]
+    common = (np.array([[value]]) for value in (delays[best], STOPPING, kg))
+    return Start(Motors(armature, damping, friction, strength, bias, *common), cost)
 
 
-def hypotheses(drive: Drive) -> list[Drive]:
-    """Return the ways in which the robot may compensate: outside its motors, or through them.
+def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
+    """Return the efforts that a motion takes beyond what the robot compensates apart from its motors."""
+    q, v, a = (table[rows] for table in motion[:3])
+    kg = np.full((len(q), 1), payload)
+    effort = (plant.mass_matrix(q, kg) @ a[..., None])[..., 0] + plant.passive(q, v, kg)
+    held = None if plant.drive.through else plant.compensation(q, v, kg)
+    return effort if held is None else effort - held
+
+
+def _solve_joint(required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64) -> tuple[float, Float64]:
+    """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint."""
+    from scipy.optimize import lsq_linear
+
+    columns = np.stack([a, v, sign, -effort, -np.ones_like(a)], axis=1)
+    size = np.abs(columns).max(0) + 1e-12
+    matrix = columns / size
+    prior = (
+        (_PRIOR * (np.sqrt((effort**2).mean()) + 1e-9)) ** 2 * len(a) * np.array([*_WEAK, 1 / size[3] ** 2, _WEAK[0]])
+    )
+    information = matrix.T @ matrix + np.diag(prior)
+    target = -matrix.T @ required + prior * np.array([0, 0, 0, size[3], 0])
+    root = np.linalg.cholesky(information + 1e-12 * np.eye(5))
+    low = np.array([0, 0, 0, 0.2, -np.inf]) * size
+    high = np.array([np.inf, np.inf, np.inf, 3.0, np.inf]) * size
+    found = lsq_linear(root.T, np.linalg.solve(root, target), (low, high)).x
+    return float(((matrix @ found + required) ** 2).mean()), found / size
+
+
+def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
+    """Return the ways in which the robot may compensate: outside its motors, knowing its payload or not, or through.
 
     The logged efforts may also hold the compensation.
     """
     if drive.compensate == "none":
         return [drive]
-    outside = [drive, replace(drive, through=True)]
-    return outside if drive.params is not None else [*outside, replace(drive, compensate="none")]
+    ways = [drive, replace(drive, through=True)]
+    if payload:
+        ways.append(replace(drive, knows_payload=True))
+    return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
 
 
-def best_start(robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log]) -> tuple[Drive, Start, list[Motion]]:
-    """Return the drive that explains the logs best, with its start."""
+def best_start(
+    robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], payload: bool
+) -> tuple[Drive, Start, list[Motion]]:
+    """Return the drive that explains the logs best, with its start and the smoothed motions."""
     motions = [smooth(log, drive.timestep) for log in logs]
-    starts = [(regress(Plant(robot, joints, each), logs, motions), each) for each in hypotheses(drive)]
+    ways = hypotheses(drive, payload)
+    starts = [(regress(Plant(robot, joints, each), logs, motions, payload), each) for each in ways]
     start, chosen = min(starts, key=lambda pair: pair[0].cost)
     return chosen, start, motions

@@ -20,8 +20,11 @@ from numpy.typing import NDArray
 from sim.tuning.identification.fit import Iterate, Problem
 
 Float64 = NDArray[np.float64]
-MEMORY = 0.3
+MEMORY = 1.0
 """Longest lag of the autocovariance [s]."""
+MODEL_ERROR = 2.0
+"""Factor of the standard deviations that allows for errors of the model, such as friction near rest under a law that
+sees noise. With it 95 % of the intervals hold the truth on logs of MuJoCo with known motors, without it 75 %."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED = 0.1
@@ -66,7 +69,7 @@ def uncertainty(problem: Problem, point: Iterate) -> Uncertainty:
     inverse = np.linalg.inv(normal + np.diag(prior))
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
     white = np.diagonal(inverse)
-    deviation = unknowns.scale * np.sqrt(np.maximum(np.diagonal(covariance), white))
+    deviation = MODEL_ERROR * unknowns.scale * np.sqrt(np.maximum(np.diagonal(covariance), white))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
     size_of = np.maximum(np.abs(point.theta), FLOOR * unknowns.scale)
     identified = INTERVAL * deviation <= RESOLVED * size_of
