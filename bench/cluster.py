@@ -3,7 +3,7 @@
     python bench/cluster.py
 
 64 pandas at 20 substeps a tick: two workers of the local pool, one node with two workers, and two nodes with one worker
-each, in turns; the ratios are medians over the turns. Then single steps. Prints the table of docs/cluster.md.
+each, in turns; the ratios are medians over the turns. Then single steps. Prints a table.
 """
 
 from __future__ import annotations
