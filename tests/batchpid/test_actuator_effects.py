@@ -41,7 +41,7 @@ def run_sensor(chosen, positions, velocities=None):
 
 
 @given(delay=st.floats(0, 0.02), frequency=st.floats(1, 100))
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_a_sine_comes_late_by_the_delay(delay, frequency):
     """To within the bound of linear interpolation, (w dt)^2 / 8, and exactly at whole steps."""
     chosen, w = bp.make_actuators(1, command_delay=delay), 2 * np.pi * frequency
@@ -64,6 +64,7 @@ def test_joints_have_their_own_delays_and_begin_with_the_effort_before():
 
 
 @given(lag=st.floats(0, 0.05), effort=st.floats(-100, 100))
+@settings(max_examples=25)
 def test_the_lag_answers_a_step_by_an_exponential(lag, effort):
     time = DT * np.arange(1, 101)
     expected = effort * -np.expm1(-time / lag) if lag > 1e-6 else np.full(100, effort)
@@ -152,18 +153,18 @@ def test_strength_and_bias(strength, bias, effort):
 
 
 @given(ratio=st.floats(0.05, 0.95))
-@settings(max_examples=10)
+@settings(max_examples=6)
 def test_backlash_has_the_describing_function_of_the_play(ratio):
     """J.-J. Slotine and W. Li, Applied Nonlinear Control (1991), section 5.2.3, with half width b and amplitude A."""
-    amplitude, count = 1.0, 2000
+    amplitude, count = 1.0, 600
     b = ratio * amplitude
     phase = 2 * np.pi * np.arange(2 * count) / count
     seen, _ = run_sensor(bp.make_actuators(1, backlash=2 * b), (amplitude * np.sin(phase))[:, None, None])
     period = seen[count:, 0, 0]
     in_phase, quadrature = (2 / count * (period * wave(phase[count:])).sum() for wave in (np.sin, np.cos))
     x = 2 * b / amplitude - 1
-    assert in_phase == pytest.approx(amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=1e-3)
-    assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=1e-3)
+    assert in_phase == pytest.approx(amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=2e-3)
+    assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=2e-3)
 
 
 def test_the_sensor_stands_still_within_the_play():
@@ -305,7 +306,7 @@ def test_jax_agrees_with_numpy(dtype, tolerance, request):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_random_actuators_deliver_finite_efforts_within_the_limits(seed):
     rng = np.random.default_rng(seed)
     chosen = bp.make_actuators(3, **random_options(rng, 2, 3))

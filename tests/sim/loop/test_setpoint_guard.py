@@ -58,7 +58,7 @@ def test_neither_workers_nor_a_restore_show(panda, control, tmp_path):
         assert first.guarded.any()
         runner.snapshot().save(tmp_path / "guarded.npz")
         second = runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:]))
-    with Runner(panda, N, workers=2, **options) as runner:
+    with Runner(panda, N, workers=1, **options) as runner:
         assert_identical(first, runner.rollout(np.clip(table[:4], panda.lower, panda.upper)))
         runner.restore(Snapshot.load(tmp_path / "guarded.npz"))
         assert_identical(second, runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:])))
