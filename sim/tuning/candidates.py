@@ -3,11 +3,12 @@
 The cost of a candidate is the mean over joints, taken as the mean over moves plus the worst move, of::
 
     w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
-        + w_final log(1 + E / 1e-3) + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
+        + w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) + w_final log(1 + E / 1e-3)
+        + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
 
-A is the joint's move, or the smallest that counts as one; O the overshoot as a fraction of that; E the error left
-at the end; TV the total variation of the effort and TV_smooth that of the smooth motion that takes a second; S the
-share of time in saturation.
+Ts counts as 1.5 times the run at most; Tmax is the settling time asked for. A is the joint's move, or the smallest that
+counts as one; O the overshoot as a fraction of that; E the error left at the end; TV the total variation of the effort
+and TV_smooth that of the smooth motion that takes a second; S the share of time in saturation.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import batchpid as bp
 from batchpid.stability import stability_bound
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.evaluation import absolute_band, run_moves
+from sim.tuning.evaluation import absolute_band, run_moves, settling_limits
 from sim.tuning.moves import Moves, smooth_variation
 from sim.tuning.weights import Weights
 
@@ -65,6 +66,7 @@ class Candidates:
         self.dimension = len(FACTORS) + (joints if per_joint else 0)
         self._band = absolute_band(robot)
         self._smooth = smooth_variation(robot, moves, 1.0)
+        self._limit = settling_limits(robot, moves)[:, None]
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
         # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
         if gain_units == "mass_matrix":
@@ -105,10 +107,12 @@ class Candidates:
         def bounded(figure: Float64) -> Float64:
             return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)
 
+        settling = np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
         cost = (
             w.itae * bounded(m.itae) / self._size
-            + w.settling * np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
+            + w.settling * settling
             + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
+            + w.late * np.log1p(np.maximum(settling / self._limit - 1, 0) / 0.05)
             + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
             + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
             + w.saturation * bounded(m.saturation_share)

@@ -48,6 +48,8 @@ INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 VARIED_MOVES, VARIED_SPREAD = 12, 0.3
 """Random moves, and first standard deviation, for robots that differ from the model: their gains lie farther away."""
+VARIED_STARTS = ((0.35, 0, 0), (0.55, 0.2, 0.25), (0.65, 0.2, 0.25), (0.7, 0, 0), (0.9, 0, 0), (1.0, 0.2, 0.25))
+"""Logarithms of bandwidth, stiffness and damping factors among the first candidates for such robots."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Candidates of the final, besides the designed gains, and its moves."""
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
@@ -182,6 +184,8 @@ def tune(
             points += [optimizer.ask() for _ in range(population)]
             if generation == 0:
                 points[0] = np.zeros(search.dimension)  # the designed gains are a candidate too
+                for index, factors in enumerate(VARIED_STARTS[: population - 1] if is_varied else (), start=1):
+                    points[index] = np.pad(np.array(factors), (0, search.dimension - len(factors)))
             if generation == len(record.costs):
                 record.append(search.costs(runner, np.array(points[-population:])))
             optimizer.tell(list(zip(points[-population:], record.costs[generation], strict=True)))

@@ -17,6 +17,8 @@ class Weights:
     """Weight of the settling time [1/s]."""
     overshoot: float = 1.0
     """Weight of log(1 + overshoot / 5 %): one move out of reach must not outweigh all others."""
+    late: float = 0.0
+    """Weight of log(1 + excess of the settling time over that asked for / 5 %): 4 where moves are to be in time."""
     final: float = 2.0
     """Weight of log(1 + final error / least half width of the settling band)."""
     chatter: float = 0.3
