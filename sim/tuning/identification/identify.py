@@ -22,11 +22,11 @@ from batchpid.validate import choice, flag, instance, integer, number
 from batchpid.versions import package_versions
 from sim.options import Compensation
 from sim.robot.robot import Robot
-from sim.tuning.identification.fit import MAX_ITERATIONS, Problem, State, fit
+from sim.tuning.identification.fit import MAX_ITERATIONS, Problem, State, cost_of, fit
 from sim.tuning.identification.history import History
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Drive, Motors, Plant
-from sim.tuning.identification.regression import Motion, best_start
+from sim.tuning.identification.regression import STRONG_PRIOR, Motion, best_start, regress
 from sim.tuning.identification.result import Fit, Identification
 from sim.tuning.identification.statistics import uncertainty
 from sim.tuning.identification.unknowns import Unknowns
@@ -122,12 +122,16 @@ def identify(
     pool: Any = ProcessPoolExecutor(processes, mp_context=get_context("spawn")) if processes > 1 else nullcontext()
     with pool as executor:
         problem = Problem(robot, joints, drive, found, motions, unknowns, executor)
-        begin = record.state or State(unknowns.clip(unknowns.point(start.motors)))
-        best = fit(problem, begin, iterations=iterations, record=record.write, progress=progress)
         nominal = unknowns.point(_nominal(robot, joints))
+        safe = regress(Plant(robot, joints, drive), found, motions, payload, STRONG_PRIOR)
+        starts = [unknowns.clip(point) for point in (*map(unknowns.point, (start.motors, safe.motors)), nominal)]
+        begin = record.state or State(min(starts, key=lambda theta: _cost(problem, theta)))
+        best = fit(problem, begin, iterations=iterations, record=record.write, progress=progress)
         before, after = (problem.evaluate(theta, jacobian=False) for theta in (nominal, best.theta))
         sure = uncertainty(problem, best)
     errors = tuple(_held_out(problem, windows) for windows in (before, after))
+    if not errors[1] < errors[0]:  # the fit failed: nothing is known
+        sure = sure._replace(identified=np.zeros_like(sure.identified))
     fits = tuple(
         Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b, a)
         for w, (b, _), (a, _) in zip(problem.windows, before, after, strict=True)
@@ -191,6 +195,11 @@ def _nominal(robot: Robot, joints: tuple[int, ...]) -> Motors:
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def _cost(problem: Problem, theta: Float64) -> float:
+    """Return the cost of a point."""
+    return cost_of(problem, problem.evaluate(theta, jacobian=False))[0]
 
 
 def _held_out(problem: Problem, windows: list[Any]) -> float:

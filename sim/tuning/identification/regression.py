@@ -33,6 +33,8 @@ _EVERY = 0.005
 PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
 """Payloads that are tried [kg]."""
 _PRIOR = 0.1
+STRONG_PRIOR = 3.0
+"""Weight of the prior at strength 1 of a start that is safe where the log hardly shows the strengths."""
 _WEAK = (0.05**2,) * 3
 
 
@@ -67,7 +69,7 @@ def smooth(log: Log, timestep: float) -> Motion:
     return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time))
 
 
-def regress(plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> Start:
+def regress(plant: Plant, logs: list[Log], motions: list[Motion], payload: bool, prior: float = _PRIOR) -> Start:
     """Return the motors, and the payload if asked, that explain the filtered efforts best."""
     from scipy.signal import butter, sosfiltfilt
 
@@ -99,7 +101,7 @@ def regress(plant: Plant, logs: list[Log], motions: list[Motion], payload: bool)
 
     def solve(index: int, kg: float) -> tuple[float, Float64]:
         both = [
-            _solve_joint(empty[:, j] + kg * per_kg[:, j], a[:, j], v[:, j], sign[:, j], efforts[index, :, j])
+            _solve_joint(empty[:, j] + kg * per_kg[:, j], a[:, j], v[:, j], sign[:, j], efforts[index, :, j], prior)
             for j in range(len(plant.joints))
         ]
         return float(sum(np.log(mean + 1e-30) for mean, _ in both)), np.array([found for _, found in both]).T
@@ -125,7 +127,9 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
     return effort if held is None else effort - held
 
 
-def _solve_joint(required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64) -> tuple[float, Float64]:
+def _solve_joint(
+    required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64, weight: float
+) -> tuple[float, Float64]:
     """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint."""
     from scipy.optimize import lsq_linear
 
