@@ -208,11 +208,11 @@ class Runner:
     def __repr__(self) -> str:
         options, workers, nodes = self.options, len(self.pids), len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        collisions = "collisions" if options.collisions else "no collisions"
+        collisions = "" if options.collisions else ", no collisions"
         where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
-            f"{options.compensate!r},\n       physics {options.physics!r}, {collisions}, timestep {self.timestep:g} s, "
+            f"{options.compensate!r},\n       physics {options.physics!r}{collisions}, timestep {self.timestep:g} s, "
             f"{self.substeps} substeps, at {self.time:g} s)"
         )
 

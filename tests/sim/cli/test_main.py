@@ -82,7 +82,7 @@ def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
     assert status == 0
     assert " ".join(command.__doc__.split()) in " ".join(out.split())
     flags = fields_of(name).keys() - {"weights"}  # its fields are flags
-    assert all(f"--{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags)
+    assert all(f"-{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags)  # --flag or --no-flag
 
 
 @pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
