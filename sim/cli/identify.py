@@ -44,7 +44,7 @@ class IdentifyCommand:
     iterations: int = 25
     """Most Gauss-Newton steps."""
     seed: int = 0
-    """Seed of the search where regression finds no start. The result does not depend on the number of workers."""
+    """Seed of the random points at which the fit may begin. The result does not depend on the number of workers."""
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False

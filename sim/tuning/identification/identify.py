@@ -33,6 +33,8 @@ from sim.tuning.identification.unknowns import Unknowns
 from sim.tuning.identification.windows import rows_of
 
 Float64 = NDArray[np.float64]
+RANDOM_STARTS, START_SPREAD = 8, 0.3
+"""Random points at which a fit may begin, and their standard deviation in typical sizes of the unknowns."""
 
 
 def identify(
@@ -71,7 +73,8 @@ def identify(
     iterations
         Most Gauss-Newton steps.
     seed
-        Of the search that starts the fit where regression leads nowhere.
+        Of the random starts. The fit begins where the simulated motion is nearest to the log: at the regression's
+        result, at ideal motors, or at one of RANDOM_STARTS points around the first.
     workers
         Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
     history
@@ -124,8 +127,9 @@ def identify(
         problem = Problem(robot, joints, drive, found, motions, unknowns, executor)
         nominal = unknowns.point(_nominal(robot, joints))
         safe = regress(Plant(robot, joints, drive), found, motions, payload, STRONG_PRIOR)
-        starts = [unknowns.clip(point) for point in (*map(unknowns.point, (start.motors, safe.motors)), nominal)]
-        begin = record.state or State(min(starts, key=lambda theta: _cost(problem, theta)))
+        points = [*map(unknowns.point, (start.motors, safe.motors)), nominal]
+        points += _random_starts(unknowns, points[0], seed)
+        begin = record.state or State(min(map(unknowns.clip, points), key=lambda theta: _cost(problem, theta)))
         best = fit(problem, begin, iterations=iterations, record=record.write, progress=progress)
         before, after = (problem.evaluate(theta, jacobian=False) for theta in (nominal, best.theta))
         sure = uncertainty(problem, best)
@@ -195,6 +199,12 @@ def _nominal(robot: Robot, joints: tuple[int, ...]) -> Motors:
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def _random_starts(unknowns: Unknowns, center: Float64, seed: int) -> list[Float64]:
+    """Return points around ``center``."""
+    draws = np.random.default_rng(seed).standard_normal((RANDOM_STARTS, len(center)))
+    return list(center + START_SPREAD * unknowns.scale * draws)
 
 
 def _cost(problem: Problem, theta: Float64) -> float:
