@@ -7,6 +7,8 @@ others continue.
 
 An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool says at every moment how
 far each worker is, and a worker with which a message was under way is replaced, so that the call can be repeated.
+
+Longer than 300 lines because all that can happen to a worker during a request is read in one place.
 """
 
 from __future__ import annotations
