@@ -32,9 +32,11 @@ READ_ATTEMPTS = 24
 
 
 def read_hdf5(
-    path: str | os.PathLike[str], names: Sequence[str], every: int, max_bytes: int
+    path: str | os.PathLike[str], names: Sequence[str] | None, every: int, max_bytes: int
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the datasets ``names`` of a file, where it has them, and its attributes.
+
+    Without ``names`` those of a log: "time", and all with a colon in their name.
 
     Every n-th of the rows before the first one whose "checksum" is not written yet, or in older files its "time".
 
@@ -43,7 +45,7 @@ def read_hdf5(
     ValueError
         The file is damaged, lies in several files, or holds more than ``max_bytes``.
     """
-    request = json.dumps([os.fspath(path), list(names), every, max_bytes])
+    request = json.dumps([os.fspath(path), names if names is None else list(names), every, max_bytes])
     environment = os.environ | {"HDF5_PLUGIN_PRELOAD": "::", "OPENBLAS_NUM_THREADS": "1"}  # "::": no plugins
     with subprocess.Popen(
         [sys.executable, "-P", __file__, request],
@@ -87,6 +89,8 @@ def _main() -> None:
     datasets: dict[str, h5py.Dataset] = {}
     try:
         file = _open(path)
+        if names is None:
+            names = [name for name in file if name == "time" or ":" in name]
         datasets = {name: _open_dataset(file, name) for name in names if file.id.links.exists(name.encode())}
         if (total := sum(dataset.nbytes for dataset in datasets.values())) > max_bytes:
             raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")
@@ -143,6 +147,8 @@ def _open_dataset(file: Any, name: str) -> Any:
 
 
 def _count_rows(datasets: Mapping[str, Any]) -> int:
+    if not {"checksum", "time"} & set(datasets):
+        return max(map(len, datasets.values()), default=0)
     checked = "checksum" in datasets
     written = datasets["checksum"][:] != NOT_WRITTEN if checked else np.isfinite(datasets["time"][:])
     return len(written) if written.all() else int(written.argmin())

@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from sim.recording.files import RecordingError, load_h5py
+from sim.recording.hdf5 import read_hdf5
 
 Float64 = NDArray[np.float64]
 QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
+MAX_BYTES = 1 << 30
+"""Most that the columns of an HDF5 file may take."""
 
 
 def error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidArgumentError:
@@ -72,12 +75,11 @@ def _is_number(cell: str) -> bool:
 
 def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
     """Return the datasets of an HDF5 file by name, None if none is named as a column of a log."""
-    h5py = load_h5py()
+    load_h5py()  # raises without the package
     try:
-        with h5py.File(path, "r") as file:
-            names = [name for name in file if name == "time" or ":" in name]
-            if not any(name.startswith("qpos:") for name in names):
-                return None
-            return {name: np.asarray(file[name][...], np.float64).reshape(-1) for name in names}
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as bad:
+        arrays, _ = read_hdf5(path, None, 1, MAX_BYTES)
+    except (OSError, ValueError) as bad:
         raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
+    if not any(name.startswith("qpos:") for name in arrays):
+        return None
+    return {name: array.astype(np.float64).reshape(-1) for name, array in arrays.items()}

@@ -147,3 +147,18 @@ def test_a_recording_is_a_log_of_each_env(panda, tmp_path):
     assert np.array_equal(first.commands_at(within)[0], rollout.setpoint[7, 0, first.joints])
     with pytest.raises(bp.InvalidArgumentError, match="fit its setpoints"):
         logs_of_rollout(panda, rollout, "effort")
+
+
+def test_a_damaged_or_linked_hdf5_log_is_refused(panda, tmp_path, columns):
+    h5py = pytest.importorskip("h5py")
+    path, linked = tmp_path / "log.h5", tmp_path / "linked.h5"
+    with h5py.File(path, "w") as file:
+        for name, rows in columns.items():
+            file[name] = rows
+    with h5py.File(linked, "w") as file:
+        for name in columns:
+            file[name] = h5py.ExternalLink(str(path), name)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    for each in (path, linked):
+        with pytest.raises(bp.BatchPIDError, match="cannot be read as a log"):
+            read_logs(panda, [each])
