@@ -234,8 +234,10 @@ def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
 def _run(program: str) -> str | None:
     """Run a Python program in a child process; return what went wrong, None if nothing did."""
     command = [sys.executable, "-P", "-c", program, json.dumps(sys.path)]
+    environment = {name: value for name, value in os.environ.items() if name != SWITCH}  # it tests what is switched off
+    options: dict[str, Any] = {"env": environment, "stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_SECONDS)
+        done = subprocess.run(command, timeout=_SECONDS, **options)
     except subprocess.TimeoutExpired:
         return f"more than {_SECONDS:g} s"
     if done.returncode:
