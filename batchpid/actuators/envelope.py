@@ -35,7 +35,7 @@ class Envelope(NamedTuple):
     limit: Any = None
     """L."""
     offset: Any = None
-    """What does not depend on q in L(q) (1 | envs, joints)."""
+    """Part of L(q) that is the same at every q (1 | envs, joints)."""
     left: Any = None
     """x_k (segments, 1 | envs, joints)."""
     right: Any = None

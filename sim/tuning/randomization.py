@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 import batchpid as bp
+from batchpid import documents
 from batchpid.actuators import JOINT_SIDE
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import file_path, number
@@ -39,7 +39,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomization:
-    """Return a preset for ``robot``, or the randomization in a YAML file; without a seed there, with ``seed``.
+    """Return a preset for ``robot``, or the randomization in a YAML or JSON file; without a seed there, with ``seed``.
 
     Raises
     ------
@@ -50,15 +50,14 @@ def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomi
         payload = Uniform(0, min(PAYLOAD, payload_capacity(robot)))
         return Randomization(seed=seed, payload=payload, **PRESETS[str(name)])
     path = file_path("randomize", name)
-    try:
-        known = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    if path.suffix.lower() not in documents.SUFFIXES or not path.exists():
         raise InvalidArgumentError(
             "randomize",
-            f"is neither a preset nor a file that can be read: {error}",
+            "is neither a preset nor a file",
             value=str(name),
-            remedy=f"use a YAML file, or {' or '.join(PRESETS)}",
-        ) from None
+            remedy=f"use a .yaml or .json file, or {' or '.join(PRESETS)}",
+        )
+    known = documents.read(path)
     known = {"seed": seed, **known} if isinstance(known, dict) else known
     randomization = Randomization.from_dict(known)
     check_robot(randomization, robot)

@@ -110,3 +110,6 @@ def test_randomization_is_a_preset_or_a_file(panda, tmp_path):
     for name, message in ((path, "payload: of 'payload' may become -1"), ("none.yaml", "neither a preset nor a file")):
         with pytest.raises(InvalidArgumentError, match=message):
             load_randomization(name, panda)
+    path.write_text("a: &a [1, 1]\npayload: [*a, *a]")
+    with pytest.raises(InvalidArgumentError, match="alias"):
+        load_randomization(path, panda)
