@@ -218,7 +218,7 @@ runner = Runner(robot, 2, params=robot.params(), cluster=Ray({address!r}, nodes=
 pids = [pid for info in runner.nodes for pid in (info.pid, *info.pids)]
 # Ray's agents notice the end of their cluster after a minute.
 pids += [child.pid for child in psutil.Process().children(recursive=True) if "Agent" not in child.name()]
-print(*pids, flush=True)
+print("pids:", *pids, flush=True)
 while True:
     runner.step(robot.settings.target)
 """
@@ -235,7 +235,9 @@ def test_nothing_is_left_of_a_program_that_is_killed(local, machines):
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [os.getcwd(), *sys.path]))},
     )
     with process:
-        pids = [int(pid) for pid in process.stdout.readline().split()]
+        # Ray prints the messages of its machines in between.
+        line = next(line for line in process.stdout if line.startswith("pids:"))
+        pids = [int(pid) for pid in line.split()[1:]]
         time.sleep(0.3)
         process.kill()
     assert len(pids) > (4 if local else 1)
