@@ -11,6 +11,7 @@ import statistics
 from typing import NamedTuple
 
 import pytest
+from test_actuators import speeds_over_ideal
 from test_few_robots import COUNTS, few_robots
 
 from sim import Robot
@@ -52,6 +53,13 @@ FEW_FLOORS = {
     4: (0.95, 1.35),  # they share a PhysX system and the calls
     16: (1.05, 1.7),  # a whole group of envs
 }
+ACTUATOR_FLOORS = {
+    # a runner with these actuators over one with actuators=None
+    "all off": 0.99,  # what is off costs nothing
+    "armature": 0.99,  # the engine's
+    "strength": 0.97,  # the velocity is read, and the effort processed
+    "effort limit": 0.96,  # and limits given to the law
+}
 
 
 @pytest.mark.check
@@ -87,11 +95,23 @@ def test_few_robots_keep_their_floors(name, physics):
     check(f"{name}, {physics}", measure)
 
 
+@pytest.mark.check
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_actuators_keep_their_floors(physics):
+    def measure():
+        return {
+            f"{name} / ideal": (ratio, ACTUATOR_FLOORS[name])
+            for name, ratio in speeds_over_ideal(physics, rounds=30).items()
+        }
+
+    check(f"actuators of panda, {physics}", measure)
+
+
 def check(label, measure):
     """Fail unless one of a few runs of ``measure`` has every ratio at its floor or above."""
     for _ in range(ATTEMPTS):
         found = measure()
-        print(f"\n{label}: " + ", ".join(f"{ratio:.2f} ({floor}) {name}" for name, (ratio, floor) in found.items()))
+        print(f"\n{label}: " + ", ".join(f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()))
         short = {name: both for name, both in found.items() if both[0] < both[1]}
         if not short:
             return

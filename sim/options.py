@@ -288,7 +288,7 @@ class RunnerOptions:
         return params
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`sim.robot.actuators.fit_actuators` does.
+        """Return ``actuators`` as :func:`sim.robot.actuators.fit_actuators` does; None if every effect is off.
 
         Raises
         ------
@@ -296,6 +296,7 @@ class RunnerOptions:
             They do not fit.
         """
         fitted = None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
+        fitted = None if fitted is None or fitted.is_ideal else fitted
         if self.randomization is None:
             return fitted
         return prepared_actuators(self.randomization, fitted, self.robot, self.control)

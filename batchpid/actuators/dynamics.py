@@ -12,6 +12,9 @@ effort u that the controller asks for::
     e      = min(max(m, low(q, v)), high(q, v))            envelope: batchpid.actuators.envelope
     e      = e' + (1 - exp(-dt / T)) (e - e')              lag, again within the envelope; exact for a constant e
 
+A command u is delivered unclipped, where nothing is late, if (low - b) / s <= u <= (high - b) / s:
+:func:`command_limits`.
+
 A prime is the value of the step before. The play is the backlash hysteresis (G. Tao and P. Kokotovic, Adaptive Control
 of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
 see :mod:`batchpid.friction`.
@@ -28,7 +31,7 @@ from batchpid.actuators.envelope import Envelope, envelope, limits
 from batchpid.actuators.model import Actuators
 from batchpid.actuators.state import ActuatorState
 from batchpid.display import array_summary
-from batchpid.elementwise import TURN, clip, namespace, wrap
+from batchpid.elementwise import TURN, clip, namespace, tiny_of, wrap
 
 _ONE = np.uint32(1)
 
@@ -42,6 +45,8 @@ class Coefficients(NamedTuple):
     intake: Any = None
     """1 - exp(-dt / T)."""
     strength: Any = None
+    divisor: Any = None
+    """s, where that is 0 a tiny number."""
     bias: Any = None
     play: Any = None
     """B / 2."""
@@ -124,6 +129,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         envelope=envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
         strength=a.strength,
+        divisor=None if a.strength is None else xp.maximum(a.strength, tiny_of(a.strength.dtype)),
         bias=a.bias,
         play=None if a.backlash is None else 0.5 * a.backlash,
         position_resolution=_step(a.position_resolution, xp),
@@ -180,6 +186,20 @@ def advance_effort(
     if k.intake is not None:
         behind = motor = clip(behind + k.intake * (motor - behind), low, high, xp)
     return ActuatorState(command, behind, *state[2:]), motor
+
+
+def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+    """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
+
+    They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
+    difference from the effort asked for they would leak into the integral. None is no limit.
+    """
+    low, high = limits(k.envelope, qpos, qvel)
+    if high is None:
+        return None, None
+    if k.bias is not None:
+        low, high = low - k.bias, high - k.bias
+    return (low, high) if k.divisor is None else (low / k.divisor, high / k.divisor)
 
 
 def advance_measurement(

@@ -74,6 +74,11 @@ class Actuators(NamedTuple):
         """True if the efforts delivered differ from those asked for."""
         return any(getattr(self, name) is not None for name in MOTOR_SIDE)
 
+    @property
+    def is_ideal(self) -> bool:
+        """True if every effect is off."""
+        return not (self.measures or self.delivers) and all(leaf is None for leaf in self.joint_side())
+
     def for_envs(self, envs: slice | Any) -> Actuators:
         """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
         return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.actuators import ActuatorState, advance_effort, advance_measurement, discretise, measurement_noise
-from batchpid.actuators.envelope import limits
+from batchpid.actuators import (
+    ActuatorState,
+    advance_effort,
+    advance_measurement,
+    command_limits,
+    discretise,
+    measurement_noise,
+)
 from sim.loop.snapshot import EPISODE
 
 Float64 = NDArray[np.float64]
@@ -63,8 +69,8 @@ class JointActuators:
         return qpos, qvel
 
     def limits(self, qpos: Float64, qvel: Float64) -> tuple[Float64 | None, Float64 | None]:
-        """Return the least and the largest effort that the motors can deliver; None for no limit."""
-        return limits(self._coefficients.envelope, qpos, qvel)
+        """Return the least and the largest effort to ask for that the motors do not clip; None for no limit."""
+        return command_limits(self._coefficients, qpos, qvel)
 
     def deliver(self, effort: Float64, qpos: Float64, qvel: Float64) -> Float64:
         """Advance the motors by one sim step; return the efforts that they deliver."""

@@ -47,7 +47,8 @@ class Control:
     reads_qpos_each_step
         Whether :meth:`effort` needs qpos at every sim step; otherwise it is ignored.
     limits
-        Least and largest effort that the motors can deliver, within those of the params; None for no limit.
+        Least and largest effort to ask for that the motors do not clip, in addition to those of the params; None for
+        no limit.
     drive
         Damping and stiffness of the engine's drives [N m s/rad, N m/rad].
     """
@@ -147,11 +148,7 @@ class PIDControl(Control):
         matrix = self._matrix if self.law.whole else None
         last = step + 1 == self._substeps
         command = self._command.setpoint, self._command.setpoint_rate
-        k = self._scaled
-        if self.limits[1] is not None:  # saturation and anti-windup are those of the motors
-            low, high = (clip(end, k.effort_min, k.effort_max, np) for end in self.limits)
-            k = k._replace(effort_min=low, effort_max=high)
-        new = self._advance(k, command, qpos, qvel, feedforward, matrix, viscous, terms=last)
+        new = self._advance(self._scaled, command, qpos, qvel, feedforward, matrix, viscous, *self.limits, terms=last)
         if last:
             self.saturated = new[2]
         self._state, effort = new[:2]
@@ -163,7 +160,7 @@ class PIDControl(Control):
 
     def _advance(self, k: Coefficients, *inputs: Any, terms: bool) -> Any:
         """Return the new state and the effort, with ``terms`` also the mask of their saturation."""
-        if self._program is not None and k is self._scaled:
+        if self._program is not None:
             return self._program.advance(self._state, *inputs, terms=terms)
         new, effort, *shown = partial(self.law.advance, terms=terms)(k, self._state, *inputs)
         return new, effort, *(each.saturated for each in shown)

@@ -48,7 +48,8 @@ class EnvGroup:
         self._coupling = options.robot.coupling
         self.draws: Draws | None = None
         """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
-        self._params, self._own_actuators = params, options.actuators  # before the randomization
+        self._params = params  # before the randomization
+        self._own_actuators: bp.Actuators | None = None  # likewise
         self._control = make_control(options, pack.spec, params, pack)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._friction = JointFriction(pack, self._control.drive, known_joints(self._options.robot).coulomb)
@@ -56,7 +57,7 @@ class EnvGroup:
         self._qpos = pack.read_qpos()
         self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
         self._steps = 0
-        self._actuators: JointActuators | None = None
+        self._actuators: JointActuators | None = None  # with effects on efforts or measurements
         self._guard: SetpointGuard | None = None
         if isinstance(options.guard, bp.Guard):
             limits = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
@@ -85,18 +86,22 @@ class EnvGroup:
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
         self._release()
-        self._own_actuators, ours = actuators, self._actuators
-        actuators = acting_actuators(self._options, actuators, self.draws)
-        if actuators is None:
-            self._actuators, self._control.limits = None, (None, None)
-        elif ours is None:
-            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep, self.pack.first_env)
-        else:
-            ours.set_actuators(actuators, self._qpos)
-        if actuators is not None or ours is not None:
-            self.pack.write_joints(actuators)
+        if actuators is not None or self._own_actuators is not None:
+            self._own_actuators = actuators
+            self.pack.write_joints(self._take_actuators())
             self._friction.update()
             self._compiled = self._make_compiled()
+
+    def _take_actuators(self) -> bp.Actuators | None:
+        """Let efforts and measurements be those of the actuators with the draws applied; return these."""
+        actuators = acting_actuators(self._options, self._own_actuators, self.draws)
+        if actuators is None or not (actuators.measures or actuators.delivers):
+            self._actuators, self._control.limits = None, (None, None)
+        elif self._actuators is None:
+            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep, self.pack.first_env)
+        else:
+            self._actuators.set_actuators(actuators, self._qpos)
+        return actuators
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
@@ -168,8 +173,9 @@ class EnvGroup:
     def write(self, pack: Pack, states: EnvStates) -> None:
         """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
+        if self._own_actuators is not None:
+            pack.write_joints(self._take_actuators())
         if self._actuators is not None:
-            pack.write_joints(self._actuators.actuators)
             self._actuators.write(states.actuators)
         self._control = make_control(self._options, pack.spec, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
@@ -196,10 +202,7 @@ class EnvGroup:
             return
         if isinstance(self.pack, VariedPack):
             self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
-        actuators = acting_actuators(self._options, self._own_actuators, self.draws)
-        if self._actuators is not None and actuators is not None:
-            self._actuators.set_actuators(actuators, self._qpos)
-        self.pack.write_joints(actuators, rows)
+        self.pack.write_joints(self._take_actuators(), rows)
         self.set_params(self._params)
 
     # -- the closed loop ---------------------------------------------------------------------------------------

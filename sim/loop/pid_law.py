@@ -9,6 +9,7 @@ from batchpid.choices import PerInertia, PerMassMatrix
 from batchpid.coefficients import Coefficients
 from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
 from batchpid.coupling import Coupling
+from batchpid.elementwise import clip, namespace
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick."""
@@ -44,6 +45,8 @@ class PIDLaw(NamedTuple):
         feedforward: Any,
         matrix: Any = None,
         viscous: Any = None,
+        low: Any = None,
+        high: Any = None,
         terms: bool = False,
     ) -> Any:
         """Return the new state and the effort, and with ``terms`` these.
@@ -59,7 +62,14 @@ class PIDLaw(NamedTuple):
         viscous
             B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B) (v+ - v) =
             dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
+        low, high
+            Least and largest effort of the motors (envs, dof), which saturation and anti-windup take within those of
+            the params; None for no limit.
         """
+        if low is not None:
+            xp = namespace(low, high)
+            low, high = (clip(end, k.effort_min, k.effort_max, xp) for end in (low, high))
+            k = k._replace(effort_min=low, effort_max=high)
         if viscous is not None:
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate = command

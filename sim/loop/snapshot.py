@@ -61,7 +61,8 @@ class EnvStates:
     friction: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
     actuators: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.actuators.ActuatorState`, and :data:`EPISODE`; none without actuators."""
+    """Leaves of :class:`batchpid.actuators.ActuatorState`, and :data:`EPISODE`; none without effects on
+    efforts or measurements."""
     guard: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.guard.GuardState`, and :data:`CHANGED`; none without guard."""
     containment: dict[str, NDArray[Any]]
@@ -271,7 +272,7 @@ def initial_actuators(
     actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float
 ) -> dict[str, NDArray[Any]]:
     """Return a state of ``actuators`` in the shapes that it has for so many envs and joints, by name."""
-    if actuators is None:
+    if actuators is None or not (actuators.measures or actuators.delivers):
         return {}
     longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))
     state = bp.actuators.init(longest, np.zeros((1, dof)), timestep).leaves()

@@ -152,6 +152,41 @@ def test_strength_and_bias(strength, bias, effort):
     assert run_motor(chosen, [effort]) == pytest.approx(strength * effort + bias)
 
 
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=50)
+def test_the_command_limits_are_where_the_motor_clips(seed):
+    """Clipped to them a command has the same effect, and within them it has all of its effect, without delay or lag."""
+    rng, joints = np.random.default_rng(seed), 30
+    strength = np.where(rng.random(joints) < 0.2, 0.0, rng.uniform(0.2, 3, joints))
+    options = {"strength": strength, "bias": rng.normal(0, 5, joints)}
+    options = {name: options[name] for name in options if rng.random() < 0.7}
+    line = {"saturation_effort": rng.uniform(1, 40, joints), "no_load_speed": rng.uniform(1, 5, joints)}
+    table = np.sort(rng.uniform(-3, 3, (joints, 4))), rng.uniform(5, 30, (joints, 4))
+    shape = {"position_limit": table} if rng.random() < 0.5 else {"effort_limit": rng.uniform(1, 30, joints)}
+    static = bp.make_actuators(joints, **options, **(line if rng.random() < 0.5 else {}), **shape)
+    late = static.replace(command_delay=0.01, lag=0.1)
+    asked, q, v = rng.normal(0, 100, (1, joints)), rng.normal(0, 2, (1, joints)), rng.normal(0, 3, (1, joints))
+    ends = [
+        actuators.command_limits(actuators.discretise(each, actuators.init(each, q, DT), DT), q, v)
+        for each in (static, late)
+    ]
+    np.testing.assert_array_equal(*ends, "they have no dynamics")
+    least, most = ends[0]
+    assert (least <= most).all()
+    clipped = np.clip(asked, least, most)
+    delivered = run_motor(static, asked, q, v)
+    np.testing.assert_allclose(run_motor(static, clipped, q, v), delivered, rtol=1e-12, atol=1e-12)
+    works = static.strength[0] > 0 if static.strength is not None else np.ones(joints, bool)
+    free = clipped * options.get("strength", 1.0) + options.get("bias", 0.0)
+    np.testing.assert_allclose(delivered[0, 0, works], free[0, works], rtol=1e-12, atol=1e-12)
+
+
+def test_without_an_envelope_no_command_is_clipped():
+    chosen, q = bp.make_actuators(2, strength=0.5, bias=1.0, lag=0.1, command_delay=0.1), np.zeros((3, 2))
+    k = actuators.discretise(chosen, actuators.init(chosen, q, DT), DT)
+    assert actuators.command_limits(k, q, q) == (None, None)
+
+
 @given(ratio=st.floats(0.05, 0.95))
 @settings(max_examples=6)
 def test_backlash_has_the_describing_function_of_the_play(ratio):
@@ -285,7 +320,8 @@ def test_jax_agrees_with_numpy(dtype, tolerance, request):
         u, q, v = inputs
         state, *seen = actuators.measure(chosen, state, q, v, DT)
         state, effort = actuators.deliver(chosen, state, u, q, v, DT)
-        return state, (*seen, effort)
+        ends = actuators.command_limits(actuators.discretise(chosen, state, DT), q, v)
+        return state, (*seen, effort, *ends)
 
     @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in 2/3 of the time
     def compiled(chosen, *inputs):

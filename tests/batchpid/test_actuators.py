@@ -39,6 +39,9 @@ def test_bad_input_is_refused(options, message):
 def test_a_neutral_value_is_off():
     actuators = bp.make_actuators(2, command_delay=0.0, strength=1.0, bias=0.0, effort_limit=np.inf, armature=0.0)
     assert all(leaf is None for leaf in actuators)
+    assert actuators.is_ideal
+    assert not bp.make_actuators(2, viscous=1.0).is_ideal
+    assert not bp.make_actuators(2, backlash=1.0).is_ideal
     assert not actuators.measures
     assert not actuators.delivers
     q = np.zeros((3, 2))

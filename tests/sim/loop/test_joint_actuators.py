@@ -113,6 +113,7 @@ def test_actuators_that_are_off_change_no_bit(panda):
     with Runner(panda, N, workers=0) as runner:
         ideal = runner.rollout(table)
     with Runner(panda, N, workers=0, actuators=bp.make_actuators(panda.dof, strength=1.0)) as runner:
+        assert runner.actuators is None
         assert_identical(ideal, runner.rollout(table))
         runner.actuators = actuators(panda)
         runner.reset()
@@ -145,6 +146,42 @@ def test_the_effort_is_that_delivered(panda):
     with Runner(panda, 1, workers=0, control="effort", compensate="none", substeps=1, actuators=chosen) as runner:
         effort = runner.rollout(np.concatenate((asked, asked[-1:]))).effort
     np.testing.assert_allclose(effort[3:], np.float32(0.5 * np.concatenate((asked, asked[-1:]))[:4]))
+
+
+@pytest.mark.parametrize("control", ["pid", "effort"])
+@pytest.mark.parametrize("strength", [0.5, 1.6])
+def test_a_joint_is_saturated_exactly_where_its_motor_is(panda, strength, control):
+    """The law is held back at the command that the motor clips, so that the whole limit is delivered, and no more."""
+    limit, moving = 12.0, slice(0, 7)
+    chosen = bp.make_actuators(panda.dof, strength=strength, bias=1.0, effort_limit=limit)
+    swing = np.where(np.arange(120) % 60 < 30, 1.0, -1.0)[:, None, None]
+    wanted = np.clip(panda.start + 0.8 * swing, panda.lower, panda.upper)
+    asked = {"pid": wanted, "effort": 40 * swing * (np.arange(panda.dof) < 7)}[control]
+    params = panda.params(anti_windup="back_calculation", effort_limit=200.0)
+    options = {"control": control, "params": params, "actuators": chosen, "compensate": "none"}
+    with Runner(panda, 1, workers=0, substeps=1, **options) as runner:
+        rollout = runner.rollout(np.ascontiguousarray(np.broadcast_to(asked, (120, 1, panda.dof))))
+    saturated, effort = rollout.saturated[..., moving], rollout.effort[..., moving]
+    assert 0.05 < saturated.mean() <= 1.0
+    np.testing.assert_array_equal(saturated, np.abs(effort) > limit * (1 - 1e-6))
+
+
+def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
+    """Friction and reflected inertia are the engine's: without other effects no signal is processed."""
+    worn, table = bp.make_actuators(panda.dof, coulomb=0.3, viscous=0.2, armature=0.1), commands(panda, 8)
+    with Runner(panda, N, workers=0, actuators=worn) as runner:
+        first = runner.rollout(table[:4])
+        snapshot = runner.snapshot()
+        second = runner.rollout(table[4:])
+    snapshot.save(tmp_path / "worn.npz")
+    assert snapshot.states.actuators == {}
+    with Runner(panda, N, workers=0, pack_size=1) as runner:
+        runner.actuators = worn
+        runner.reset()
+        assert_identical(first, runner.rollout(table[:4]))
+        runner.restore(Snapshot.load(tmp_path / "worn.npz"))
+        assert_identical(second, runner.rollout(table[4:]))
+        assert runner.actuators.armature.max() == 0.1
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,9 @@ def test_the_program_is_bit_identical_to_numpy(options, joints, envs, odd, seed,
     )
     qvel = numbers(rng, shape, odd) if law.measures_rate else qvel
     matrix, viscous = (numbers(rng, (*shape, joints), odd), numbers(rng, shape, odd)) if law.whole else (None, None)
-    arguments = (state, (numbers(rng, shape, odd), rate), numbers(rng, shape, odd), qvel, feedforward, matrix, viscous)
+    ends = np.sort(numbers(rng, (2, *shape), odd), axis=0) if data.draw(st.booleans()) else (None, None)
+    signals = (numbers(rng, shape, odd), rate), numbers(rng, shape, odd), qvel, feedforward
+    arguments = (state, *signals, matrix, viscous, *ends)
     program = LawProgram(law, k)
     with np.errstate(all="ignore"):
         new, effort, terms = law.advance(k, *arguments, terms=True)
