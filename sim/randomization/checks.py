@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.actuators import JOINT_SIDE
-from batchpid.actuators.model import NEUTRAL
+from batchpid.actuators.fields import NEUTRAL
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice
 from sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
 from sim.randomization.randomization import Randomization
 from sim.robot.robot import Robot
 
-DRAWN = [name for name in NEUTRAL if name != "static"]  # which depends on another
-"""Fields of actuators that can be drawn."""
 _PAIRED = ("saturation_effort", "no_load_speed")
 _HUGE = 1e300
 
@@ -86,7 +84,7 @@ def prepared_actuators(
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
     values: dict[str, NDArray[Any]] = {}
     for leaf, each in randomization.actuators.items():
-        nominal = getattr(known, choice("actuators", leaf, DRAWN))
+        nominal = getattr(known, choice("actuators", leaf, list(NEUTRAL)))
         if nominal is None and np.isinf(NEUTRAL[leaf]):
             remedy = f"give the runner actuators with {leaf}"
             raise InvalidArgumentError(f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy)

@@ -13,6 +13,7 @@ from law_cases import read_only
 import batchpid as bp
 from batchpid import actuators, friction
 from batchpid.actuators import noise
+from batchpid.errors import InvalidArgumentError
 
 DT = 1 / 2000
 positive = st.floats(1e-3, 1e3)
@@ -112,10 +113,41 @@ def test_presets_are_named_as_their_models():
             actuators.presets.mujoco_joint(2, armature=0.1, frictionloss=0.2, damping=0.3, forcerange=4.0),
             bp.make_actuators(2, armature=0.1, coulomb=0.2, viscous=0.3, effort_limit=4.0),
         ),
+        (
+            actuators.presets.isaac_joint(
+                2, armature=0.1, friction=0.3, dynamic_friction=0.2, viscous_friction=0.4, lag=0.1
+            ),
+            bp.make_actuators(2, armature=0.1, static=0.3, coulomb=0.2, viscous=0.4, lag=0.1),
+        ),
+        (
+            actuators.presets.delayed_pd(2, DT, 2, 6, effort_limit=5.0),
+            bp.make_actuators(2, command_delay=2 * DT, max_delay=6 * DT, effort_limit=5.0),
+        ),
+        (
+            actuators.presets.newton(2, delay_steps=[1, 3], timestep=DT),
+            bp.make_actuators(2, command_delay=[DT, 3 * DT]),
+        ),
     ]
     for ours, expected in same:
         for mine, other in zip(ours, expected, strict=True):
             np.testing.assert_array_equal(mine, other)
+
+
+def test_presets_need_delays_in_order_and_their_time_step():
+    with pytest.raises(InvalidArgumentError, match="max_delay: out of range"):
+        actuators.presets.delayed_pd(2, DT, 3, 2)
+    with pytest.raises(InvalidArgumentError, match="timestep: is missing"):
+        actuators.presets.newton(2, delay_steps=1)
+
+
+def test_the_lag_is_mujocos_exact_filter():
+    """Its activation, stated again, with the control clipped before and after (its ctrlrange and forcerange)."""
+    chosen, activation, expected = actuators.presets.mujoco_joint(1, dynprm=0.01, forcerange=2.0), 0.0, []
+    asked = np.random.default_rng(0).uniform(-2, 2, 50)
+    for control in asked:
+        activation += (control - activation) / 0.01 * 0.01 * (1 - np.exp(-DT / 0.01))
+        expected.append(activation)
+    np.testing.assert_allclose(run_motor(chosen, asked)[:, 0, 0], expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(

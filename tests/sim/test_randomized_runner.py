@@ -42,6 +42,7 @@ EVERYTHING = Randomization(
         "command_delay": Uniform(0, 0.003, shared=True),
         "sensor_delay": Choice([0.0, 0.001]),
         "coulomb": Uniform(0, 0.1),
+        "static": Uniform(0, 0.4),
         "position_resolution": Uniform(0, 1e-5),
     },
 )

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from robots import load_bundled
 
-from batchpid import make_actuators
+from batchpid import friction, make_actuators
+from batchpid.actuators import presets
 from batchpid.errors import InvalidArgumentError
 from sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
@@ -125,6 +126,41 @@ def test_draws_are_applied_by_their_operation():
     qpos, qvel = randomization.start(start, np.zeros_like(start), draws, PANDA)
     np.testing.assert_array_equal(qpos, np.clip(start + draws.values["qpos"], PANDA.lower, PANDA.upper))
     assert not qvel.any()
+
+
+def test_delays_are_drawn_as_by_a_delayed_pd_actuator():
+    """Whole steps between both ends, one for all joints of an env, drawn again for each episode."""
+    least, most, step = 2, 5, 1 / 2000
+    chosen = presets.delayed_pd(PANDA.dof, step, least, most)
+    more = Choice(step * np.arange(most - least + 1), shared=True)
+    randomization = Randomization(actuators={"command_delay": more})
+    prepared = prepared_actuators(randomization, chosen, PANDA)
+    assert prepared.max_delay == most * step
+    seen = set()
+    for episode in range(8):
+        draws = randomization.draw(PANDA, np.array([[env, episode] for env in range(8)]))
+        delays = randomization.randomized_actuators(prepared, draws, PANDA).command_delay / step
+        np.testing.assert_allclose(delays, np.rint(delays[:, :1]) + np.zeros(PANDA.dof), rtol=1e-12)
+        seen.add(tuple(np.rint(delays[:, 0]).astype(int).tolist()))
+    assert len(seen) == 8
+    assert set().union(*seen) == set(range(least, most + 1))
+
+
+def test_static_friction_below_coulombs_is_coulombs():
+    """So that the one can be drawn without the other."""
+    drawn_static = Randomization(actuators={"static": Uniform(0, 2, operation="abs")})
+    check_robot(drawn_static, PANDA)
+    worn = make_actuators(PANDA.dof, coulomb=1.0)
+    prepared = prepared_actuators(drawn_static, worn, PANDA)
+    rows = drawn_static.randomized_actuators(prepared, drawn_static.first(PANDA, 50), PANDA)
+    assert rows.static.min() < 1.0 < rows.static.max()
+    assert rows.coulomb.tolist() == worn.coulomb.tolist()
+    velocity, load = np.zeros((50, PANDA.dof)), np.full((50, PANDA.dof), 0.9)
+    model = friction.Friction(rows.coulomb, None, rows.static)
+    state = friction.init(model, velocity, 0 * load, np.tile(np.eye(PANDA.dof), (50, 1, 1)), 1 / 2000)
+    for _ in range(20):
+        state, total = friction.advance(model, state, load, velocity)
+        assert not total.any(), "below Coulomb's friction no joint moves"
 
 
 def test_it_is_what_its_dict_describes():
