@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -75,17 +75,33 @@ class Dynamics:
             return mass_matrix(self.bodies, qpos)
         return _rowwise(self._model.compute_generalized_mass_matrix, qpos)
 
-    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def joint_mass_matrix(self, qpos: NDArray[Any], added: Mapping[str, Float64] | None = None) -> Float64:
         """Return the mass matrices (n, dof, dof) that the joints show, on a floating base where the robot has one.
 
         There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, those of the base.
+        ``added`` are spatial inertias (n, 6, 6) that links have in addition, by name
+        (:func:`sim.robot.spatial_inertia.spatial_matrix`).
         """
         if self._spec.fixed_base:
-            return self.mass_matrix(qpos)
-        base = len(_BASE)
-        full = scene_dynamics(_on_joints(self._spec)).mass_matrix(np.pad(qpos, ((0, 0), (base, 0))))
+            return self.mass_matrix(qpos) + self._added_mass_matrix(qpos, added or {})
+        base, on_joints = len(_BASE), scene_dynamics(_on_joints(self._spec))
+        placed = np.pad(qpos, ((0, 0), (base, 0)))
+        full = on_joints.mass_matrix(placed) + on_joints._added_mass_matrix(placed, added or {})
         couples = full[:, :base, base:]
         return full[:, base:, base:] - couples.transpose(0, 2, 1) @ np.linalg.solve(full[:, :base, :base], couples)
+
+    def _added_mass_matrix(self, qpos: NDArray[Any], added: Mapping[str, Float64]) -> Float64:
+        """Return the part of mass matrices (n, dof, dof) of spatial inertias S: the sum of J^T S J of their links."""
+        matrices = np.zeros((*qpos.shape, qpos.shape[1]))
+        numbers = {link.name: number for link, number in self._links.items() if link.name in added}
+        if not numbers:
+            return matrices
+        inertias = np.stack([added[name] for name in numbers], axis=1)
+        for row, pose in enumerate(np.asarray(qpos, np.float64)):
+            self._model.compute_full_jacobian(pose)
+            jacobians = np.array([self._model.get_link_jacobian(number, local=True) for number in numbers.values()])
+            matrices[row] = (jacobians.transpose(0, 2, 1) @ inertias[row] @ jacobians).sum(0)
+        return matrices
 
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""

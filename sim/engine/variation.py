@@ -1,4 +1,4 @@
-"""Robots that differ from the model, env by env: payload, masses of links, friction, damping and armature of joints.
+"""Robots that differ from the model, env by env: payload, masses and their centers, friction, damping and armature.
 
 Compensation and mass matrix stay those of the model, because a controller does not know its payload.
 
@@ -18,11 +18,11 @@ from sapien import Pose
 
 from batchpid.friction import Friction
 from sim.engine.building import SceneSpec, center_of_mass, merged, set_inertia
-from sim.engine.dynamics import model_force
+from sim.engine.dynamics import model_force, scene_dynamics
 from sim.engine.pack import Pack
 from sim.robot.merging import place_links
 from sim.robot.mimics import coupling_of
-from sim.robot.spatial_inertia import SpatialInertia, total
+from sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total
 
 Float64 = NDArray[np.float64]
 _NO_MASS = 1e-6
@@ -36,6 +36,9 @@ class Variation(NamedTuple):
     """Mass added at the center of mass of a link (envs,) [kg]."""
     link_mass: Float64 | None = None
     """Mass of each link of the URDF as a share of its own (envs, links); NaN for 1."""
+    center_of_mass: Float64 | None = None
+    """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3 links) [m]: x, y, z of
+    the first link, of the second, ..."""
     friction: Float64 | None = None
     """Coulomb friction of the joints (envs, dof) [N m or N]."""
     damping: Float64 | None = None
@@ -47,7 +50,7 @@ class Variation(NamedTuple):
 class VariedPack(Pack):
     """Pack whose robots differ from the model by ``variation``, one row for each, which :meth:`vary` changes.
 
-    ``carrier`` is the link of the URDF that carries the payload, ``links`` are those of ``variation.link_mass``.
+    ``carrier`` is the link of the URDF that carries the payload, ``links`` are those whose mass or center varies.
     """
 
     def __init__(
@@ -61,9 +64,11 @@ class VariedPack(Pack):
         links: Sequence[str],
     ) -> None:
         self._variation = variation
-        varies_mass = variation.payload is not None or variation.link_mass is not None
-        self._bodies = _bodies(spec, carrier, links if variation.link_mass is not None else []) if varies_mass else {}
-        self._least_share = _least_share(variation)
+        varies_links = variation.link_mass is not None or variation.center_of_mass is not None
+        varies_mass = varies_links or variation.payload is not None
+        self._bodies = _bodies(spec, carrier, links if varies_links else []) if varies_mass else {}
+        self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
+        self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
         self._frames: list[tuple[Pose, Pose] | None] = []
         super().__init__(spec, size, first_env, system_size)
         if variation.armature is not None:
@@ -78,7 +83,6 @@ class VariedPack(Pack):
         for mine, new in zip(self._variation, variation, strict=True):
             if mine is not None:
                 mine[rows] = new
-        self._least_share = _least_share(self._variation)
         for row in rows:
             self._change_masses(self.robots[row], row)
 
@@ -96,8 +100,10 @@ class VariedPack(Pack):
         if not self._bodies:
             return
         for link in robot.links:
-            if (body := self._bodies.get(link.name)) is not None:
-                set_inertia(link, _varied_inertia(body, self._variation, row))
+            if (body := self._bodies.get(name := link.name)) is not None:
+                inertia = _varied_inertia(body, self._variation, row)
+                set_inertia(link, inertia)
+                self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._models[name])
         for joint, frames in zip(robot.joints, self._frames, strict=True):
             if frames is not None:
                 joint.set_pose_in_parent(frames[0])
@@ -113,8 +119,8 @@ class VariedPack(Pack):
         return model if variation.damping is None else model._replace(viscous=variation.damping.copy())
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        """Return a lower bound of the mass matrices that the joints show (M, dof, dof): that of the lightest links."""
-        return super().joint_mass_matrix(qpos) * self._least_share[:, None, None]
+        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
+        return scene_dynamics(self.spec).joint_mass_matrix(qpos, self._added)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the passive force of the model at the measured positions."""
@@ -129,8 +135,10 @@ class _Part(NamedTuple):
 
     inertia: SpatialInertia
     """In the frame of the body."""
+    axes: Float64
+    """Axes of the link's frame in that of the body, as columns (3, 3)."""
     column: int | None
-    """Column of :attr:`Variation.link_mass`; None for a link that does not vary."""
+    """Number among the links that vary; None for a link that does not."""
 
 
 class _Body(NamedTuple):
@@ -146,11 +154,11 @@ def _bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, _B
     parts: dict[str, list[_Part]] = defaultdict(list)
     for name, at in placements.items():
         if name in inertias and inertias[name].mass > 0:
-            inertia = inertias[name].moved(at.position, at.wxyz)
-            parts[at.link].append(_Part(inertia, links.index(name) if name in links else None))
+            inertia, axes = inertias[name].moved(at.position, at.wxyz), rotation_matrix(at.wxyz)
+            parts[at.link].append(_Part(inertia, axes, links.index(name) if name in links else None))
     loaded, place = center_of_mass(spec, carrier)
     if not parts[loaded]:
-        parts[loaded].append(_Part(SpatialInertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)), None))
+        parts[loaded].append(_Part(SpatialInertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)), np.eye(3), None))
     return {
         body: _Body(members, place if body == loaded else None)
         for body, members in parts.items()
@@ -158,20 +166,17 @@ def _bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, _B
     }
 
 
-def _least_share(variation: Variation) -> Float64:
-    """Return a bound b <= 1 (envs,) of the mass matrices: M >= b M of the model, since M is linear in the inertias."""
-    if variation.link_mass is None:
-        return np.ones(1)
-    return np.fmin(np.fmin.reduce(variation.link_mass, axis=1, initial=1.0), 1.0)
-
-
 def _varied_inertia(body: _Body, variation: Variation, row: int) -> SpatialInertia:
     """Return the inertia of a body with its links scaled, and with the payload."""
     parts = []
     for part in body.parts:
-        share = 1.0 if variation.link_mass is None or part.column is None else variation.link_mass[row, part.column]
-        share = 1.0 if np.isnan(share) else share
-        parts.append(SpatialInertia(share * part.inertia.mass, part.inertia.center, share * part.inertia.tensor))
+        (mass, center, tensor), column, share = part.inertia, part.column, 1.0
+        if variation.link_mass is not None and column is not None:
+            share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
+        if variation.center_of_mass is not None and column is not None:
+            displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
+            center = center + part.axes @ np.nan_to_num(displacement)
+        parts.append(SpatialInertia(share * mass, center, share * tensor))
     if body.payload is not None and variation.payload is not None:
         parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
     return total(parts)

@@ -112,8 +112,10 @@ def _check_range(name: str, each: Field, robot: Robot) -> None:
     columns, nominal = elements(name, robot), nominal_values(name, robot)
     strict = name == "link_mass"
     for _, chosen, distribution in parts(name, each, columns):
-        if name == "payload" and distribution.operation == "scale":
+        if name in ("payload", "center_of_mass") and distribution.operation == "scale":
             raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
+        if name == "center_of_mass":
+            continue
         known = nominal[chosen]
         if strict and distribution.operation == "scale":
             known = np.where(np.isnan(known), 1.0, known)  # the engine finds it

@@ -1,4 +1,4 @@
-"""Fields of a randomization: names, the joints or links that they have values for, and nominal values."""
+"""Fields of a randomization: names, the joints, links or axes that they have values for, and nominal values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Float64 = NDArray[np.float64]
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
 
-PHYSICAL = ("payload", "link_mass", "friction", "damping", "armature")
+PHYSICAL = ("payload", "link_mass", "center_of_mass", "friction", "damping", "armature")
 """Fields that change the simulated robot."""
 START = ("qpos", "qvel")
 """Fields that change the state at a reset."""
@@ -26,9 +26,11 @@ GROUPS = ("params", "actuators")
 
 
 def elements(name: str, robot: Robot) -> Sequence[str]:
-    """Return what a field has one value each of: joints, links, or one thing."""
+    """Return what a field has one value each of: joints, links, axes of links, or one thing."""
     if name == "payload":
         return ("payload",)
+    if name == "center_of_mass":
+        return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
     if name == "link_mass":
         return [link.name for link in robot.links if link.mass or (link.mass is None and link.collisions)]
     return robot.joint_names
@@ -39,9 +41,10 @@ def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str,
     if isinstance(each, Distribution):
         yield name, list(range(len(columns))), each
         return
+    owners = [column[:-2] for column in columns] if name == "center_of_mass" else columns
     for element, distribution in each.items():
-        choice(name, element, columns)
-        yield f"{name}.{element}", [columns.index(element)], distribution
+        choice(name, element, list(dict.fromkeys(owners)))
+        yield f"{name}.{element}", [at for at, owner in enumerate(owners) if owner == element], distribution
 
 
 def nominal_values(name: str, robot: Robot) -> Float64:
@@ -49,8 +52,8 @@ def nominal_values(name: str, robot: Robot) -> Float64:
     if name == "link_mass":
         masses = {link.name: link.mass for link in robot.links}
         return np.array([masses[link] for link in elements(name, robot)], np.float64)  # None is NaN
-    known = {"friction": robot.friction, "damping": robot.damping, "payload": np.zeros(1)}
-    return known.get(name, np.zeros(robot.dof))
+    known = {"friction": robot.friction, "damping": robot.damping}
+    return known.get(name, np.zeros(len(elements(name, robot))))
 
 
 def mapping(name: str, value: object) -> Mapping[str, Any]:

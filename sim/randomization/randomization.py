@@ -56,6 +56,8 @@ class Randomization:
     """Link that carries the payload; default the last before the fingers."""
     link_mass: Field | None = None
     """Masses of the links of the URDF [kg]; their inertia tensors change in proportion."""
+    center_of_mass: Field | None = None
+    """Displacement of the centers of mass of the links, along each of the three axes of the link [m]; nominal 0."""
     friction: Field | None = None
     """Coulomb friction of the joints [N m or N]; nominal that of the URDF."""
     damping: Field | None = None

@@ -28,8 +28,27 @@ class SpatialInertia(NamedTuple):
 
         The tensor about the center of mass turns with the axes: I' = R I R^T.
         """
-        matrix = rotate(np.broadcast_to(wxyz, (3, 4)), np.eye(3)).T
+        matrix = rotation_matrix(wxyz)
         return SpatialInertia(self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T)
+
+
+def rotation_matrix(wxyz: Float64) -> Float64:
+    """Return the axes of a frame with this rotation, as columns (3, 3)."""
+    return rotate(np.broadcast_to(wxyz, (3, 4)), np.eye(3)).T
+
+
+def spatial_matrix(inertia: SpatialInertia) -> Float64:
+    """Return the matrix S (6, 6) of the kinetic energy 1/2 (v, w)^T S (v, w), with v the velocity of the origin.
+
+    S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
+    """
+    (x, y, z), mass = inertia.center, inertia.mass
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = mass * np.eye(3)
+    matrix[:3, 3:], matrix[3:, :3] = -mass * cross, mass * cross
+    matrix[3:, 3:] = inertia.tensor - mass * cross @ cross
+    return matrix
 
 
 def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:

@@ -32,6 +32,7 @@ EVERYTHING = Randomization(
     seed=3,
     payload=Uniform(0, 0.5),
     link_mass=Uniform(0.7, 1.3, operation="scale"),
+    center_of_mass=Uniform(-0.01, 0.01),
     friction=Uniform(0, 0.3),
     damping=Uniform(0, 0.2),
     armature=LogUniform(1e-3, 0.05),

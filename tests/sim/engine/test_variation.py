@@ -1,10 +1,14 @@
 """Varied packs: a live robot that changes moves as a fresh one, and has the inertia and weight of its drawn masses."""
 
+import dataclasses
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from robots import load_bundled
 
 from sim.engine.building import SceneSpec
+from sim.engine.dynamics import Dynamics
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
 from sim.engine.variation import Variation, VariedPack
@@ -27,15 +31,16 @@ def random_variation(robot, seed, rows=1):
     return Variation(
         payload=rng.uniform(0, 1, rows),
         link_mass=rng.uniform(0.5, 2, (rows, len(robot.links))),
+        center_of_mass=rng.uniform(-0.02, 0.02, (rows, 3 * len(robot.links))),
         friction=rng.uniform(0, 1, (rows, dof)),
         damping=rng.uniform(0, 1, (rows, dof)),
         armature=rng.uniform(0, 0.1, (rows, dof)),
     )
 
 
-def make(robot, variation, rows=1):
+def make(robot, variation, rows=1, spec=None):
     carrier = "panda_hand" if "panda" in robot.name else "j2s7s300_link_7"
-    return VariedPack(spec_of(robot), rows, 0, rows, variation, carrier, links_of(robot))
+    return VariedPack(spec or spec_of(robot), rows, 0, rows, variation, carrier, links_of(robot))
 
 
 def swing(pack, robot, steps=STEPS, seed=0):
@@ -89,14 +94,44 @@ def test_mass_matrix_and_gravity_are_proportional_to_the_masses(name):
     np.testing.assert_allclose(matrices[1], 2 * matrices[0], rtol=1e-4, atol=2e-6)
 
 
+@pytest.mark.parametrize("fixed_base", [True, False])
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_centers_of_mass_are_displaced_along_the_axes_of_their_links(name, fixed_base):
+    """As those of a robot whose URDF has them there."""
+    robot, rng = load_bundled(name), np.random.default_rng(0)
+    moved = rng.uniform(-0.05, 0.05, (len(robot.links), 3))
+    urdf = ElementTree.fromstring(robot.urdf)
+    for link, displacement in zip(robot.links, moved, strict=True):
+        element = urdf.find(f"link[@name='{link.name}']/inertial")
+        if element is not None:
+            origin = element.find("origin")
+            origin = ElementTree.SubElement(element, "origin", xyz="0 0 0") if origin is None else origin
+            center = np.array(origin.get("xyz", "0 0 0").split(), float) + displacement
+            origin.set("xyz", " ".join(map(repr, center.tolist())))
+    spec = dataclasses.replace(spec_of(robot), fixed_base=fixed_base)
+    edited = Dynamics(dataclasses.replace(spec, urdf=ElementTree.tostring(urdf, encoding="unicode")))
+    pack = make(robot, Variation(center_of_mass=moved.reshape(1, -1)), spec=spec)
+    model, still = pack.robots[0].create_pinocchio_model(), np.zeros((1, robot.dof))
+    for qpos in rng.uniform(robot.lower.clip(-3), robot.upper.clip(None, 3), (5, 1, robot.dof)):
+        np.testing.assert_allclose(pack.joint_mass_matrix(qpos), edited.joint_mass_matrix(qpos), rtol=1e-4, atol=1e-6)
+        weight = model.compute_inverse_dynamics(qpos[0], still[0], still[0])
+        np.testing.assert_allclose(weight, edited.inverse_dynamics(qpos, still, still)[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_the_mass_matrix_is_that_of_the_varied_robot(name):
+    robot, rng = load_bundled(name), np.random.default_rng(0)
+    pack = make(robot, random_variation(robot, 0, 2), 2)
+    pack.vary([1], random_variation(robot, 3))
+    qpos = rng.uniform(robot.lower.clip(-3), robot.upper.clip(None, 3), (2, robot.dof))
+    for each, position, matrix in zip(pack.robots, qpos, pack.joint_mass_matrix(qpos), strict=True):
+        expected = np.array(each.create_pinocchio_model().compute_generalized_mass_matrix(position))
+        np.testing.assert_allclose(matrix, expected, rtol=1e-5, atol=1e-6)
+
+
 def test_the_controller_compensates_the_model(panda):
     """A robot with twice the mass sinks under the efforts that hold the model."""
     heavy, plain = make(panda, Variation(link_mass=np.full((1, len(panda.links)), 2.0))), Pack(spec_of(panda), 1)
     for pack in (heavy, plain):
         pack.write_state([0], panda.start[None], np.zeros((1, panda.dof)))
     np.testing.assert_allclose(heavy.passive_force(True, True), plain.passive_force(True, True), atol=1e-4)
-    assert (heavy.joint_mass_matrix(panda.start[None]) == plain.joint_mass_matrix(panda.start[None])).all()
-    light = make(panda, Variation(link_mass=np.linspace(0.25, 3, len(panda.links))[None]))
-    np.testing.assert_allclose(
-        light.joint_mass_matrix(panda.start[None]), 0.25 * plain.joint_mass_matrix(panda.start[None])
-    )

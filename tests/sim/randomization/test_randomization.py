@@ -13,11 +13,13 @@ from batchpid.actuators import presets
 from batchpid.errors import InvalidArgumentError
 from sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
+from sim.randomization.fields import elements
 
 PANDA = load_bundled("panda")
 FIELDS = {
     "payload": Uniform(0, 2),
     "link_mass": Uniform(0.8, 1.2, operation="scale"),
+    "center_of_mass": Uniform(-0.01, 0.01),
     "friction": {"panda_joint1": LogUniform(0.1, 1.0), "panda_joint4": Normal(0.5, 0.1, low=0.0)},
     "armature": Choice([0.0, 0.1], shared=True),
     "qpos": Uniform(-0.1, 0.1),
@@ -128,6 +130,18 @@ def test_draws_are_applied_by_their_operation():
     assert not qvel.any()
 
 
+def test_centers_of_mass_are_drawn_along_three_axes():
+    """For all links, or those that are named."""
+    one = Randomization(center_of_mass={"panda_link7": Uniform(-0.01, 0.01)})
+    check_robot(one, PANDA)
+    columns, rows = elements("center_of_mass", PANDA), drawn(one, [(env, 0) for env in range(9)])["center_of_mass"]
+    named = [columns[at] for at in np.flatnonzero(~np.isnan(rows).all(0))]
+    assert named == ["panda_link7.x", "panda_link7.y", "panda_link7.z"]
+    assert len(np.unique(rows[:, ~np.isnan(rows).all(0)])) == 27
+    everywhere = drawn(Randomization(center_of_mass=Uniform(-0.01, 0.01)), [(0, 0)])["center_of_mass"]
+    assert everywhere.shape == (1, 3 * len(elements("link_mass", PANDA)))
+
+
 def test_delays_are_drawn_as_by_a_delayed_pd_actuator():
     """Whole steps between both ends, one for all joints of an env, drawn again for each episode."""
     least, most, step = 2, 5, 1 / 2000
@@ -176,6 +190,9 @@ def test_it_is_what_its_dict_describes():
         ({"payload": Uniform(0, 1), "payload_link": "wheel"}, "payload_link: unknown option"),
         ({"link_mass": Normal(1, 0.1, operation="scale")}, r"link_mass: of .* must be > 0.*low="),
         ({"link_mass": {"wheel": Uniform(0, 1)}}, "link_mass: unknown option"),
+        ({"center_of_mass": {"wheel": Uniform(0, 1)}}, "center_of_mass: unknown option"),
+        ({"center_of_mass": {"panda_link7.x": Uniform(0, 1)}}, "center_of_mass: unknown option"),
+        ({"center_of_mass": Uniform(0, 1, operation="scale")}, "center_of_mass: is 0, which cannot be scaled"),
         ({"friction": {"panda_joint9": Uniform(0, 1)}}, "friction: unknown option"),
         ({"damping": Uniform(-0.1, 0.1)}, "damping: of 'panda_joint1' may become -0.097"),
         ({"qpos": {"panda_joint9": Uniform(0, 1)}}, "qpos: unknown option"),
