@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from law_cases import ENVS, JOINTS, OPTIONS, Backend, Inputs, read_only
+from quick_jit import quick_jit
 
 import batchpid as bp
 
@@ -31,7 +32,8 @@ def backend(request: pytest.FixtureRequest) -> Backend:
         return Backend(request.param, dtype, lambda value: read_only(value, dtype), bp.step)
     if dtype == np.float64:
         request.getfixturevalue("x64")
-    step = jax.jit(bp.step, static_argnames=("dt", "terms"))
+    # One of the two as JAX compiles it by default.
+    step = (jax.jit if dtype == np.float64 else quick_jit)(bp.step, static_argnames=("dt", "terms"))
 
     def strict_step(*args: Any, **keywords: Any) -> Any:
         with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):

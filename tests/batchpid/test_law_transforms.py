@@ -1,12 +1,14 @@
-"""The law under every JAX transform, over every option."""
+"""The law under every JAX transform, over every option.
 
-import functools
+test_law_oracle.py compares the law as JAX compiles it by default with NumPy's.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from law_cases import DT, ENVS, JOINTS
+from law_cases import DT, ENVS, JOINTS, OPTIONS
+from quick_jit import quick_jit
 
 import batchpid as bp
 
@@ -39,44 +41,33 @@ def rollout(params, setpoint, measurement):
     return jax.lax.scan(body, bp.init(params, measurement[0]), (setpoint, measurement))[1]
 
 
-def test_jit_scan_vmap_and_grad_over_every_option(options, inputs, dtype):
+def numpy_rollout(params, setpoint, measurement):
+    """Return the efforts of :func:`rollout`, step by step in NumPy."""
+    state, efforts = bp.init(params, measurement[0]), []
+    for r, y in zip(setpoint, measurement, strict=True):
+        state, effort = bp.step(params, state, r, y, DT)
+        efforts.append(effort)
+    return np.array(efforts)
+
+
+def test_jit_compiles_once_over_every_option(options, inputs, dtype):
     params = on_jax(bp.make_params(JOINTS, **options, dtype=dtype), dtype)
     r, y = (jnp.asarray(x, dtype) for x in (inputs.setpoint, inputs.measurement))
-    tolerance = {"rtol": 1e-12, "atol": 1e-11} if dtype == np.float64 else {"rtol": 1e-4, "atol": 3e-4}
-
-    # jit, without recompilation
     traces = []
 
-    @jax.jit
+    @quick_jit
     def step(params, state, r, y):
         traces.append(None)
         return bp.step(params, state, r, y, DT)
 
-    state, efforts = bp.init(params, y[0]), []
+    state, effort = bp.init(params, y[0]), None
     structure = jax.tree.structure(state)
-    for t in range(len(r)):
-        changed = params._replace(kp=params.kp * (1 + t)) if t == 29 else params
+    for t in range(5):
+        changed = params._replace(kp=params.kp * (1 + t)) if t == 3 else params
         state, effort = step(changed, state, r[t], y[t])
-        efforts.append(effort)
     assert len(traces) == 1
     assert jax.tree.structure(state) == structure
     assert all(leaf.shape == (ENVS, JOINTS) and leaf.dtype == dtype for leaf in (*jax.tree.leaves(state), effort))
-
-    # scan, vmap over the gains, and grad with respect to every leaf; that of the gains is compared below
-    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in 2/3 of the time
-    def run(candidates):
-        def total(candidates):
-            efforts = jax.vmap(rollout, (0, None, None))(candidates, r, y)
-            return jnp.sum(efforts), efforts
-
-        return jax.grad(total, has_aux=True)(candidates)
-
-    gradients, many = run(jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, leaf]), params))
-    np.testing.assert_allclose(many[0, :29], jnp.stack(efforts)[:29], **tolerance)
-    np.testing.assert_allclose(many[2], many[0], **tolerance)
-    assert not np.allclose(many[1], many[0])
-    assert jax.tree.structure(gradients) == jax.tree.structure(params)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
     # pytree round trip
     leaves, tree = jax.tree.flatten(params)
@@ -85,27 +76,59 @@ def test_jit_scan_vmap_and_grad_over_every_option(options, inputs, dtype):
     assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
 
 
+def test_scan_vmap_and_grad_over_every_option(options, inputs, x64):
+    check_scan_vmap_and_grad(options, inputs, np.float64, {"rtol": 1e-12, "atol": 1e-11})
+
+
+def test_scan_vmap_and_grad_in_float32(inputs):
+    check_scan_vmap_and_grad(OPTIONS["everything"], inputs, np.float32, {"rtol": 1e-4, "atol": 3e-4})
+
+
+def check_scan_vmap_and_grad(options, inputs, dtype, tolerance):
+    """Scan over time, vmap over the gains, and grad with respect to every leaf; that of the gains is compared below."""
+    numpy_params = bp.make_params(JOINTS, **options, dtype=dtype)
+    params, inputs = on_jax(numpy_params, dtype), [x.astype(dtype) for x in (inputs.setpoint, inputs.measurement)]
+    r, y = map(jnp.asarray, inputs)
+
+    @quick_jit
+    def run(candidates):
+        def total(candidates):
+            efforts = jax.vmap(rollout, (0, None, None))(candidates, r, y)
+            return jnp.sum(efforts), efforts
+
+        return jax.grad(total, has_aux=True)(candidates)
+
+    gradients, many = run(jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, leaf]), params))
+    np.testing.assert_allclose(many[0], numpy_rollout(numpy_params, *inputs), **tolerance)
+    np.testing.assert_allclose(many[2], many[0], **tolerance)
+    assert not np.allclose(many[1], many[0])
+    assert jax.tree.structure(gradients) == jax.tree.structure(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
 def test_gradients_equal_finite_differences(options, inputs, x64):
-    """Away from saturation: the made-up run is scaled down, so that no limit but the rate's is near."""
+    """Those of the law in NumPy. Away from saturation: the made-up run is scaled down, so that no limit is near."""
     options.pop("effort_rate_limit", None)
-    params = on_jax(bp.make_params(JOINTS, **options), np.float64)
+    params = bp.make_params(JOINTS, **options)
     if params.effort_min is not None:
         params = params._replace(effort_min=100 * params.effort_min, effort_max=100 * params.effort_max)
     if params.deadband is not None:
         params = params._replace(deadband=1e-3 * params.deadband)
-    r, y = (jnp.asarray(x) * 1e-3 for x in (inputs.setpoint, inputs.measurement))
-    weights = jnp.asarray(inputs.feedforward)
+    run, weights = [x * 1e-3 for x in (inputs.setpoint, inputs.measurement)], inputs.feedforward
     gains = {name: getattr(params, name) for name in GAINS if getattr(params, name) is not None}
 
-    def loss(gains):
-        return jnp.sum(weights * rollout(params._replace(**gains), r, y))
+    @quick_jit
+    @jax.grad
+    def gradient_of(gains):
+        return jnp.sum(weights * rollout(on_jax(params, np.float64)._replace(**gains), *map(jnp.asarray, run)))
 
-    gradient, h = jax.jit(jax.grad(loss))(gains), 1e-4
-    shifts = {name: jax.random.normal(jax.random.key(n), value.shape) for n, (name, value) in enumerate(gains.items())}
-    loss = jax.jit(loss)
+    gradient, h, rng = gradient_of(on_jax(gains, np.float64)), 1e-4, np.random.default_rng(0)
     for name, value in gains.items():
-        up, down = (loss(gains | {name: value + s * h * shifts[name]}) for s in (1, -1))
-        slope = jnp.sum(gradient[name] * shifts[name])
+        shift = rng.normal(size=value.shape)
+        up, down = (
+            np.sum(weights * numpy_rollout(params._replace(**{name: value + s * h * shift}), *run)) for s in (1, -1)
+        )
+        slope = np.sum(gradient[name] * shift)
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-6, atol=1e-9)
         assert slope != 0
 
@@ -116,14 +139,14 @@ def test_gradients_survive_times_of_zero(zero, inputs, x64):
     strategy = {"anti_windup": "back_calculation"} if zero == "tracking_time" else {}
     params = on_jax(bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy), np.float64)
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
-    gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
+    gradients = quick_jit(jax.grad(lambda params: jnp.sum(rollout(params, r, y))))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
 def test_gradients_survive_non_finite_inputs(inputs, x64):
     params = on_jax(bp.make_params(JOINTS, 40.0, 5.0, 2.0, non_finite="zero"), np.float64)
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement).at[3, 0, 0].set(jnp.nan)
-    gradients = jax.grad(lambda params: jnp.sum(rollout(params, r, y)))(params)
+    gradients = quick_jit(jax.grad(lambda params: jnp.sum(rollout(params, r, y))))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
@@ -155,21 +178,21 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, in
         base = base if strategy["anti_windup"] != "back_calculation" else bp.make_params(JOINTS, kp, **options)
     slope = jax.grad(cost)(kp)
     assert (slope != 0).all()
-    np.testing.assert_allclose(jax.jit(jax.grad(cost))(kp), slope, rtol=1e-9)
-    np.testing.assert_allclose(jax.vmap(jax.grad(cost))(jnp.stack([kp, kp]))[1], slope, rtol=1e-9)
+    np.testing.assert_allclose(quick_jit(jax.grad(cost))(kp), slope, rtol=1e-9)
+    np.testing.assert_allclose(quick_jit(jax.vmap(jax.grad(cost)))(jnp.stack([kp, kp]))[1], slope, rtol=1e-9)
     assert jax.vmap(built)(jnp.stack([kp, 2 * kp])).kp.tolist() == [[kp.tolist()], [(2 * kp).tolist()]]
     if strategy["anti_windup"] != "back_calculation" or build == "replace":
-        np.testing.assert_allclose(slope, jax.grad(cost_of_leaf)(kp), rtol=1e-9)
+        np.testing.assert_allclose(slope, quick_jit(jax.grad(cost_of_leaf))(kp), rtol=1e-9)
     else:
-        step = 1e-5 * jnp.array([0.3, -0.7, 0.2])
-        np.testing.assert_allclose(slope @ step, (cost(kp + step) - cost(kp - step)) / 2, rtol=1e-5)
+        step, compiled = 1e-5 * jnp.array([0.3, -0.7, 0.2]), quick_jit(cost)
+        np.testing.assert_allclose(slope @ step, (compiled(kp + step) - compiled(kp - step)) / 2, rtol=1e-5)
 
 
 def test_params_whose_leaves_are_all_traced_can_be_changed(options, dtype):
     """The arguments of a compiled function: replace gives what it gives outside."""
     params = bp.make_params(JOINTS, **options, dtype=dtype)
     expected = params.replace(kp=2.0, effort_limit=3.0)
-    changed = jax.jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(params, jnp.asarray(2.0, dtype))
+    changed = quick_jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(params, jnp.asarray(2.0, dtype))
     assert [type(leaf) for leaf in changed if isinstance(leaf, tuple)] == [
         type(leaf) for leaf in expected if isinstance(leaf, tuple)
     ]
