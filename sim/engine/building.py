@@ -11,19 +11,23 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import sapien.wrapper.urdf_loader  # noqa: F401 - its packages suppress a Ctrl-C while they are imported: not amid a run
 from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
 from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
+from sim.engine.lazy_module import imported_lazily
 from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
 from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
+
+with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fifths of the start of a worker
+    # Its packages suppress a Ctrl-C while they are imported: not amid a run.
+    import sapien.wrapper.urdf_loader  # noqa: F401
 
 
 @dataclass(frozen=True)

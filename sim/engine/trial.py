@@ -1,8 +1,7 @@
 """Trials: calls into SAPIEN that might end the process, made in a child process first.
 
-A server process imports SAPIEN once and forks for each trial, in milliseconds instead of half a second. It has one
-thread, so that a fork is safe, as it is not in the caller's process. It ends after some idle seconds, and with the
-caller.
+A server process imports SAPIEN once and forks for each trial, in milliseconds instead of 0.3 s. It has one thread, so
+that a fork is safe, as it is not in the caller's process. It ends after some idle seconds, and with the caller.
 """
 
 from __future__ import annotations

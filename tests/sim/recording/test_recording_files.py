@@ -407,7 +407,7 @@ def flips(content, count, seed):
 
 
 def test_a_file_with_a_flipped_bit_is_refused_or_equal(small_file):
-    count = 200 if small_file.suffix == ".npz" else 20  # a process reads each .h5 file
+    count = 200 if small_file.suffix == ".npz" else 10  # a process reads each .h5 file
     assert 0 < assert_refused_or_equal(small_file, flips(small_file.read_bytes(), count, 0)) < count
 
 
@@ -418,8 +418,9 @@ def test_a_file_with_any_of_many_flipped_bits_is_refused_or_equal(small_file):
 
 def test_a_truncated_file_is_refused_or_equal(small_file):
     content = small_file.read_bytes()
-    lengths = [0, 1, 7, 48, 200, *np.linspace(1000, len(content) - 1, 15).astype(int)]
-    assert assert_refused_or_equal(small_file, (content[:length] for length in lengths)) > 10
+    some = 15 if small_file.suffix == ".npz" else 6
+    lengths = [0, 1, 48, 200, *np.linspace(1000, len(content) - 1, some).astype(int)]
+    assert assert_refused_or_equal(small_file, (content[:length] for length in lengths)) > len(lengths) // 2
 
 
 @pytest.mark.parametrize("path", [".", "", "/", "..", "a" * 5000, "/dev/null", "run.h5/more"])
