@@ -2,17 +2,20 @@
 
 The cost of a candidate is the mean over joints, taken as the mean over moves plus the worst move, of::
 
-    w_itae ITAE / (A 1 s^2) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %)
-        + w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) + w_final log(1 + E / 1e-3)
-        + w_chatter max(TV / TV_smooth - 1, 0) + w_saturation S
+    w_itae log(1 + ITAE / (A 1 s^2)) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %) + w_final log(1 + E / 1e-3)
+        + w_chatter log(1 + max(TV / TV_smooth - 1, 0)) + w_saturation S
 
-Ts counts as 1.5 times the run at most; Tmax is the settling time asked for. A is the joint's move, or the smallest that
-counts as one; O the overshoot as a fraction of that; E the error left at the end; TV the total variation of the effort
-and TV_smooth that of the smooth motion that takes a second; S the share of time in saturation.
+and of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) of the arm's joint that settles last, the mean over moves. Where
+robots are drawn, one of them may be out of reach, and the mean over moves counts twice in place of the worst. Ts counts
+as 1.5 times the run at most; Tmax is the settling time asked for. A is the joint's move, or the smallest that counts as
+one; O the overshoot as a fraction of that; E the error left at the end; TV the total variation of the effort and
+TV_smooth that of the smooth motion that takes a second; S the share of time in saturation. Logarithms keep one move or
+joint out of reach from deciding alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +25,7 @@ import batchpid as bp
 from batchpid.stability import stability_bound
 from sim.robot.robot import Robot
 from sim.runner import Runner
-from sim.tuning.evaluation import absolute_band, run_moves, settling_limits
+from sim.tuning.evaluation import absolute_band, arm_joints, run_moves, settling_limits
 from sim.tuning.moves import Moves, smooth_variation
 from sim.tuning.weights import Weights
 
@@ -48,7 +51,10 @@ DIVERGED_COST = 1e3
 
 
 class Candidates:
-    """Candidates of a search as points in log space: their params, and the costs of their rollouts on ``moves``."""
+    """Candidates of a search as points in log space: their params, and the costs of their rollouts on ``moves``.
+
+    ``varied`` says that the robots of the moves are drawn: the cost is twice the mean over moves, without the worst.
+    """
 
     def __init__(
         self,
@@ -58,15 +64,18 @@ class Candidates:
         moves: Moves,
         seconds: float,
         weights: Weights,
+        *,
         headroom: float = HEADROOM,
+        varied: bool = False,
     ) -> None:
         self.robot, self.moves, self.seconds, self.weights, self.headroom = robot, moves, seconds, weights, headroom
+        self.varied = varied
         self.designed = robot.designed(gain_units)
         joints = int(robot.independent.sum())
         self.dimension = len(FACTORS) + (joints if per_joint else 0)
         self._band = absolute_band(robot)
         self._smooth = smooth_variation(robot, moves, 1.0)
-        self._limit = settling_limits(robot, moves)[:, None]
+        self._limit = settling_limits(robot, moves)
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
         # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
         if gain_units == "mass_matrix":
@@ -77,6 +86,19 @@ class Candidates:
                 self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
         inertia = gain_units == "inertia"
         self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
+
+    def points(self, gains: Sequence[Float64]) -> Float64:
+        """Return the points (n, dimension) of ``gains``: (ki, kp, kd) each, per unit of inertia.
+
+        The designed gains per mass matrix are such gains; in other units the same factors are taken.
+        """
+        designed = self.robot.designed()
+        known = [np.median(leaf[..., self.robot.independent]) for leaf in (designed.ki, designed.kp, designed.kd)]
+        ki, kp, kd = (np.array(gains) / known).T
+        bandwidth = np.cbrt(ki)
+        points = np.zeros((len(gains), self.dimension))
+        points[:, :3] = np.log(np.stack([bandwidth, kp / bandwidth**2, kd / bandwidth], 1))
+        return points
 
     def params(self, points: Float64) -> bp.PIDParams:
         """Return params with one row for each of ``points`` (n, dimension)."""
@@ -109,16 +131,18 @@ class Candidates:
 
         settling = np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
         cost = (
-            w.itae * bounded(m.itae) / self._size
+            w.itae * np.log1p(bounded(m.itae) / self._size)
             + w.settling * settling
             + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
-            + w.late * np.log1p(np.maximum(settling / self._limit - 1, 0) / 0.05)
             + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
-            + w.chatter * np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0)
+            + w.chatter * np.log1p(np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0))
             + w.saturation * bounded(m.saturation_share)
         )[..., self.robot.independent].mean(2)
+        late = np.maximum(settling[..., arm_joints(self.robot)].max(2) / self._limit - 1, 0)
         lasted = rollout.ok.mean(0).reshape(count, -1)
-        total = np.minimum(cost.mean(1) + cost.max(1), DIVERGED_COST)
+        other = cost.mean(1) if self.varied else cost.max(1)
+        total = cost.mean(1) + other + w.late * np.log1p(late / 0.05).mean(1)
+        total = np.minimum(total, DIVERGED_COST)
         total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
         return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
 

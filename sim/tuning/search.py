@@ -5,6 +5,9 @@ have no collision shapes in the search. A share of the effort limits is reserved
 searched; :mod:`sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
 evolution strategy: a tutorial", arXiv:1604.00772).
 
+Gains for robots that differ from the model, by actuators or a randomization, lie farther from the designed ones. There
+the first generation are the designs of :mod:`sim.tuning.first_candidates`, and CMA-ES starts from the best of them.
+
 The best of the candidates and the designed gains then run a final on more moves, with collisions, under the caller's
 solver, at the full effort limits. The cheapest there is the result: what suits the few moves of the search need not
 suit others.
@@ -33,23 +36,23 @@ from batchpid.validate import integer, number
 from batchpid.versions import package_versions
 from sim.cluster import Ray
 from sim.loop.contact_log import MissedContactWarning
+from sim.options import RunnerOptions
 from sim.randomization.randomization import Randomization
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.robot import Robot
 from sim.runner import Runner
 from sim.tuning.candidates import HEADROOM, Candidates
 from sim.tuning.evaluation import SUBSTEPS
-from sim.tuning.moves import Moves, random_moves, search_moves
+from sim.tuning.first_candidates import first_gains, loop_delay
+from sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from sim.tuning.randomization import reseeded
 from sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
-VARIED_MOVES, VARIED_SPREAD = 12, 0.3
-"""Random moves, and first standard deviation, for robots that differ from the model: their gains lie farther away."""
-VARIED_STARTS = ((0.35, 0, 0), (0.55, 0.2, 0.25), (0.65, 0.2, 0.25), (0.7, 0, 0), (0.9, 0, 0), (1.0, 0.2, 0.25))
-"""Logarithms of bandwidth, stiffness and damping factors among the first candidates for such robots."""
+VARIED_MOVES = 20
+"""Random moves of the search for robots that differ from the model."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Candidates of the final, besides the designed gains, and its moves."""
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
@@ -110,9 +113,9 @@ def tune(
         Of the terms of the cost.
     moves
         Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Robots with
-        actuators or a randomization are searched on VARIED_MOVES random ones: the hardest of those that the effort
-        limits allow the model ask too much of them, and would decide alone. Moves that are
-        given are the final as well, and are searched on with the physics of the final, since they may touch something.
+        actuators or a randomization are searched on the tutorial's and VARIED_MOVES random ones: the hardest of those
+        that the effort limits allow the model ask too much of them. Moves that are given are the final as well, and are
+        searched on with the physics of the final, since they may touch something.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     workers, cluster
@@ -146,7 +149,8 @@ def tune(
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     is_varied = randomization is not None or robot.actuators is not None
     if moves is None:
-        moves = random_moves(robot, VARIED_MOVES, seed) if is_varied else search_moves(robot, seed)
+        sample = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed) if is_varied else None
+        moves = search_moves(robot, seed) if sample is None else sample
     count = len(moves.start)
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # One iteration is enough where the loop computes friction, and not the solver.
@@ -168,10 +172,20 @@ def tune(
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
     record = _History(history, settings)
-    search = Candidates(robot, gain_units, per_joint, moves, seconds, weights)
-    spread = VARIED_SPREAD if is_varied else INITIAL_SPREAD
-    optimizer = CMA(mean=np.zeros(search.dimension), sigma=spread, seed=seed, population_size=population)
+    search = Candidates(
+        robot, gain_units, per_joint, moves, seconds, weights, headroom=1.0 if is_varied else HEADROOM, varied=is_varied
+    )
+
+    def optimizer_at(mean: Float64) -> CMA:
+        return CMA(mean=mean, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+
+    optimizer = optimizer_at(np.zeros(search.dimension))
     start = search.params(np.zeros((1, search.dimension)))
+    firsts = [np.zeros(search.dimension)]  # the designed gains are a candidate too
+    if is_varied:
+        dt = float(runner_options.get("timestep", RunnerOptions.timestep))
+        delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)))
+        firsts += [*search.points(first_gains(delay))][: population - 1]
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     points: list[Float64] = []
@@ -183,12 +197,13 @@ def tune(
         for generation in bar:
             points += [optimizer.ask() for _ in range(population)]
             if generation == 0:
-                points[0] = np.zeros(search.dimension)  # the designed gains are a candidate too
-                for index, factors in enumerate(VARIED_STARTS[: population - 1] if is_varied else (), start=1):
-                    points[index] = np.pad(np.array(factors), (0, search.dimension - len(factors)))
+                points[: len(firsts)] = firsts
             if generation == len(record.costs):
                 record.append(search.costs(runner, np.array(points[-population:])))
-            optimizer.tell(list(zip(points[-population:], record.costs[generation], strict=True)))
+            if generation == 0 and is_varied:
+                optimizer = optimizer_at(points[int(np.argmin(record.costs[0]))])
+            else:
+                optimizer.tell(list(zip(points[-population:], record.costs[generation], strict=True)))
             costs = record.costs[: generation + 1]
             if hasattr(bar, "set_postfix"):
                 bar.set_postfix(cost=f"{np.min(costs):.4f}", designed=f"{costs[0][0]:.4f}")
@@ -199,7 +214,7 @@ def tune(
     if final is not None and best:
         ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS] if index]
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
-        judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0)
+        judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
         with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
             best = finalists[int(np.argmin(judge.costs(runner, np.array(points)[finalists])))]

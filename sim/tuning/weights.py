@@ -17,12 +17,12 @@ class Weights:
     """Weight of the settling time [1/s]."""
     overshoot: float = 1.0
     """Weight of log(1 + overshoot / 5 %): one move out of reach must not outweigh all others."""
-    late: float = 0.0
-    """Weight of log(1 + excess of the settling time over that asked for / 5 %): 4 where moves are to be in time."""
+    late: float = 4.0
+    """Weight of log(1 + excess of the settling time over that asked for / 5 %), of a move's last joint."""
     final: float = 2.0
     """Weight of log(1 + final error / least half width of the settling band)."""
     chatter: float = 0.3
-    """Weight of the effort's variation beyond that of the smooth move."""
+    """Weight of log(effort's variation / that of the smooth move), where it is more."""
     saturation: float = 3.0
     """Weight of the share of time in saturation."""
 

@@ -7,11 +7,17 @@ import json
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
 from sim import Randomization, Runner, Uniform
+from sim.cli.run import evaluate_sets
+from sim.tuning.evaluation import arm_joints
+from sim.tuning.first_candidates import first_gains
+from sim.tuning.gain_sets import GainSet
 from sim.tuning.moves import random_moves
+from sim.tuning.randomization import ENCODER, load_randomization
 from sim.tuning.search import tune
 from sim.tuning.weights import Weights
 
@@ -104,6 +110,40 @@ def test_randomization_and_actuators_make_another_search(panda):
     )
     assert len({plain.history, varied.history, late.history}) == 3
     assert varied.settings["randomization"] == drawn.to_dict()
+
+
+def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
+    options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}
+    found = tune(late, generations=1, **options)
+    own = 1 / 2000 + float(np.max(found.start_params.derivative_filter_time))
+    designs = [*first_gains(0.003 + own)[:3]]
+    gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
+    assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
+
+
+def test_search_of_robots_that_differ_resumes_as_if_it_had_not_been_stopped(panda, tmp_path):
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
+    options = {"population": 4, "seconds": 0.2, "moves": random_moves(panda, 1, 0), "workers": 0}
+    whole = tune(late, generations=3, **options)
+    tune(late, generations=2, history=tmp_path / "search.json", **options)
+    resumed = tune(late, generations=3, history=tmp_path / "search.json", **options)
+    assert resumed.history == whole.history
+    assert resumed.params.kp.tobytes() == whole.params.kp.tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least"), [("panda", 19), ("jaco2", 17)])
+def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(name, least):
+    robot = load_bundled(name)
+    robot = dataclasses.replace(
+        robot, actuators=make_actuators(robot.dof, command_delay=0.005, position_resolution=ENCODER)
+    )
+    payload = load_randomization("payload", robot)
+    found = tune(robot, generations=1, randomization=payload)
+    (judged,) = evaluate_sets(robot, [GainSet("tuned", found.params)], moves=20, seed=0, randomization=payload)
+    late = judged.demands(arm_joints(robot))["settling time"].max(1) > 1
+    assert len(late) - late.sum() >= least
 
 
 def test_time_limit_ends_the_search_after_a_generation(panda):
