@@ -74,11 +74,13 @@ def test_all_effects(benchmark):
 
     def run():
         for _ in range(STEPS):
-            measured, _ = actuators.measure(qpos, qvel)
+            measured, rate = actuators.measure(qpos, qvel)
+            limits = actuators.limits(measured, rate)
             delivered = actuators.deliver(effort, qpos, qvel)
-        return measured, delivered
+        return measured, delivered, limits
 
-    measured, delivered = benchmark(run)
+    measured, delivered, (_, most) = benchmark(run)
+    assert (most < 70.0).all(), "the effort limit over the strength"
     assert not np.array_equal(measured, qpos)
     assert not np.array_equal(delivered, effort)
     if benchmark.stats is not None:

@@ -27,11 +27,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.actuators import delay, noise
-from batchpid.actuators.envelope import Envelope, envelope, limits
+from batchpid.actuators.envelope import Envelope, command_envelope, envelope, limits
 from batchpid.actuators.model import Actuators
 from batchpid.actuators.state import ActuatorState
 from batchpid.display import array_summary
-from batchpid.elementwise import TURN, clip, namespace, tiny_of, wrap
+from batchpid.elementwise import TURN, clip, namespace, wrap
 
 _ONE = np.uint32(1)
 
@@ -42,11 +42,11 @@ class Coefficients(NamedTuple):
     command: delay.Delay | None = None
     sensor: delay.Delay | None = None
     envelope: Any = Envelope()
+    commands: Any = Envelope()
+    """Envelope of the commands that the motor delivers unclipped."""
     intake: Any = None
     """1 - exp(-dt / T)."""
     strength: Any = None
-    divisor: Any = None
-    """s, where that is 0 a tiny number."""
     bias: Any = None
     play: Any = None
     """B / 2."""
@@ -60,7 +60,7 @@ class Coefficients(NamedTuple):
     """The same for positions and velocities (1 | envs, 2 joints)."""
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(command=None, sensor=None, envelope=None), "envs", "joints")
+        return array_summary(self._replace(command=None, sensor=None, envelope=None, commands=None), "envs", "joints")
 
 
 def init(
@@ -127,9 +127,9 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
         sensor=None if a.sensor_delay is None else delay.discretise(_twice(a.sensor_delay, xp), dt, state.sensor),
         envelope=envelope(a),
+        commands=command_envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
         strength=a.strength,
-        divisor=None if a.strength is None else xp.maximum(a.strength, tiny_of(a.strength.dtype)),
         bias=a.bias,
         play=None if a.backlash is None else 0.5 * a.backlash,
         position_resolution=_step(a.position_resolution, xp),
@@ -148,7 +148,8 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
-    return k._replace(**flat, envelope=Envelope(*map(spread, k.envelope)))
+    ends, commands = (Envelope(*map(spread, each)) for each in (k.envelope, k.commands))
+    return k._replace(**flat, envelope=ends, commands=commands)
 
 
 def deliver(
@@ -194,12 +195,7 @@ def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
     difference from the effort asked for they would leak into the integral. None is no limit.
     """
-    low, high = limits(k.envelope, qpos, qvel)
-    if high is None:
-        return None, None
-    if k.bias is not None:
-        low, high = low - k.bias, high - k.bias
-    return (low, high) if k.divisor is None else (low / k.divisor, high / k.divisor)
+    return limits(k.commands, qpos, qvel)
 
 
 def advance_measurement(

@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.actuators.model import Actuators
-from batchpid.elementwise import clip, namespace
+from batchpid.elementwise import clip, namespace, tiny_of
 
 
 class Envelope(NamedTuple):
@@ -34,8 +34,12 @@ class Envelope(NamedTuple):
     """S / v0."""
     limit: Any = None
     """L."""
+    least: Any = None
+    """-L."""
     offset: Any = None
     """Part of L(q) that is the same at every q (1 | envs, joints)."""
+    least_offset: Any = None
+    """That of -L(q)."""
     left: Any = None
     """x_k (segments, 1 | envs, joints)."""
     right: Any = None
@@ -45,33 +49,53 @@ class Envelope(NamedTuple):
 
 
 def envelope(actuators: Actuators) -> Envelope:
-    """Return the envelope of ``actuators``."""
+    """Return the envelope of the efforts that the motors of ``actuators`` deliver."""
     xp = namespace(*actuators)
     stall, points, efforts = actuators.saturation_effort, actuators.limit_positions, actuators.limit_efforts
-    slope = None
+    k = Envelope(limit=actuators.effort_limit)
+    if k.limit is not None:
+        k = k._replace(least=-k.limit)
     if stall is not None:
         finite = xp.isfinite(stall)
         slope = xp.where(finite, xp.where(finite, stall, 0.0) / actuators.no_load_speed, 0.0)
+        k = k._replace(stall=stall, reverse=-stall, slope=slope)
     if points is None:
-        return Envelope(stall, None if stall is None else -stall, slope, actuators.effort_limit)
+        return k
     points, efforts = (xp.moveaxis(table, 2, 0) for table in (points, efforts))
     width, finite = points[1:] - points[:-1], xp.isfinite(efforts[1:])
     rise = xp.where(finite, efforts[1:], 0.0) - xp.where(finite, efforts[:-1], 0.0)
     rise = xp.where(width > 0, rise / xp.where(width > 0, width, 1.0), 0.0)
-    reverse = None if stall is None else -stall
     offset = efforts[0] - (rise * points[:-1]).sum(0)
-    return Envelope(stall, reverse, slope, actuators.effort_limit, offset, points[:-1], points[1:], rise)
+    return k._replace(offset=offset, least_offset=-offset, left=points[:-1], right=points[1:], rise=rise)
+
+
+def command_envelope(actuators: Actuators) -> Envelope:
+    """Return the envelope of the commands u of motors that deliver s u + b: each end e of the other's is (e - b) / s.
+
+    Where s = 0 it is wide: no command matters.
+    """
+    k, strength, bias = envelope(actuators), actuators.strength, actuators.bias
+    if strength is None and bias is None:
+        return k
+    divisor = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))
+    shift = 0.0 if bias is None else bias
+    ends = {name: getattr(k, name) for name in ("stall", "reverse", "limit", "least", "offset", "least_offset")}
+    ends = {name: (end - shift) / divisor for name, end in ends.items() if end is not None}
+    rates = {name: getattr(k, name) for name in ("slope", "rise")}
+    return k._replace(**ends, **{name: rate / divisor for name, rate in rates.items() if rate is not None})
 
 
 def limits(k: Envelope, qpos: Any, velocity: Any) -> tuple[Any, Any]:
-    """Return the least and the largest effort at ``qpos`` and ``velocity`` (envs, joints), None for none."""
+    """Return the least and the largest effort, or command, at ``qpos`` and ``velocity`` (envs, joints), None for none.
+
+    Both are None, or none is.
+    """
     xp = namespace(qpos, velocity)
-    limit = k.limit
+    low, high = k.least, k.limit
     if k.offset is not None:
-        limit = k.offset + (k.rise * xp.minimum(xp.maximum(qpos[None], k.left), k.right)).sum(0)
-        limit = limit if k.limit is None else xp.minimum(limit, k.limit)
-    least = None if limit is None else -limit
+        change = (k.rise * xp.minimum(xp.maximum(qpos[None], k.left), k.right)).sum(0)
+        low, high = clip(k.least_offset - change, low, None, xp), clip(k.offset + change, None, high, xp)
     if k.stall is None:
-        return least, limit
+        return low, high
     lost = k.slope * velocity
-    return clip(k.reverse - lost, least, limit, xp), clip(k.stall - lost, least, limit, xp)
+    return clip(k.reverse - lost, low, high, xp), clip(k.stall - lost, low, high, xp)
