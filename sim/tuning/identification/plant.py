@@ -34,6 +34,9 @@ from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
 from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
+Groups = list[tuple[float, Any]]
+"""Payloads [kg], each with the rows that carry it."""
+UNLOADED: Groups = [(0.0, slice(None))]
 _SWEEPS = 2
 _CREEP = 1 / 9
 """Share of its friction-free acceleration that a joint creeps with before it stops, with ``stopping``; MuJoCo's."""
@@ -126,18 +129,25 @@ class Plant:
 
     def mass_matrix(self, qpos: Float64, payload: Float64) -> Float64:
         """Return the mass matrices (n, joints, joints) of the logged joints at ``qpos`` (n, joints)."""
+        return self._mass_matrix(qpos, _groups(payload))
+
+    def _mass_matrix(self, qpos: Float64, groups: Groups) -> Float64:
         whole = self.whole(qpos)
         matrix = np.empty((len(qpos), self.robot.dof, self.robot.dof))
-        for kg, rows in _groups(payload):
+        for kg, rows in groups:
             matrix[rows] = self.dynamics(kg).mass_matrix(whole[rows])
         return matrix if self._spread is None else self._spread.T @ matrix @ self._spread
 
     def passive(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64:
         """Return gravity and Coriolis forces (n, joints) [N m or N]."""
+        return self._passive(qpos, qvel, _groups(payload))
+
+    def _passive(self, qpos: Float64, qvel: Float64, groups: Groups) -> Float64:
+        """Return the passive forces (n, joints) of the rows in ``groups``, 0 for others."""
         whole = self.whole(qpos)
         rate = qvel if self._spread is None else qvel @ self._spread.T
-        still, force = np.zeros_like(whole), np.empty_like(whole)
-        for kg, rows in _groups(payload):
+        still, force = np.zeros_like(whole), np.zeros_like(whole)
+        for kg, rows in groups:
             force[rows] = self.dynamics(kg).inverse_dynamics(whole[rows], rate[rows], still[rows])
         return force if self._spread is None else force @ self._spread
 
@@ -147,6 +157,23 @@ class Plant:
             return None
         known = payload if self.drive.knows_payload and payload is not None else np.zeros((len(qpos), 1))
         return self.passive(qpos, qvel if "coriolis" in self.drive.compensate else np.zeros_like(qvel), known)
+
+    def _forces(self, qpos: Float64, qvel: Float64, groups: Groups) -> tuple[Float64 | None, Float64]:
+        """Return compensation and passive forces (n, joints); what cancels may be left out of both."""
+        drive = self.drive
+        if drive.compensate != "gravity+coriolis":
+            known = groups if drive.knows_payload else UNLOADED
+            c = None if drive.compensate == "none" else self._passive(qpos, np.zeros_like(qvel), known)
+            return c, self._passive(qpos, qvel, groups)
+        unknown = [] if drive.knows_payload else [(kg, rows) for kg, rows in groups if kg]
+        unloaded = self._passive(qpos, qvel, [(0.0, rows) for _, rows in unknown])
+        if not drive.through:
+            return unloaded, self._passive(qpos, qvel, unknown)
+        h = c = self._passive(qpos, qvel, groups)
+        for _, rows in unknown:
+            c = c.copy()
+            c[rows] = unloaded[rows]
+        return c, h
 
     def _mobility(self, motors: Motors) -> Float64:
         """Return the diagonals of the inverse mass matrices (n, joints) with the logged joints at 0."""
@@ -180,24 +207,23 @@ class Plant:
         out[:, 0] = q
         implicit = motors.armature + dt * motors.damping
         diagonal = np.arange(q.shape[1])
-        unloaded = drive.params is None or drive.params.gain_units is None or not motors.payload.any()
-        same = drive.compensate == "gravity+coriolis" and (drive.knows_payload or not motors.payload.any())
+        groups = _groups(motors.payload)
+        in_units = drive.params is not None and drive.params.gain_units is not None
         with np.errstate(all="ignore"):
             for step in range(steps):
                 if not np.isfinite(q).all():
                     bad = ~np.isfinite(q).all(1)
                     q, v, f = (np.where(bad[:, None], 0.0, x) for x in (q, v, f))
                     out[bad, step:] = np.inf
-                matrix = self.mass_matrix(q, motors.payload)
-                h = self.passive(q, v, motors.payload)
-                c = h if same else self.compensation(q, v, motors.payload)
+                matrix = self._mass_matrix(q, groups)
+                c, h = self._forces(q, v, groups)
                 now = past + step
                 if law is None:
                     u = _at(command, now - whole, rows) * (1 - part) + _at(command, now - whole - 1, rows) * part
                     if drive.through and c is not None:
                         u, c = u + c, None
                 else:
-                    known = matrix if unloaded else self.mass_matrix(q, np.zeros_like(motors.payload))
+                    known = self._mass_matrix(q, UNLOADED) if in_units and groups != UNLOADED else matrix
                     asked = law.effort(command[now], q, v, known, c if drive.through else None)
                     history[now % longest] = asked
                     u = history[(now - whole) % longest, rows] * (1 - part)
@@ -255,7 +281,7 @@ def _at(command: Float64, index: Any, rows: Any) -> Float64:
     return command[np.maximum(index, 0), rows]
 
 
-def _groups(payload: Float64) -> list[tuple[float, Any]]:
+def _groups(payload: Float64) -> Groups:
     """Return each payload (n, 1) that occurs, with the rows that carry it."""
     column = payload[:, 0]
     values = np.unique(column)
