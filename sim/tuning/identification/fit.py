@@ -1,227 +1,135 @@
-r"""Fit of simulated motions to logs: Gauss-Newton with finite differences, all perturbed candidates at once.
+r"""Fit of simulated motions to logs: maximum likelihood by nonlinear least squares.
 
-With the measured positions y and the simulated ones q(theta) of all joints j and rows k, the fit minimises the negative
-logarithm of the likelihood for white noise of unknown size on each joint::
+The negative logarithm of the likelihood (:mod:`sim.tuning.identification.problem`) is that of the sizes sigma of the
+residuals r. Since log(x) <= x - 1, it falls where the weighted sum of squares does::
 
-    sum_j N_j / 2 log(sum_k r_jk^2 / N_j),     r = y - q(theta)
+    sum over rows and joints of (r / sigma)^2 + sum over unknowns of ((theta - m) / s)^2
 
-A Gauss-Newton step solves the least-squares problem weighted by the residuals' present size of each joint, damped as D.
-Marquardt does where a step fails, within the bounds of the unknowns (J. Nocedal and S. Wright, Numerical Optimization,
-2nd ed., 2006, section 10.3). Column i of the Jacobian is the simulated motion with unknown i changed a little, less the
-motion without, over the change.
+with the sizes before the step and a weak prior of means m and standard deviations s. Steps that reduce it, by
+``scipy.optimize.least_squares`` in a trust region within the bounds (M. A. Branch, T. F. Coleman and Y. Li, "A
+subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems", SIAM Journal
+on Scientific Computing 21, 1999), alternate with new sizes.
 
-Under the PID law a whole log is one simulation. A log of efforts is cut into short windows, because an error of an
-uncontrolled arm grows: multiple shooting (H. G. Bock, "Recent advances in parameter identification techniques for
-O.D.E.", 1983). The state at the start of a window is unknown, too; its effect, linear for small errors, is projected
-out of the residual and the Jacobian of that window.
+Residuals and Jacobian of a joint in a stretch, [J r], have many rows. Their triangular QR factor has the same sums of
+products, which is all that the steps depend on: they are given that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robot.robot import Robot
-from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Drive
-from sim.tuning.identification.regression import Motion
-from sim.tuning.identification.unknowns import Unknowns
-from sim.tuning.identification.windows import Window, cut, project, simulate, whole
+from sim.tuning.identification.problem import Evaluation, Problem
 
 Float64 = NDArray[np.float64]
-CHUNK = 256
-"""Most simulations of one task."""
-STATE_STEP = 1e-4
-"""Change of an initial position [rad or m], and of a velocity per second, for the projection."""
-MAX_ITERATIONS = 25
-GAIN = 2e-5
-"""Least decrease of the cost for which the fit goes on."""
-CONVERGED = 0.02
-"""Size of a step, in standard deviations of the unknowns, below which the fit ends."""
+GAIN = 5e-3
+"""Least decrease of the mean logarithm of the sizes for which the fit goes on."""
+TRIES = 6
+"""Most evaluations for one good step."""
+_ONE_STEP = 1.0
+"""Relative tolerance of the sum of squares that ends least_squares with its first good step."""
+_INSIDE = 1e-9
+"""Least distance of the start from the bounds, over typical sizes."""
 
 
-@dataclass
-class Problem:
-    """Logs to fit, cut into windows."""
-
-    robot: Robot
-    joints: tuple[int, ...]
-    drive: Drive
-    logs: list[Log]
-    motions: list[Motion]
-    unknowns: Unknowns
-    executor: Executor | None = None
-    windows: list[Window] = field(init=False)
-
-    def __post_init__(self) -> None:
-        divide = whole if self.drive.params is not None else cut
-        self.windows = [
-            window
-            for number, (log, motion) in enumerate(zip(self.logs, self.motions, strict=True))
-            for window in divide(number, log, motion, self.drive.timestep)
-        ]
-
-    def evaluate(self, theta: Float64, jacobian: bool) -> list[tuple[Float64, Float64 | None]]:
-        """Return the residuals (rows, joints) of each window, and their Jacobians (rows, joints, unknowns)."""
-        unknowns, shoots = self.unknowns, self.drive.params is None
-        joints = len(self.joints)
-        steps = unknowns.steps(theta)
-        points = np.vstack([theta, theta + np.diag(steps)]) if jacobian else theta[None]
-        motors = unknowns.motors(points)
-        states = np.zeros((len(points), 2, joints))
-        if shoots:
-            shift = STATE_STEP * np.eye(2 * joints).reshape(-1, 2, joints)
-            states = np.concatenate([states, shift])
-            motors = motors.take(np.r_[: len(points), np.zeros(2 * joints, int)])
-        tasks, sizes = [], len(states)
-        halves = 1 if shoots or sizes == 1 else 2
-        for group in self._groups(max(1, CHUNK // sizes)):
-            members = [self.windows[number] for number in group]
-            rows = np.array_split(np.arange(sizes), halves)
-            tasks += [(members, motors.take(part), states[part]) for part in rows]
-        simulated = self._map(tasks)
-        found: list[tuple[Float64, Float64 | None]] = []
-        parts = iter(simulated)
-        for group in self._groups(max(1, CHUNK // sizes)):
-            pieces = [next(parts) for _ in range(halves)]
-            for number, member in enumerate(group):
-                window = self.windows[member]
-                positions = np.concatenate([piece[number] for piece in pieces])
-                residual = window.measured - positions[0]
-                slopes = (positions[1 : len(points)] - positions[0]) / steps[:, None, None] if jacobian else None
-                columns = None if slopes is None else slopes.transpose(1, 2, 0)
-                if shoots:
-                    basis = ((positions[len(points) :] - positions[0]) / STATE_STEP).transpose(1, 2, 0)
-                    residual, columns = project(basis, residual, columns)
-                found.append((residual, columns))
-        return found
-
-    def lags(self, seconds: float) -> list[int]:
-        """Return how many rows of each log are ``seconds`` long."""
-        return [round(seconds / float(np.median(np.diff(log.time)))) for log in self.logs]
-
-    def _groups(self, most: int) -> Iterator[list[int]]:
-        """Yield the numbers of windows that are simulated together: of the same number of steps."""
-        group: list[int] = []
-        for number, window in enumerate(self.windows):
-            shape = window.segment.command.shape, window.past
-            if group and (
-                len(group) == most
-                or shape != (self.windows[group[0]].segment.command.shape, self.windows[group[0]].past)
-            ):
-                yield group
-                group = []
-            group.append(number)
-        if group:
-            yield group
-
-    def _map(self, tasks: list[Any]) -> list[list[Float64]]:
-        about = (self.robot, self.joints, self.drive)
-        if self.executor is None:
-            return [simulate(about, *task) for task in tasks]
-        return list(self.executor.map(simulate, [about] * len(tasks), *zip(*tasks, strict=True)))
-
-
-class Iterate(NamedTuple):
-    """Accepted point of the fit."""
+class Solution(NamedTuple):
+    """Best point of a fit."""
 
     theta: Float64
     cost: float
-    windows: list[tuple[Float64, Float64 | None]]
-    sigma: Float64
-    """Root mean square of the residuals of each joint (joints,)."""
-
-
-def cost_of(problem: Problem, windows: list[tuple[Float64, Float64 | None]]) -> tuple[float, Float64]:
-    """Return the negative logarithm of the likelihood per joint and row, and the residuals' sizes (joints,)."""
-    rows = np.concatenate([r[w.fitted] for (r, _), w in zip(windows, problem.windows, strict=True)])
-    with np.errstate(invalid="ignore", over="ignore"):
-        sigma = np.sqrt((rows**2).mean(0)) + 1e-12
-        cost = float(np.log(sigma).mean())
-    return (cost, sigma) if np.isfinite(cost) else (np.inf, sigma)
-
-
-class State(NamedTuple):
-    """State of a fit before a step."""
-
-    theta: Float64
-    damping: float = 0.0
-    step: int = 0
+    """Negative logarithm of the likelihood, over rows and joints."""
+    sizes: Float64
+    """Sizes of the residuals (stretches, joints) [rad or m]."""
+    windows: list[Evaluation]
+    left: int
+    """Evaluations that are left."""
 
 
 def fit(
-    problem: Problem,
-    state: State,
-    *,
-    iterations: int = MAX_ITERATIONS,
-    record: Callable[[State], None] | None = None,
-    progress: Callable[[Any], Any] | None = None,
-) -> Iterate:
-    """Return the best point from ``state`` on; ``record`` is called with the state before each step."""
-    unknowns, damping = problem.unknowns, state.damping
-    best = _iterate(problem, state.theta)
-    bar = (progress or (lambda items: items))(range(state.step, iterations))
-    for number in bar:
-        if record is not None:
-            record(State(best.theta, damping, number))
-        if hasattr(bar, "set_postfix"):
-            bar.set_postfix(error=f"{np.exp(best.cost):.3g}")
-        step, deviation = gauss_newton_step(problem, best, damping)
-        theta = unknowns.clip(best.theta + step)
-        moved = float(np.max(np.abs(theta - best.theta) / deviation))
-        if moved < CONVERGED:
-            break
-        tried = _iterate(problem, theta)
-        if tried.cost < best.cost:
-            gain, best = best.cost - tried.cost, tried
-            damping = 0.0 if damping < 1e-3 else damping / 10
-            if gain < GAIN:
-                break
-        elif damping > 1e6:
-            break
-        else:
-            damping = max(10 * damping, 1e-2)
-    return best
+    problem: Problem, start: Float64, left: int, step: Callable[[Float64, int, float], None] = lambda *_: None
+) -> Solution:
+    """Return the best point from ``start`` on, after ``left`` evaluations at most.
+
+    ``step`` is called before each step with the point, the number of evaluations that are left, and the cost.
+    """
+    from scipy.optimize import least_squares
+
+    factors = _Factors(problem, left)
+    scale, spread = problem.unknowns.scale, problem.unknowns.spread
+    bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
+    x = np.clip(start / scale, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
+    cost = np.inf
+    while True:
+        factors.keep(x * scale)
+        sizes = factors.sizes(x * scale)
+        before, cost = cost, float(problem.costs(sizes).mean())
+        step(x * scale, factors.left, cost)
+        if factors.left <= 0 or before - cost < GAIN:
+            return Solution(x * scale, cost, sizes, factors.windows(x * scale), factors.left)
+
+        def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
+            found = factors.at(x * scale)[..., -1] / sizes[..., None]
+            return np.append(found.ravel(), (x * scale - problem.unknowns.prior) / spread)
+
+        def jacobian(x: Float64, sizes: Float64 = sizes) -> Float64:
+            found = -factors.at(x * scale)[..., :-1] / sizes[..., None, None]
+            return np.vstack([found.reshape(-1, len(x)), np.diag(scale / spread)])
+
+        # One evaluation is that of x, which is known.
+        most = min(TRIES, factors.left) + 1
+        options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
+        x = least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x
 
 
-def _iterate(problem: Problem, theta: Float64) -> Iterate:
-    windows = problem.evaluate(theta, jacobian=True)
-    cost, sigma = cost_of(problem, windows)
-    return Iterate(theta, cost, windows, sigma)
+class _Factors:
+    """Triangular factors of [J r] by point; the Jacobian is that of unknowns over their typical sizes."""
 
+    def __init__(self, problem: Problem, left: int) -> None:
+        self.left = left
+        self._problem = problem
+        self._known: dict[bytes, tuple[Float64, Float64, list[Evaluation]]] = {}
 
-def weighted(problem: Problem, point: Iterate) -> tuple[Float64, Float64]:
-    """Return the fitted residuals (n,) and their Jacobian (n, unknowns), in units of each joint's sigma."""
-    residuals, columns = [], []
-    for (residual, jacobian), window in zip(point.windows, problem.windows, strict=True):
-        assert jacobian is not None
-        residuals.append((residual[window.fitted] / point.sigma).reshape(-1))
-        columns.append((jacobian[window.fitted] / point.sigma[:, None]).reshape(-1, jacobian.shape[2]))
-    return np.concatenate(residuals), np.nan_to_num(np.concatenate(columns))
+    def at(self, theta: Float64) -> Float64:
+        """Return the factors (stretches, joints, rows, unknowns + 1); inf if the simulation diverges."""
+        return self._all(theta)[0]
 
+    def sizes(self, theta: Float64) -> Float64:
+        """Return the sizes of the residuals (stretches, joints)."""
+        return self._all(theta)[1]
 
-def gauss_newton_step(problem: Problem, point: Iterate, damping: float) -> tuple[Float64, Float64]:
-    """Return the step within the bounds, and the standard deviations of the unknowns for white noise."""
-    from scipy.optimize import lsq_linear
+    def keep(self, theta: Float64) -> None:
+        """Forget all points but ``theta``."""
+        self._known = {theta.tobytes(): self._all(theta)}
 
-    unknowns = problem.unknowns
-    r, columns = weighted(problem, point)
-    scale = unknowns.scale
-    normal = (columns * scale).T @ (columns * scale)
-    target = (columns * scale).T @ r
-    prior = (scale / unknowns.spread) ** 2
-    information = normal + np.diag(prior)
-    gradient = target + prior * (unknowns.prior - point.theta) / scale
-    root = np.linalg.cholesky(information + damping * np.diag(np.diagonal(information)) + 1e-12 * np.eye(len(scale)))
-    low, high = ((bound - point.theta) / scale for bound in (unknowns.low, unknowns.high))
-    tiny = 1e-12 + 1e-9 * np.abs(high - low).clip(max=1e3)
-    solved = lsq_linear(
-        root.T, np.linalg.solve(root, gradient), (np.minimum(low, 0) - tiny, np.maximum(high, 0) + tiny)
-    )
-    deviation = scale * np.sqrt(np.diagonal(np.linalg.inv(information)))
-    return scale * solved.x, deviation
+    def windows(self, theta: Float64) -> list[Evaluation]:
+        """Return residuals and Jacobian of all windows."""
+        return self._all(theta)[2]
+
+    def _all(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
+        key = theta.tobytes()
+        if key not in self._known:
+            self.left -= bool(self._known)  # that of the start does not count, so that a fit may resume there
+            self._known[key] = self._evaluate(theta)
+        return self._known[key]
+
+    def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
+        problem, scale = self._problem, self._problem.unknowns.scale
+        windows = problem.evaluate(theta)
+        sizes = problem.sizes([window.residual for window in windows])
+        count = len(theta) + 1
+        factors = np.zeros((*sizes.shape, count, count))
+        places = [
+            (window, rows) for window, stretches in zip(windows, problem.stretches, strict=True) for rows in stretches
+        ]
+        for number, (window, rows) in enumerate(places):
+            for joint in range(sizes.shape[1]):
+                table = np.column_stack([window.jacobian[rows, joint] * scale, window.residual[rows, joint]])
+                if np.isfinite(table[:, -1]).all():
+                    factor = np.linalg.qr(np.nan_to_num(table), mode="r")
+                    factors[number, joint, : len(factor)] = factor
+                else:
+                    factors[number, joint] = np.inf
+        return factors, sizes, windows

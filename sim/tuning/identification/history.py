@@ -1,20 +1,31 @@
-"""History of a fit: its state after each step, in a file from which it resumes."""
+"""History of a fit: its state before each step, in a file from which it resumes."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
-from sim.tuning.identification.fit import State
+
+
+class State(NamedTuple):
+    """State of a fit before a step: all that the rest of the fit depends on."""
+
+    theta: NDArray[np.float64]
+    """Point (unknowns,)."""
+    left: int
+    """Evaluations that are left."""
+    done: tuple[list[float], ...] = ()
+    """Solutions of the variants of the drive that were fitted before."""
 
 
 class History:
-    """State of a fit after each step, kept in a file unless ``path`` is None; read from it if it exists."""
+    """State of a fit before each step, kept in a file unless ``path`` is None; read from it if it exists."""
 
     def __init__(self, path: Path | str | None, settings: dict[str, Any]) -> None:
         self.state: State | None = None
@@ -24,7 +35,7 @@ class History:
         try:
             document = json.loads(Path(path).read_text())
             theirs = document["settings"]
-            self.state = State(np.array(document["theta"], float), float(document["damping"]), int(document["step"]))
+            self.state = State(np.array(document["theta"], float), int(document["left"]), tuple(document["done"]))
             different = sorted(k for k in {*theirs, *self._settings} if theirs.get(k) != self._settings.get(k))
             problem = f"is of another fit ({', '.join(different)} differ)" if different else None
         except (ValueError, KeyError, TypeError) as error:
@@ -36,6 +47,5 @@ class History:
     def write(self, state: State) -> None:
         """Write the file."""
         if self._path is not None:
-            document = {"settings": self._settings, "theta": state.theta.tolist()}
-            document |= {"damping": state.damping, "step": state.step}
+            document = {"settings": self._settings, **state._asdict(), "theta": state.theta.tolist()}
             write_atomically(self._path, json.dumps(document))

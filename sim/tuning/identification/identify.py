@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,19 +23,19 @@ from batchpid.validate import choice, flag, instance, integer, number
 from batchpid.versions import package_versions
 from sim.options import Compensation
 from sim.robot.robot import Robot
-from sim.tuning.identification.fit import MAX_ITERATIONS, Problem, State, cost_of, fit
-from sim.tuning.identification.history import History
+from sim.tuning.identification.fit import Solution, fit
+from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Drive, Motors, Plant
-from sim.tuning.identification.regression import STRONG_PRIOR, Motion, best_start, regress
+from sim.tuning.identification.problem import Problem
+from sim.tuning.identification.regression import Motion, best_drive, smooth
 from sim.tuning.identification.result import Fit, Identification
+from sim.tuning.identification.start import begin
 from sim.tuning.identification.statistics import uncertainty
 from sim.tuning.identification.unknowns import Unknowns
 from sim.tuning.identification.windows import rows_of
 
 Float64 = NDArray[np.float64]
-RANDOM_STARTS, START_SPREAD = 8, 0.3
-"""Random points at which a fit may begin, and their standard deviation in typical sizes of the unknowns."""
 
 
 def identify(
@@ -46,7 +47,7 @@ def identify(
     timestep: float = 1 / 2000,
     payload: bool = True,
     hold: bool = False,
-    iterations: int = MAX_ITERATIONS,
+    evaluations: int = 25,
     seed: int = 0,
     workers: int | None = None,
     history: Path | str | None = None,
@@ -70,31 +71,31 @@ def identify(
         Find a payload at the tool, too.
     hold
         Commands hold from row to row of a file: :func:`sim.tuning.identification.logs.read_logs`.
-    iterations
-        Most Gauss-Newton steps.
+    evaluations
+        Most evaluations of the fit; one simulates the robot, and a changed one for each unknown.
     seed
-        Of the random starts. The fit begins where the simulated motion is nearest to the log: at the regression's
-        result, at ideal motors, or at one of RANDOM_STARTS points around the first.
+        Of CMA-ES, which finds where the fit begins.
     workers
         Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
     history
-        JSON file, written after each step. If it exists the fit resumes from it.
+        File (.npz), written after each evaluation. If it exists the fit resumes from it.
     progress
-        Wraps the range of steps, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
+        Wraps the range of evaluations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
 
     Raises
     ------
     InvalidArgumentError
         An option is out of range, a file holds no log of this robot, or a history is of another fit.
     MissingDependencyError
-        The package ``scipy`` is missing.
+        A package is missing.
     """
-    if find_spec("scipy") is None:
-        raise MissingDependencyError("scipy", "identification", "tune")
+    for package in ("scipy", "cmaes"):
+        if find_spec(package) is None:
+            raise MissingDependencyError(package, "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
     timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
-    iterations, seed = integer("iterations", iterations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
+    evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
     payload, kind = flag("payload", payload), "effort" if params is None else "setpoint"
@@ -104,8 +105,9 @@ def identify(
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
     drive = Drive(timestep, params, compensate.removesuffix("+friction"), measured_rate=measured)
-    drive, start, motions = best_start(robot, joints, drive, found, payload)
-    unknowns = _unknowns(robot, joints, drive, start.motors, motions, payload)
+    motions = [smooth(log, timestep) for log in found]
+    drive, regression = best_drive(robot, joints, drive, found, motions, payload)
+    unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
     settings = {
         "robot": robot.name,
         "logs": [log.source for log in found],
@@ -113,36 +115,75 @@ def identify(
         "compensate": compensate,
         "timestep": timestep,
         "payload": payload,
-        "iterations": iterations,
+        "evaluations": evaluations,
         "seed": seed,
         "data": hashlib.sha256(
             pickle.dumps([(m.command, log.qpos) for m, log in zip(motions, found, strict=True)])
         ).hexdigest(),
-        "versions": package_versions(("batchpid", "sapien", "numpy", "scipy")),
+        "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = ProcessPoolExecutor(processes, mp_context=get_context("spawn")) if processes > 1 else nullcontext()
     with pool as executor:
-        problem = Problem(robot, joints, drive, found, motions, unknowns, executor)
-        nominal = unknowns.point(_nominal(robot, joints))
-        safe = regress(Plant(robot, joints, drive), found, motions, payload, STRONG_PRIOR)
-        points = [*map(unknowns.point, (start.motors, safe.motors)), nominal]
-        points += _random_starts(unknowns, points[0], seed)
-        begin = record.state or State(min(map(unknowns.clip, points), key=lambda theta: _cost(problem, theta)))
-        best = fit(problem, begin, iterations=iterations, record=record.write, progress=progress)
-        before, after = (problem.evaluate(theta, jacobian=False) for theta in (nominal, best.theta))
+        problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in _variants(drive)]
+        ideal = _ideal(robot, joints)
+        state = record.state or State(begin(problems[0], regression, ideal, seed), evaluations)
+        solutions = _fit_all(problems, state, record, _Steps(evaluations, progress))
+        problem, best = min(zip(problems, solutions, strict=True), key=lambda pair: pair[1].cost)
+        before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
-    errors = tuple(_held_out(problem, windows) for windows in (before, after))
+    before = [residual[0] for residual in before]
+    errors = tuple(_held_out(problem, residuals) for residuals in (before, after))
     if not errors[1] < errors[0]:  # the fit failed: nothing is known
         sure = sure._replace(identified=np.zeros_like(sure.identified))
     fits = tuple(
         Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b, a)
-        for w, (b, _), (a, _) in zip(problem.windows, before, after, strict=True)
+        for w, b, a in zip(problem.windows, before, after, strict=True)
     )
+    fitted = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
+    noise = np.sqrt((fitted**2).mean(0))
     return Identification(
-        robot, joints, unknowns, best.theta, sure, (errors[0], errors[1]), best.sigma, drive, settings, fits
+        robot, joints, unknowns, best.theta, sure, (errors[0], errors[1]), noise, problem.drive, settings, fits
     )
+
+
+class _Steps:
+    """Progress of a fit: a bar over its evaluations."""
+
+    def __init__(self, evaluations: int, progress: Callable[[Any], Any] | None) -> None:
+        self._bar = (progress or (lambda items: items))(range(evaluations))
+        self._steps, self._left, self._done = iter(self._bar), evaluations, 0
+
+    def __call__(self, left: int, cost: float) -> None:
+        """Advance the bar to so many evaluations ``left``, and show the typical error that belongs to ``cost``."""
+        while self._left > left and next(self._steps, None) is not None:
+            self._left -= 1
+        if hasattr(self._bar, "set_postfix"):
+            self._bar.set_postfix(error=f"{np.exp(cost):.3g}")
+
+
+def _variants(drive: Drive) -> list[Drive]:
+    """Return ways in which the law may measure: without noise, or differences of positions with their noise."""
+    if drive.params is None:
+        return [drive]
+    return [drive, replace(drive, noisy=True, measured_rate=False)]
+
+
+def _fit_all(problems: list[Problem], state: State, record: History, steps: _Steps) -> list[Solution]:
+    """Return the solution of each of ``problems``, each begun with that of the one before, from ``state`` on."""
+    solutions = [fit(problem, np.array(theta), 0) for problem, theta in zip(problems, state.done, strict=False)]
+    theta, left = state.theta, state.left
+    for problem in problems[len(state.done) :]:
+        done = tuple(solution.theta.tolist() for solution in solutions)
+
+        def step(theta: Float64, left: int, cost: float, done: tuple[list[float], ...] = done) -> None:
+            record.write(State(theta, left, done))
+            steps(left, cost)
+
+        solutions.append(fit(problem, theta, left, step))
+        theta, left = solutions[-1].theta, solutions[-1].left
+    return solutions
 
 
 def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]:
@@ -194,27 +235,16 @@ def _unknowns(
     return Unknowns.of(inertia, effort, speed, payload)
 
 
-def _nominal(robot: Robot, joints: tuple[int, ...]) -> Motors:
-    """Return the motors of the robot as it is described."""
+def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
+    """Return the motors of the robot as its description says."""
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
 
 
-def _random_starts(unknowns: Unknowns, center: Float64, seed: int) -> list[Float64]:
-    """Return points around ``center``."""
-    draws = np.random.default_rng(seed).standard_normal((RANDOM_STARTS, len(center)))
-    return list(center + START_SPREAD * unknowns.scale * draws)
-
-
-def _cost(problem: Problem, theta: Float64) -> float:
-    """Return the cost of a point."""
-    return cost_of(problem, problem.evaluate(theta, jacobian=False))[0]
-
-
-def _held_out(problem: Problem, windows: list[Any]) -> float:
+def _held_out(problem: Problem, residuals: list[Float64]) -> float:
     """Return the root mean square of the residuals on the rows that were kept."""
-    kept = [r[~w.fitted] for (r, _), w in zip(windows, problem.windows, strict=True)]
+    kept = [r[~w.fitted] for r, w in zip(residuals, problem.windows, strict=True)]
     with np.errstate(invalid="ignore", over="ignore"):
         error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
     return error if np.isfinite(error) else float("inf")

@@ -68,6 +68,8 @@ class Segment(NamedTuple):
     """Velocity at its start (joints,)."""
     command: Float64
     """Setpoints or efforts (past + steps, joints) from ``past`` steps before the start on."""
+    noise: Float64
+    """Noise of the positions that the law is given (past + steps, joints)."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ class Drive:
     """True if the compensation passes through the motors, with their strength and delay."""
     knows_payload: bool = False
     """True if the compensation is that of the robot with its payload."""
+    noisy: bool = False
+    """True if the law is given the positions of the log, with their noise, False if it is given those without."""
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
 
@@ -125,7 +129,7 @@ class Plant:
 
     def whole(self, qpos: Float64) -> Float64:
         """Return the positions of all joints (n, dof) for those of the logged ones (n, joints)."""
-        return qpos if self._spread is None else self._rest + qpos @ self._spread.T
+        return qpos if self._spread is None else self._rest + np.einsum("nj,kj->nk", qpos, self._spread)
 
     def mass_matrix(self, qpos: Float64, payload: Float64) -> Float64:
         """Return the mass matrices (n, joints, joints) of the logged joints at ``qpos`` (n, joints)."""
@@ -190,7 +194,9 @@ class Plant:
         dt, drive = self.drive.timestep, self.drive
         q = np.array([segment.qpos for segment in segments])
         v = np.array([segment.qvel for segment in segments])
-        command = np.stack([segment.command for segment in segments], axis=1)
+        command, noise = (
+            np.stack([getattr(segment, name) for segment in segments], axis=1) for name in ("command", "noise")
+        )
         steps, rows = len(command) - past, np.arange(len(q))
         law = None if drive.params is None else _Law(drive, q, v)
         delays = motors.delay[:, 0] / dt
@@ -224,7 +230,9 @@ class Plant:
                         u, c = u + c, None
                 else:
                     known = self._mass_matrix(q, UNLOADED) if in_units and groups != UNLOADED else matrix
-                    asked = law.effort(command[now], q, v, known, c if drive.through else None)
+                    asked = law.effort(
+                        command[now], q + noise[now] if drive.noisy else q, v, known, c if drive.through else None
+                    )
                     history[now % longest] = asked
                     u = history[(now - whole) % longest, rows] * (1 - part)
                     u += history[(now - whole - 1) % longest, rows] * part

@@ -4,7 +4,8 @@ With the measured motion filtered without phase lag, and the effort u filtered a
 
     s u(t - d) + b + c - h - (M q'')_j = A q''_j + B q'_j + F sgn(q'_j)
 
-which is solved by least squares with A, B, F >= 0, for each delay d of a grid (J. Swevers, W. Verdonck and J. De
+which is solved by least squares with A, B, F >= 0, for each delay d of a grid, where the joint moves fast enough not to
+stick (J. Swevers, W. Verdonck and J. De
 Schutter, "Dynamic model identification for industrial robots", IEEE Control Systems Magazine 27(5), 2007; M. Gautier,
 "Dynamic identification of robots with power model", ICRA 1997). Under the PID law u is computed from the filtered
 positions. A weak prior keeps what the log does not show at strength 1.
@@ -13,6 +14,7 @@ positions. A weak prior keeps what the log does not show at strength 1.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,18 +26,25 @@ from sim.tuning.identification.plant import Drive, Motors, Plant, law_efforts
 Float64 = NDArray[np.float64]
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
-MAX_DELAY, DELAY_STEP = 0.03, 5e-4
-"""Longest delay that is tried, and the step of the grid [s]."""
+DELAY_STEP = 5e-4
+DELAYS = np.arange(0.0, 0.03, DELAY_STEP)
+"""Delays that are tried [s]."""
+MOVES, LEAST_ROWS = 0.4, 50
+"""Speed, over its root mean square, below which a joint may stick, and the fewest rows that are left without those."""
+NOISE_CUTOFF = 60.0
+"""Frequency [Hz] above which what was measured counts as noise."""
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 STOPPING = 5e-3
 _EVERY = 0.005
 PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
 """Payloads that are tried [kg]."""
-_PRIOR = 0.1
-STRONG_PRIOR = 3.0
-"""Weight of the prior at strength 1 of a start that is safe where the log hardly shows the strengths."""
-_WEAK = (0.05**2,) * 3
+EVIDENCE = 0.1
+"""Least decrease of the logarithm of a joint's mean square that counts, on average over the joints."""
+_PRIOR = 0.005
+"""Weight of the prior at ideal motors, over the effort's size."""
+WEAK, STRONG = 0.1, 3.0
+"""Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
 
 
 class Motion(NamedTuple):
@@ -45,6 +54,8 @@ class Motion(NamedTuple):
     qvel: Float64
     qacc: Float64
     command: Float64
+    noise: Float64
+    """Noise of the measured positions above NOISE_CUTOFF: that of the log's rows, and between them drawn alike."""
 
 
 class Start(NamedTuple):
@@ -66,56 +77,99 @@ def smooth(log: Log, timestep: float) -> Motion:
     pad = min(len(raw) - 1, round(0.5 / timestep))
     qpos = sosfiltfilt(sections, raw, axis=0, padlen=pad)
     qvel = np.gradient(qpos, timestep, axis=0)
-    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time))
+    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time), _noise(log, time, raw))
 
 
-def regress(plant: Plant, logs: list[Log], motions: list[Motion], payload: bool, prior: float = _PRIOR) -> Start:
-    """Return the motors, and the payload if asked, that explain the filtered efforts best."""
+def _noise(log: Log, time: Float64, raw: Float64) -> Float64:
+    """Return the noise of the measured positions at ``time``; 0 if the rows are too far apart to tell it."""
     from scipy.signal import butter, sosfiltfilt
 
-    drive, dt = plant.drive, plant.drive.timestep
-    period = max(float(np.median(np.diff(log.time))) for log in logs)
-    sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
-    delays = np.arange(0.0, MAX_DELAY, DELAY_STEP)
-    blocks: list[tuple[Float64, ...]] = []
-    late: list[Float64] = []
-    for motion in motions:
-        edge = min(round(EDGE / dt), len(motion.qpos) // 5)
-        rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
-        v, a = motion.qvel[rows], motion.qacc[rows]
-        empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
-        effort = motion.command if drive.params is None else law_efforts(drive, plant, motion)
-        if drive.through and (held := plant.compensation(motion.qpos, motion.qvel)) is not None:
-            effort = effort + held
-        if drive.params is None:  # the law's efforts are of filtered positions already
-            effort = sosfiltfilt(sections, effort, axis=0)
-        time = np.arange(len(effort)) * dt
-        late.append(
-            np.array([np.stack([np.interp(time[rows] - d, time, u) for u in effort.T], axis=1) for d in delays])
-        )
-        still = 0.01 * np.abs(v).max(0) + 1e-9
-        sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
-        blocks.append((empty, loaded - empty, a, v, sign))
-    empty, per_kg, a, v, sign = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    efforts = np.concatenate(late, axis=1)
+    timestep, period = time[1] - time[0], float(np.median(np.diff(log.time)))
+    if (share := 1 - 2 * NOISE_CUTOFF * period) < 0.5:
+        return np.zeros_like(raw)
+    sections = butter(4, NOISE_CUTOFF, fs=1 / timestep, output="sos")
+    slow = sosfiltfilt(sections, raw, axis=0, padlen=min(len(raw) - 1, 1000))
+    step = np.clip(np.rint((log.time - time[0]) / timestep).astype(int), 0, len(time) - 1)
+    found = log.qpos - slow[step]
+    size = 1.4826 * np.median(np.abs(found), axis=0) / np.sqrt(share)  # the median is blind to jerks of the joint
+    noise = size * np.random.default_rng(0).standard_normal(raw.shape)
+    noise[step] = np.clip(found, -4 * size, 4 * size)
+    return noise
 
-    def solve(index: int, kg: float) -> tuple[float, Float64]:
+
+class Regression:
+    """Efforts that the motions took and those that were commanded, filtered alike, for regressions at any delay."""
+
+    def __init__(self, plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> None:
+        from scipy.signal import butter, sosfiltfilt
+
+        drive, dt = plant.drive, plant.drive.timestep
+        period = max(float(np.median(np.diff(log.time))) for log in logs)
+        sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
+        blocks: list[tuple[Float64, ...]] = []
+        late: list[Float64] = []
+        for motion in motions:
+            edge = min(round(EDGE / dt), len(motion.qpos) // 5)
+            rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
+            v, a = motion.qvel[rows], motion.qacc[rows]
+            empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
+            effort = motion.command if drive.params is None else law_efforts(drive, plant, motion)
+            if drive.through and (held := plant.compensation(motion.qpos, motion.qvel)) is not None:
+                effort = effort + held
+            if drive.params is None:  # the law's efforts are of filtered positions already
+                effort = sosfiltfilt(sections, effort, axis=0)
+            time = np.arange(len(effort)) * dt
+            late.append(
+                np.array([np.stack([np.interp(time[rows] - d, time, u) for u in effort.T], axis=1) for d in DELAYS])
+            )
+            still = 0.01 * np.abs(v).max(0) + 1e-9
+            sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
+            blocks.append((empty, loaded - empty, a, v, sign))
+        self._efforts = np.concatenate(late, axis=1)
+        self._columns = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+        fast = np.abs(speeds := self._columns[3]) > MOVES * np.sqrt((speeds**2).mean(0))
+        self._moves = fast | (fast.sum(0) < LEAST_ROWS)
+        self._payload = payload
+
+    def at(self, delay: float, kg: float = 0.0, strength_prior: float | Float64 = WEAK) -> Start:
+        """Return the motors that explain the efforts best at a ``delay`` [s], with a payload.
+
+        ``strength_prior`` is the weight of the prior at strength 1, of all joints or of each (joints,).
+        """
+        empty, per_kg, a, v, sign = self._columns
+        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
+        below, share = int(place), place % 1.0
+        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
+        tables = empty + kg * per_kg, a, v, sign, effort
+        priors = np.broadcast_to(strength_prior, empty.shape[1])
         both = [
-            _solve_joint(empty[:, j] + kg * per_kg[:, j], a[:, j], v[:, j], sign[:, j], efforts[index, :, j], prior)
-            for j in range(len(plant.joints))
+            _solve_joint(*(column[rows] for column in columns), prior)
+            for *columns, rows, prior in zip(*(table.T for table in tables), self._moves.T, priors, strict=True)
         ]
-        return float(sum(np.log(mean + 1e-30) for mean, _ in both)), np.array([found for _, found in both]).T
+        cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
+        armature, damping, friction, strength, bias = np.array([found for _, found in both]).T[:, None]
+        common = (np.array([[value]]) for value in (delay, STOPPING, kg))
+        return Start(Motors(armature, damping, friction, strength, bias, *common), cost)
 
-    best, kg = min(range(len(delays)), key=lambda index: solve(index, 0.0)[0]), 0.0
-    if payload:
+    @cached_property
+    def best(self) -> Start:
+        """Motors at the delay, and with the payload if one is asked for, that explain the efforts best."""
+        empty = self._at_best_delay(0.0)
+        if not self._payload:
+            return empty
+        loaded = empty
         for _ in range(2):
-            near = best
-            kg = min(PAYLOADS, key=lambda each: solve(near, each)[0])
-            best = min(range(len(delays)), key=lambda index: solve(index, kg)[0])
-    cost, columns = solve(best, kg)
-    armature, damping, friction, strength, bias = columns[:, None]
-    common = (np.array([[value]]) for value in (delays[best], STOPPING, kg))
-    return Start(Motors(armature, damping, friction, strength, bias, *common), cost)
+            delay = loaded.motors.delay[0, 0]
+            loaded = self._at_best_delay(min(PAYLOADS, key=lambda kg, late=delay: self.at(late, kg).cost))
+        return loaded if explains_better(loaded, empty) else empty
+
+    def _at_best_delay(self, kg: float) -> Start:
+        return min((self.at(delay, kg) for delay in DELAYS), key=lambda start: start.cost)
+
+
+def explains_better(special: Start, plain: Start) -> bool:
+    """Return whether ``special`` explains the efforts so much better than ``plain`` that it is not by chance."""
+    return plain.cost - special.cost > EVIDENCE * plain.motors.armature.shape[1]
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
@@ -128,7 +182,7 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
 
 
 def _solve_joint(
-    required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64, weight: float
+    required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64, strength_prior: float
 ) -> tuple[float, Float64]:
     """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint."""
     from scipy.optimize import lsq_linear
@@ -136,9 +190,8 @@ def _solve_joint(
     columns = np.stack([a, v, sign, -effort, -np.ones_like(a)], axis=1)
     size = np.abs(columns).max(0) + 1e-12
     matrix = columns / size
-    prior = (
-        (_PRIOR * (np.sqrt((effort**2).mean()) + 1e-9)) ** 2 * len(a) * np.array([*_WEAK, 1 / size[3] ** 2, _WEAK[0]])
-    )
+    weights = np.array([_PRIOR, _PRIOR, _PRIOR, strength_prior / size[3], _PRIOR])
+    prior = (weights * (np.sqrt((effort**2).mean()) + 1e-9)) ** 2 * len(a)
     information = matrix.T @ matrix + np.diag(prior)
     target = -matrix.T @ required + prior * np.array([0, 0, 0, size[3], 0])
     root = np.linalg.cholesky(information + 1e-12 * np.eye(5))
@@ -161,12 +214,14 @@ def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
     return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
 
 
-def best_start(
-    robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], payload: bool
-) -> tuple[Drive, Start, list[Motion]]:
-    """Return the drive that explains the logs best, with its start and the smoothed motions."""
-    motions = [smooth(log, drive.timestep) for log in logs]
+def best_drive(
+    robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], motions: list[Motion], payload: bool
+) -> tuple[Drive, Regression]:
+    """Return the drive that explains the logs best, with its regression."""
     ways = hypotheses(drive, payload)
-    starts = [(regress(Plant(robot, joints, each), logs, motions, payload), each) for each in ways]
-    start, chosen = min(starts, key=lambda pair: pair[0].cost)
-    return chosen, start, motions
+    found = [(Regression(Plant(robot, joints, each), logs, motions, payload), each) for each in ways]
+    best, chosen = found[0]
+    for other, way in found[1:]:
+        if explains_better(other.best, best.best):
+            best, chosen = other, way
+    return chosen, best

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.tuning.identification.fit import Iterate, Problem
+from sim.tuning.identification.fit import Solution
+from sim.tuning.identification.problem import Problem
 
 Float64 = NDArray[np.float64]
 MEMORY = 1.0
@@ -28,8 +29,7 @@ sees noise. Without it a quarter of the intervals missed the truth on a log of a
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED = 0.1
-"""Largest half width, over the estimate or FLOOR of its typical size, of an unknown that counts as identified."""
-FLOOR = 0.2
+"""Largest half width of an interval, over the estimate, of an unknown that counts as identified."""
 
 
 class Uncertainty(NamedTuple):
@@ -42,17 +42,17 @@ class Uncertainty(NamedTuple):
     """Of the Jacobian in units of typical sizes, over the largest, descending."""
 
 
-def uncertainty(problem: Problem, point: Iterate) -> Uncertainty:
+def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     """Return the uncertainty of the fitted ``point``."""
     unknowns = problem.unknowns
     count = len(unknowns.scale)
     size = np.array(problem.lags(MEMORY))
     normal, spread = np.zeros((count, count)), np.zeros((count, count))
     covariances = _autocovariances(problem, point, int(size.max()))
-    for (_, jacobian), window in zip(point.windows, problem.windows, strict=True):
-        assert jacobian is not None
+    weights = _sizes_of_rows(problem, point)
+    for (_, jacobian), window, sigma in zip(point.windows, problem.windows, weights, strict=True):
         for joint in range(jacobian.shape[1]):
-            columns = np.nan_to_num(jacobian[window.fitted, joint]) * unknowns.scale / point.sigma[joint]
+            columns = np.nan_to_num(jacobian[window.fitted, joint] * unknowns.scale) / sigma[:, joint, None]
             if not len(columns):
                 continue
             normal += columns.T @ columns
@@ -62,23 +62,23 @@ def uncertainty(problem: Problem, point: Iterate) -> Uncertainty:
             c[-len(covariances) + 1 :] = covariances[1:, joint][::-1]
             power = np.maximum(np.fft.rfft(c).real, 0.0)
             spectrum = np.fft.rfft(columns, length, axis=0)
-            weights = np.full(len(power), 2.0)
-            weights[[0, -1]] = 1.0
-            spread += ((spectrum.conj() * (weights * power)[:, None]).T @ spectrum).real / length
+            both_sides = np.full(len(power), 2.0)
+            both_sides[[0, -1]] = 1.0
+            spread += ((spectrum.conj() * (both_sides * power)[:, None]).T @ spectrum).real / length
     prior = (unknowns.scale / unknowns.spread) ** 2
     inverse = np.linalg.inv(normal + np.diag(prior))
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
     white = np.diagonal(inverse)
     deviation = MODEL_ERROR * unknowns.scale * np.sqrt(np.maximum(np.diagonal(covariance), white))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
-    size_of = np.maximum(np.abs(point.theta), FLOOR * unknowns.scale)
-    identified = INTERVAL * deviation <= RESOLVED * size_of
+    identified = INTERVAL * deviation <= RESOLVED * np.abs(point.theta)
     return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
 
 
-def _autocovariances(problem: Problem, point: Iterate, lags: int) -> Float64:
+def _autocovariances(problem: Problem, point: Solution, lags: int) -> Float64:
     """Return the tapered autocovariances of the weighted residuals of each joint (lags, joints)."""
-    parts = [r[w.fitted] / point.sigma for (r, _), w in zip(point.windows, problem.windows, strict=True)]
+    weights = _sizes_of_rows(problem, point)
+    parts = [r[w.fitted] / s for (r, _), w, s in zip(point.windows, problem.windows, weights, strict=True)]
     parts = [part for part in parts if len(part)]
     lags = max(2, min(lags, min(map(len, parts)) // 2))
     total = np.zeros((lags, parts[0].shape[1]))
@@ -88,3 +88,14 @@ def _autocovariances(problem: Problem, point: Iterate, lags: int) -> Float64:
         total += np.fft.irfft(spectrum, length, axis=0)[:lags]
     taper = 1 - np.arange(lags) / lags
     return taper[:, None] * total / sum(map(len, parts))
+
+
+def _sizes_of_rows(problem: Problem, point: Solution) -> list[Float64]:
+    """Return the size of the residuals of each fitted row of each window (rows, joints)."""
+    sizes = iter(point.sizes)
+    return [
+        np.concatenate([np.tile(next(sizes), (len(rows), 1)) for rows in stretches])
+        if stretches
+        else np.zeros((0, len(problem.joints)))
+        for stretches in problem.stretches
+    ]

@@ -97,7 +97,9 @@ def _window(
     part = np.clip(at[rows] - index, 0, 1)[:, None]
     before = log.time[0] + dt * np.arange(first - past, first)
     command = np.vstack([log.commands_at(before), motion.command[first:last]]) if past else motion.command[first:last]
-    segment = Segment(motion.qpos[first], motion.qvel[first], command)
+    noise = np.zeros_like(command)
+    noise[past:] = motion.noise[first:last]
+    segment = Segment(motion.qpos[first], motion.qvel[first], command, noise)
     fitted = log.time[rows] <= log.time[0] + (1 - HELD_OUT) * log.seconds
     return Window(number, segment, past, index - first, part, log.qpos[rows], int(rows[0]), fitted)
 

@@ -1,0 +1,179 @@
+r"""Simulated motions of candidates along logs: residuals, their likelihood, and their Jacobian.
+
+The residuals of joint j are its measured positions y less the simulated ones, r = y - q(theta). A log is divided into
+stretches b; in each the residuals of a joint are white noise of unknown size, so that the negative logarithm of the
+likelihood is, over the number of rows and joints::
+
+    mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
+
+f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or later
+than it did, the size is large, and the stretch counts little.
+
+Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
+change.
+
+Under the PID law a whole log is one simulation. A log of efforts is cut into short windows, because an error of an
+uncontrolled arm grows: multiple shooting (H. G. Bock, "Recent advances in parameter identification techniques for
+O.D.E.", 1983). The state at the start of a window is unknown, too; its effect, linear for small errors, is projected
+out of the residual and the Jacobian of that window.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robot.robot import Robot
+from sim.tuning.identification.logs import Log
+from sim.tuning.identification.plant import Drive
+from sim.tuning.identification.regression import Motion
+from sim.tuning.identification.unknowns import Unknowns
+from sim.tuning.identification.windows import Window, cut, project, rows_of, simulate, whole
+
+Float64 = NDArray[np.float64]
+CHUNK = 32
+"""Most simulations at once."""
+STRETCH = 0.5
+"""Length of the stretches of a log [s], about."""
+LEAST_NOISE = 1e-6
+"""Least noise of a sensor, over the range of the motion."""
+WORST = 1e6
+"""Largest size of residuals that counts [rad or m]."""
+STATE_STEP = 1e-4
+"""Change of an initial position [rad or m], and of a velocity per second, for the projection."""
+
+
+class Evaluation(NamedTuple):
+    """Residuals of a point, and their Jacobian, of one window."""
+
+    residual: Float64
+    """Measured less simulated positions (rows, joints) [rad or m]."""
+    jacobian: Float64
+    """Change of the simulated positions with the unknowns (rows, joints, unknowns)."""
+
+
+@dataclass
+class Problem:
+    """Logs to fit, cut into windows."""
+
+    robot: Robot
+    joints: tuple[int, ...]
+    drive: Drive
+    logs: list[Log]
+    motions: list[Motion]
+    unknowns: Unknowns
+    executor: Executor | None = None
+    windows: list[Window] = field(init=False)
+
+    noise: Float64 = field(init=False)
+    """Twice the noise of the sensors (joints,) [rad or m]."""
+    stretches: list[list[NDArray[np.intp]]] = field(init=False)
+    """Numbers of the fitted rows in each stretch of each window."""
+
+    def __post_init__(self) -> None:
+        divide = whole if self.drive.params is not None else cut
+        self.windows = [
+            window
+            for number, (log, motion) in enumerate(zip(self.logs, self.motions, strict=True))
+            for window in divide(number, log, motion, self.drive.timestep)
+        ]
+        self.stretches = [self._divided(window) for window in self.windows]
+        self._rows = [len(rows) for stretches in self.stretches for rows in stretches]
+        qpos = np.concatenate([log.qpos for log in self.logs])
+        measured = np.sqrt(np.mean([(motion.noise**2).mean(0) for motion in self.motions], axis=0))
+        self.noise = np.maximum(2 * measured, LEAST_NOISE * (np.ptp(qpos, axis=0) + 1e-3))
+
+    def _divided(self, window: Window) -> list[NDArray[np.intp]]:
+        rows = np.flatnonzero(window.fitted)
+        seconds = np.ptp(self.logs[window.log].time[rows_of(window)][rows]) if len(rows) else 0.0
+        return [part for part in np.array_split(rows, max(1, int(seconds / STRETCH))) if len(part)]
+
+    @property
+    def shoots(self) -> bool:
+        """Whether the initial states of the windows are unknown."""
+        return self.drive.params is None
+
+    def residuals(self, points: Float64) -> list[Float64]:
+        """Return the residuals (points, rows, joints) of each window.
+
+        What initial states explain is left out, with their effect at the first point.
+        """
+        found = []
+        for window, (positions, basis) in zip(self.windows, self._simulate(points), strict=True):
+            residual = window.measured - positions
+            found.append(residual if basis is None else np.stack([project(basis, each, None)[0] for each in residual]))
+        return found
+
+    def sizes(self, residuals: list[Float64]) -> Float64:
+        """Return the sizes (..., stretches, joints) of the residuals (..., rows, joints) of all windows."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = [
+                (residual[..., rows, :] ** 2).mean(-2)
+                for residual, stretches in zip(residuals, self.stretches, strict=True)
+                for rows in stretches
+            ]
+            return np.sqrt(np.stack(squares, axis=-2) + self.noise**2)
+
+    def costs(self, sizes: Float64) -> Float64:
+        """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).
+
+        They are finite where a simulation diverges, too.
+        """
+        return np.average(np.log(np.fmin(sizes, WORST)), axis=-2, weights=self._rows)
+
+    def evaluate(self, theta: Float64) -> list[Evaluation]:
+        """Return residuals and Jacobian of each window at one point (unknowns,)."""
+        steps = self.unknowns.steps(theta)
+        found = []
+        points = np.vstack([theta, theta + np.diag(steps)])
+        for window, (positions, basis) in zip(self.windows, self._simulate(points), strict=True):
+            residual = window.measured - positions[0]
+            jacobian = ((positions[1:] - positions[0]) / steps[:, None, None]).transpose(1, 2, 0)
+            if basis is not None:
+                residual, jacobian = project(basis, residual, jacobian)
+            found.append(Evaluation(residual, jacobian))
+        return found
+
+    def lags(self, seconds: float) -> list[int]:
+        """Return how many rows of each log are ``seconds`` long."""
+        return [round(seconds / float(np.median(np.diff(log.time)))) for log in self.logs]
+
+    def _simulate(self, points: Float64) -> list[tuple[Float64, Float64 | None]]:
+        """Return for each window the positions (points, rows, joints), and the effect of its initial state.
+
+        The effect, at the first point, is (rows, joints, states), None if the state is known.
+        """
+        count, joints = len(points), len(self.joints)
+        states = np.zeros((count, 2, joints))
+        numbers = np.arange(count)
+        if self.shoots:
+            states = np.concatenate([states, STATE_STEP * np.eye(2 * joints).reshape(-1, 2, joints)])
+            numbers = np.r_[numbers, np.zeros(2 * joints, int)]
+        motors = self.unknowns.motors(points[numbers])
+        groups = [list(group) for _, group in groupby(self.windows, lambda w: (w.segment.command.shape, w.past))]
+        tasks, places = [], []
+        for number, group in enumerate(groups):
+            most = max(1, CHUNK // len(group))
+            parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
+            tasks += [(group, motors.take(part), states[part]) for part in parts]
+            places += [number] * len(parts)
+        simulated = self._map(tasks)
+        found = []
+        for number, group in enumerate(groups):
+            pieces = [piece for piece, place in zip(simulated, places, strict=True) if place == number]
+            for at in range(len(group)):
+                positions = np.concatenate([piece[at] for piece in pieces])
+                effect = (positions[count:] - positions[0]) / STATE_STEP
+                found.append((positions[:count], effect.transpose(1, 2, 0) if self.shoots else None))
+        return found
+
+    def _map(self, tasks: list[Any]) -> list[list[Float64]]:
+        about = (self.robot, self.joints, self.drive)
+        if self.executor is None:
+            return [simulate(about, *task) for task in tasks]
+        return list(self.executor.map(simulate, [about] * len(tasks), *zip(*tasks, strict=True)))
