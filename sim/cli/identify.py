@@ -41,10 +41,10 @@ class IdentifyCommand:
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
     no_payload: flags.Switch = False
     """There is no payload at the tool."""
-    iterations: int = 25
-    """Most Gauss-Newton steps."""
+    evaluations: int = 25
+    """Most evaluations of the fit; each simulates the robot, and a changed one for each unknown."""
     seed: int = 0
-    """Seed of the random points at which the fit may begin. The result does not depend on the number of workers."""
+    """Seed of CMA-ES, which finds where the fit begins. The result does not depend on the number of workers."""
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False
@@ -84,11 +84,11 @@ class IdentifyCommand:
             timestep=self.timestep,
             payload=not self.no_payload,
             hold=self.hold,
-            iterations=self.iterations,
+            evaluations=self.evaluations,
             seed=self.seed,
             workers=self.workers,
             history=history,
-            progress=bar("identifying", unit="step"),
+            progress=bar("identifying", unit="evaluation"),
         )
         print(report(found))
         about = {"identified_from": found.settings["logs"], "held_out_error": found.document()["held_out_error"]}

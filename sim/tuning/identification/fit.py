@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from sim.tuning.identification.problem import Evaluation, Problem
 
 Float64 = NDArray[np.float64]
-GAIN = 5e-3
-"""Least decrease of the mean logarithm of the sizes for which the fit goes on."""
+GAIN, LEAST_GAIN = 5e-3, 2e-4
+"""Decrease of the cost below which the fit ends with a step of less than a standard deviation, and with any step."""
 TRIES = 6
 """Most evaluations for one good step."""
 _ONE_STEP = 1.0
@@ -61,13 +61,18 @@ def fit(
     scale, spread = problem.unknowns.scale, problem.unknowns.spread
     bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
     x = np.clip(start / scale, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
-    cost = np.inf
+    cost, last = np.inf, x
     while True:
         factors.keep(x * scale)
         sizes = factors.sizes(x * scale)
         before, cost = cost, float(problem.costs(sizes).mean())
         step(x * scale, factors.left, cost)
-        if factors.left <= 0 or before - cost < GAIN:
+        gain, deviations = (
+            before - cost,
+            _deviations(factors.at(x * scale)[..., :-1] / sizes[..., None, None], scale / spread),
+        )
+        moved = np.max(np.abs(x - last) / deviations)
+        if factors.left <= 0 or gain < LEAST_GAIN or (gain < GAIN and moved < 1):
             return Solution(x * scale, cost, sizes, factors.windows(x * scale), factors.left)
 
         def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
@@ -81,7 +86,14 @@ def fit(
         # One evaluation is that of x, which is known.
         most = min(TRIES, factors.left) + 1
         options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
+        last = x
         x = least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x
+
+
+def _deviations(factors: Float64, prior: Float64) -> Float64:
+    """Return the standard deviations of the unknowns for white noise, from the factors of the weighted Jacobian."""
+    table = factors.reshape(-1, len(prior))
+    return np.sqrt(np.diagonal(np.linalg.inv(table.T @ table + np.diag(prior**2))))
 
 
 class _Factors:

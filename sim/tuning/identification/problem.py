@@ -6,8 +6,8 @@ likelihood is, over the number of rows and joints::
 
     mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
 
-f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or later
-than it did, the size is large, and the stretch counts little.
+f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or
+later than it did, the size is large, and the stretch counts little.
 
 Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
 change.

@@ -39,11 +39,11 @@ STOPPING = 5e-3
 _EVERY = 0.005
 PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
 """Payloads that are tried [kg]."""
-EVIDENCE = 0.1
+EVIDENCE = 0.3
 """Least decrease of the logarithm of a joint's mean square that counts, on average over the joints."""
 _PRIOR = 0.005
 """Weight of the prior at ideal motors, over the effort's size."""
-WEAK, STRONG = 0.1, 3.0
+NO_PRIOR, WEAK, STRONG = 1e-3, 0.1, 3.0
 """Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
 
 
@@ -142,10 +142,10 @@ class Regression:
         effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
         tables = empty + kg * per_kg, a, v, sign, effort
         priors = np.broadcast_to(strength_prior, empty.shape[1])
-        both = [
-            _solve_joint(*(column[rows] for column in columns), prior)
-            for *columns, rows, prior in zip(*(table.T for table in tables), self._moves.T, priors, strict=True)
-        ]
+        both = []
+        for joint, rows in enumerate(self._moves.T):
+            required, *columns = (table[rows, joint] for table in tables)
+            both.append(_solve_joint(required, columns, float(priors[joint])))
         cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
         armature, damping, friction, strength, bias = np.array([found for _, found in both]).T[:, None]
         common = (np.array([[value]]) for value in (delay, STOPPING, kg))
@@ -159,12 +159,12 @@ class Regression:
             return empty
         loaded = empty
         for _ in range(2):
-            delay = loaded.motors.delay[0, 0]
-            loaded = self._at_best_delay(min(PAYLOADS, key=lambda kg, late=delay: self.at(late, kg).cost))
+            costs = [self.at(loaded.motors.delay[0, 0], kg, NO_PRIOR).cost for kg in PAYLOADS]
+            loaded = self._at_best_delay(PAYLOADS[int(np.argmin(costs))])
         return loaded if explains_better(loaded, empty) else empty
 
     def _at_best_delay(self, kg: float) -> Start:
-        return min((self.at(delay, kg) for delay in DELAYS), key=lambda start: start.cost)
+        return min((self.at(delay, kg, NO_PRIOR) for delay in DELAYS), key=lambda start: start.cost)
 
 
 def explains_better(special: Start, plain: Start) -> bool:
@@ -181,12 +181,14 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
     return effort if held is None else effort - held
 
 
-def _solve_joint(
-    required: Float64, a: Float64, v: Float64, sign: Float64, effort: Float64, strength_prior: float
-) -> tuple[float, Float64]:
-    """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint."""
+def _solve_joint(required: Float64, motion: list[Float64], strength_prior: float) -> tuple[float, Float64]:
+    """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint.
+
+    ``motion`` is acceleration, velocity, its sign, and the commanded effort (rows,).
+    """
     from scipy.optimize import lsq_linear
 
+    a, v, sign, effort = motion
     columns = np.stack([a, v, sign, -effort, -np.ones_like(a)], axis=1)
     size = np.abs(columns).max(0) + 1e-12
     matrix = columns / size

@@ -63,7 +63,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
     motors = Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0))
     for kind in ("setpoint", "effort"):
         plant = Plant(arm, (0, 1), Drive(1 / 2000, params if kind == "setpoint" else None, "gravity+coriolis"))
-        segment = Segment(table["qpos"][0], np.zeros(2), table[kind])
+        segment = Segment(table["qpos"][0], np.zeros(2), table[kind], np.zeros((len(table[kind]), 2)))
         moved = plant.simulate(motors, [segment], 0)[0, :-1]
         np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
 
@@ -73,7 +73,9 @@ def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
     rng = np.random.default_rng(0)
     leaves = [rng.uniform(0.1, 1.0, (3, 2)) for _ in PER_JOINT]
     motors = Motors(*leaves, *(rng.uniform(0.002, 0.01, (3, 1)) for _ in range(2)), np.array([[0.0], [0.3], [0.3]]))
-    segments = [Segment(q, np.zeros(2), np.tile(q + 0.2, (50, 1))) for q in rng.uniform(-1, 1, (3, 2))]
+    segments = [
+        Segment(q, np.zeros(2), np.tile(q + 0.2, (50, 1)), np.zeros((50, 2))) for q in rng.uniform(-1, 1, (3, 2))
+    ]
     together = plant.simulate(motors, segments, 0)
     for k in range(3):
         assert np.array_equal(plant.simulate(motors.take([k]), [segments[k]], 0)[0], together[k])
@@ -91,16 +93,22 @@ def test_known_motors_are_found(arm, runs, kind):
         payload=False,
     )
     document = json.loads(json.dumps(found.document()))
+    known = inside = 0
     for index, joint in enumerate(arm.joint_names):
         for name in PER_JOINT:
             estimate, low, high = document["joints"][joint][name]
-            assert low <= estimate <= high
+            if estimate is None:
+                continue
+            known += 1
+            assert low < estimate < high
             wanted = float(getattr(truth, name)[index])
-            assert abs(estimate - wanted) < max(0.05 * abs(wanted), 3 * (high - low)), (joint, name)
+            assert abs(estimate - wanted) < 0.05 * abs(wanted) + (high - low) / 2, (joint, name)
+            inside += low <= wanted <= high
     assert document["delay"][0] == pytest.approx(truth.delay, abs=2e-4)
     before, after = document["held_out_error"]
     assert after < before / 10
-    assert found.not_identified == []
+    assert known >= 9
+    assert inside >= known - 1
     actuators = found.actuators()
     assert actuators.command_delay[0, 0] == pytest.approx(document["delay"][0])
     assert actuators.coulomb[0, 0] == pytest.approx(document["joints"]["shoulder"]["friction"][0])
@@ -114,7 +122,7 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     still = motion._replace(position=np.where([False, True], motion.position, motion.position[0]))
     table = mujoco_log["simulate"](turret, truth, still, params, every=2, compensate=False)
     log = as_log(turret, table, "setpoint")
-    found = identify(turret, log, params=params, compensate="none", workers=0, payload=False, iterations=3)
+    found = identify(turret, log, params=params, compensate="none", workers=0, payload=False, evaluations=3)
     document = found.document()
     assert {f"shoulder: {kind}" for kind in PER_JOINT} <= set(found.not_identified)
     assert "elbow: friction" not in found.not_identified
@@ -127,7 +135,7 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
     time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
-    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "iterations": 2}
+    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 2}
     whole = identify(arm, log, **options)
 
     def stop(steps):
