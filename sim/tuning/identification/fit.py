@@ -22,11 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.errors import InvalidArgumentError
 from sim.tuning.identification.problem import Evaluation, Problem
 
 Float64 = NDArray[np.float64]
-GAIN, LEAST_GAIN = 5e-3, 2e-4
-"""Decrease of the cost below which the fit ends with a step of less than a standard deviation, and with any step."""
+GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
+"""The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
+STEP standard deviations of the unknowns."""
 TRIES = 6
 """Most evaluations for one good step."""
 _ONE_STEP = 1.0
@@ -62,17 +64,19 @@ def fit(
     bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
     x = np.clip(start / scale, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
     cost, last = np.inf, x
+    if not np.isfinite(factors.at(x * scale)).all():
+        remedy = "check the params that drove the robot, --timestep and the units of the logs"
+        raise InvalidArgumentError(
+            "logs", "move otherwise than any robot that was simulated: all diverge", remedy=remedy
+        )
     while True:
         factors.keep(x * scale)
         sizes = factors.sizes(x * scale)
         before, cost = cost, float(problem.costs(sizes).mean())
         step(x * scale, factors.left, cost)
-        gain, deviations = (
-            before - cost,
-            _deviations(factors.at(x * scale)[..., :-1] / sizes[..., None, None], scale / spread),
-        )
-        moved = np.max(np.abs(x - last) / deviations)
-        if factors.left <= 0 or gain < LEAST_GAIN or (gain < GAIN and moved < 1):
+        gain = before - cost
+        moved = np.max(np.abs(x - last) / _deviations(factors.at(x * scale) / sizes[..., None, None], scale / spread))
+        if factors.left <= 0 or gain < LEAST_GAIN or (gain < GAIN and moved < STEP):
             return Solution(x * scale, cost, sizes, factors.windows(x * scale), factors.left)
 
         def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
@@ -91,8 +95,8 @@ def fit(
 
 
 def _deviations(factors: Float64, prior: Float64) -> Float64:
-    """Return the standard deviations of the unknowns for white noise, from the factors of the weighted Jacobian."""
-    table = factors.reshape(-1, len(prior))
+    """Return the standard deviations of the unknowns for white noise, from the weighted factors."""
+    table = factors[..., :-1].reshape(-1, len(prior))
     return np.sqrt(np.diagonal(np.linalg.inv(table.T @ table + np.diag(prior**2))))
 
 

@@ -77,16 +77,18 @@ def smooth(log: Log, timestep: float) -> Motion:
     pad = min(len(raw) - 1, round(0.5 / timestep))
     qpos = sosfiltfilt(sections, raw, axis=0, padlen=pad)
     qvel = np.gradient(qpos, timestep, axis=0)
-    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time), _noise(log, time, raw))
+    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time), _noise(log, time))
 
 
-def _noise(log: Log, time: Float64, raw: Float64) -> Float64:
+def _noise(log: Log, time: Float64) -> Float64:
     """Return the noise of the measured positions at ``time``; 0 if the rows are too far apart to tell it."""
+    from scipy.interpolate import make_interp_spline
     from scipy.signal import butter, sosfiltfilt
 
     timestep, period = time[1] - time[0], float(np.median(np.diff(log.time)))
     if (share := 1 - 2 * NOISE_CUTOFF * period) < 0.5:
-        return np.zeros_like(raw)
+        return np.zeros((len(time), log.qpos.shape[1]))
+    raw = make_interp_spline(log.time, log.qpos)(time)
     sections = butter(4, NOISE_CUTOFF, fs=1 / timestep, output="sos")
     slow = sosfiltfilt(sections, raw, axis=0, padlen=min(len(raw) - 1, 1000))
     step = np.clip(np.rint((log.time - time[0]) / timestep).astype(int), 0, len(time) - 1)

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.tuning.identification.logs import Log
+from sim.tuning.identification.plant import Drive, Motors, Plant, Segment
+from sim.tuning.identification.regression import STRONG, Regression, smooth
+from sim.tuning.identification.unknowns import PER_JOINT
+
+pytest.importorskip("scipy")
+DT = 1 / 2000
+
+
+def log_of(qpos: np.ndarray, command: np.ndarray, every: int) -> Log:
+    time = DT * np.arange(0, len(qpos), every)
+    return Log("log", tuple(range(qpos.shape[1])), "setpoint", time, qpos[::every], time, command[::every], False)
+
+
+def motors_of(**values: list[float]) -> Motors:
+    joints = [np.array([values[kind]]) for kind in PER_JOINT]
+    return Motors(*joints, *(np.array([[values[kind]]]) for kind in ("delay", "stopping", "payload")))
+
+
+def test_joints_that_stick_half_of_the_time_are_found(panda):
+    joints, params = (5, 6), panda.designed("effort")
+    params = type(params)(*(leaf[:, list(joints)] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    plant = Plant(panda, joints, Drive(DT, params, "gravity+coriolis"))
+    sticky = motors_of(
+        armature=[0.05, 0.004], damping=[0.2, 0.02], friction=[1.0, 0.2], strength=[1.0, 1.0], bias=[0.0, 0.02],
+        delay=0.002, stopping=0.002, payload=0.0,
+    )  # fmt: skip
+    time = DT * np.arange(8000)
+    waves = np.stack([np.sin(5 * time) ** 3 + 0.3 * np.sin(k * time) ** 5 for k in (21, 17)], axis=1)
+    setpoints = panda.start[list(joints)] + 0.2 * waves
+    qpos = plant.simulate(sticky, [Segment(setpoints[0], np.zeros(2), setpoints, np.zeros_like(setpoints))], 0)[0, :-1]
+    log = log_of(qpos, setpoints, 1)
+    motion = smooth(log, DT)
+    assert (np.abs(motion.qvel) < 1e-3).mean() > 0.2
+    found = Regression(plant, [log], [motion], False).at(0.002, 0.0, STRONG).motors
+    for kind in ("armature", "friction", "strength"):
+        np.testing.assert_allclose(getattr(found, kind), getattr(sticky, kind), rtol=0.2, err_msg=kind)
+
+
+@given(st.floats(1e-6, 1e-3), st.integers(1, 2))
+def test_the_noise_of_a_log_is_told_from_its_motion(size, every):
+    rng, time = np.random.default_rng(0), DT * np.arange(4000)
+    motion = np.stack([np.sin(6 * time), 0.2 * np.sin(20 * time)], axis=1)
+    noise = size * rng.standard_normal(motion.shape)
+    found = smooth(log_of(motion + noise, motion, every), DT).noise
+    np.testing.assert_allclose(found.std(0), size, rtol=0.2)
+    rows = found[::every]
+    assert all(np.corrcoef(rows[:, joint], noise[::every, joint])[0, 1] > 0.8 for joint in range(2))
+
+
+def test_rows_that_are_far_apart_tell_no_noise():
+    motion = np.sin(DT * np.arange(4000))[:, None]
+    assert not smooth(log_of(motion, motion, 20), DT).noise.any()
