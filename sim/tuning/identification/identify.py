@@ -23,10 +23,11 @@ from batchpid.validate import choice, flag, instance, integer, number
 from batchpid.versions import package_versions
 from sim.options import Compensation
 from sim.robot.robot import Robot
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.fit import Solution, fit
 from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, read_logs
-from sim.tuning.identification.plant import Drive, Motors, Plant
+from sim.tuning.identification.plant import Motors, Plant
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import Motion, best_drive, smooth
 from sim.tuning.identification.result import Fit, Identification

@@ -22,16 +22,13 @@ Joints that are in no log rest where the robot starts; followers move with their
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid as bp
-from batchpid.choices import PerMassMatrix
-from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
 from sim.robot.robot import Robot
+from sim.tuning.identification.drive import Drive, Law
 
 Float64 = NDArray[np.float64]
 Groups = list[tuple[float, Any]]
@@ -70,26 +67,6 @@ class Segment(NamedTuple):
     """Setpoints or efforts (past + steps, joints) from ``past`` steps before the start on."""
     noise: Float64
     """Noise of the positions that the law is given (past + steps, joints)."""
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Control of the robot in a log."""
-
-    timestep: float
-    """Time step of control and simulation [s]."""
-    params: bp.PIDParams | None
-    """Params of the PID law, of the logged joints; None for a log of efforts."""
-    compensate: str
-    """"gravity+coriolis", "gravity" or "none"."""
-    through: bool = False
-    """True if the compensation passes through the motors, with their strength and delay."""
-    knows_payload: bool = False
-    """True if the compensation is that of the robot with its payload."""
-    noisy: bool = False
-    """True if the law is given the positions of the log, with their noise, False if it is given those without."""
-    measured_rate: bool = False
-    """True if the law is given the joint velocity, False if it takes differences of positions."""
 
 
 class Plant:
@@ -198,7 +175,7 @@ class Plant:
             np.stack([getattr(segment, name) for segment in segments], axis=1) for name in ("command", "noise")
         )
         steps, rows = len(command) - past, np.arange(len(q))
-        law = None if drive.params is None else _Law(drive, q, v)
+        law = None if drive.params is None else Law(drive, q, v)
         delays = motors.delay[:, 0] / dt
         whole = np.floor(delays).astype(int)
         part = (delays - whole)[:, None]
@@ -260,31 +237,6 @@ class Plant:
         return out
 
 
-class _Law:
-    """PID law of many candidates."""
-
-    def __init__(self, drive: Drive, qpos: Float64, qvel: Float64) -> None:
-        params = drive.params
-        assert params is not None
-        self._params, self._measured = params, drive.measured_rate
-        self._k = bp.discretise(params, drive.timestep, len(qpos))
-        self._state = bp.init(params, qpos)
-
-    def effort(
-        self, setpoint: Float64, qpos: Float64, qvel: Float64, matrix: Float64, feedforward: Float64 | None
-    ) -> Float64:
-        """Advance the law by a step and return the efforts (n, joints)."""
-        units = self._params.gain_units
-        rate = qvel if self._measured else None
-        if isinstance(units, PerMassMatrix):
-            new = advance_with_mass_matrix(self._k, self._state, setpoint, qpos, matrix, rate, None, feedforward)
-        else:
-            k = self._k if units is None else per_inertia(self._k, np.diagonal(matrix, axis1=1, axis2=2))
-            new = bp.advance(k, self._state, setpoint, qpos, rate, None, feedforward)
-        self._state, effort = new[:2]
-        return np.asarray(effort)
-
-
 def _at(command: Float64, index: Any, rows: Any) -> Float64:
     return command[np.maximum(index, 0), rows]
 
@@ -296,18 +248,3 @@ def _groups(payload: Float64) -> Groups:
     if len(values) == 1:
         return [(float(values[0]), slice(None))]
     return [(float(value), np.flatnonzero(column == value)) for value in values]
-
-
-def law_efforts(drive: Drive, plant: Plant, motion: Any) -> Float64:
-    """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
-    law = _Law(drive, motion.qpos[:1], motion.qvel[:1])
-    needs = drive.params is not None and drive.params.gain_units is not None
-    none = np.zeros((1, 1))
-    matrix = plant.mass_matrix(motion.qpos[:1], none)
-    efforts = np.empty_like(motion.qpos)
-    for step in range(len(motion.qpos)):
-        q, v = motion.qpos[step : step + 1], motion.qvel[step : step + 1]
-        if needs and step % 8 == 0:
-            matrix = plant.mass_matrix(q, none)
-        efforts[step] = law.effort(motion.command[step : step + 1], q, v, matrix, None)[0]
-    return efforts

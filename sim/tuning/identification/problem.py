@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.robot.robot import Robot
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Drive
 from sim.tuning.identification.regression import Motion
 from sim.tuning.identification.unknowns import Unknowns
 from sim.tuning.identification.windows import Window, cut, project, rows_of, simulate, whole

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.tuning.identification.drive import Drive, Law
 from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Drive, Motors, Plant, law_efforts
+from sim.tuning.identification.plant import Motors, Plant
 
 Float64 = NDArray[np.float64]
 CUTOFF = 15.0
@@ -115,7 +116,7 @@ class Regression:
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
             v, a = motion.qvel[rows], motion.qacc[rows]
             empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
-            effort = motion.command if drive.params is None else law_efforts(drive, plant, motion)
+            effort = motion.command if drive.params is None else _law_efforts(drive, plant, motion)
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel)) is not None:
                 effort = effort + held
             if drive.params is None:  # the law's efforts are of filtered positions already
@@ -172,6 +173,21 @@ class Regression:
 def explains_better(special: Start, plain: Start) -> bool:
     """Return whether ``special`` explains the efforts so much better than ``plain`` that it is not by chance."""
     return plain.cost - special.cost > EVIDENCE * plain.motors.armature.shape[1]
+
+
+def _law_efforts(drive: Drive, plant: Plant, motion: Motion) -> Float64:
+    """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
+    law = Law(drive, motion.qpos[:1], motion.qvel[:1])
+    needs = drive.params is not None and drive.params.gain_units is not None
+    none = np.zeros((1, 1))
+    matrix = plant.mass_matrix(motion.qpos[:1], none)
+    efforts = np.empty_like(motion.qpos)
+    for step in range(len(motion.qpos)):
+        q, v = motion.qpos[step : step + 1], motion.qvel[step : step + 1]
+        if needs and step % 8 == 0:
+            matrix = plant.mass_matrix(q, none)
+        efforts[step] = law.effort(motion.command[step : step + 1], q, v, matrix, None)[0]
+    return efforts
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:

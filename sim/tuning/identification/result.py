@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from sim.robot.robot import Robot
-from sim.tuning.identification.plant import Drive
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.statistics import INTERVAL, Uncertainty
 from sim.tuning.identification.unknowns import PER_JOINT, Unknowns
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.robot.robot import Robot
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Drive, Motors, Plant, Segment
+from sim.tuning.identification.plant import Motors, Plant, Segment
 from sim.tuning.identification.regression import Motion
 
 Float64 = NDArray[np.float64]

@@ -12,10 +12,19 @@ pytest.importorskip("scipy")
 pytest.importorskip("cmaes")
 
 
+PENDULUM = """<robot name="pendulum"><link name="base"/>
+<link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>
+<inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="bob"/><origin xyz="0 0 0.5"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="40" velocity="6"/></joint></robot>"""
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Return a recording of a panda with motors of 0.9 of its strength, and the file of its params."""
-    folder, robot = tmp_path_factory.mktemp("log"), Robot.load("panda")
+    """Robot, a recording of it with a motor of 0.9 of its strength, and the params that drove it: files."""
+    folder = tmp_path_factory.mktemp("log")
+    (folder / "pendulum.urdf").write_text(PENDULUM)
+    robot = Robot.load(folder / "pendulum.urdf")
     gains, motion = robot.designed("effort"), excite(robot, seconds=1.0, lowest=1.0, rate=200)
     actuators = bp.make_actuators(robot.dof, strength=0.9)
     options = {"workers": 0, "substeps": 10, "compensate": "gravity+coriolis", "actuators": actuators}
@@ -23,30 +32,30 @@ def log(tmp_path_factory):
         runner.reset(motion.position[0])
         rollout = runner.rollout(motion.position)
     bp.save_params(folder / "gains.yaml", gains, robot.joint_names)
-    return write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
+    return folder / "pendulum.urdf", write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
 
 
 def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
-    recording, gains = log
+    robot, recording, gains = log
     out, details = tmp_path / "motors.yaml", tmp_path / "motors.json"
-    options = ("--evaluations", 1, "--workers", 0, "--no-payload", "--out", out, "--json", details)
-    status, said, error = batchpid("identify", "panda", recording, "--params", gains, *options)
+    options = ("--evaluations", 4, "--workers", 0, "--no-payload", "--out", out, "--json", details)
+    status, said, error = batchpid("identify", robot, recording, "--params", gains, *options)
     assert status == 0, error
-    assert "panda_joint1" in said
+    assert "hinge" in said
     document = json.loads(details.read_text())
-    assert set(document["joints"]["panda_joint2"]) == {"armature", "damping", "friction", "strength", "bias"}
+    assert set(document["joints"]["hinge"]) == {"armature", "damping", "friction", "strength", "bias"}
     assert document["held_out_error"][1] < document["held_out_error"][0]
-    assert Robot.load("panda", actuators=out).actuators is not None
+    assert Robot.load(robot, actuators=out).actuators is not None
     assert out.with_suffix(".png").exists()
     assert not out.with_suffix(".fit.json").exists()
 
 
 def test_what_is_missing_is_named(batchpid, log, tmp_path):
-    recording, _ = log
+    robot, recording, _ = log
     for words, message in (
-        (("identify", "panda"), "logs: are missing"),
-        (("identify", "panda", recording), "fit its setpoints"),
-        (("identify", "panda", recording, "--evaluations", 0), "evaluations"),
+        (("identify", robot), "logs: are missing"),
+        (("identify", robot, recording), "fit its setpoints"),
+        (("identify", robot, recording, "--evaluations", 0), "evaluations"),
     ):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
         assert status != 0

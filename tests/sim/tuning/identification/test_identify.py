@@ -8,9 +8,10 @@ import pytest
 import batchpid as bp
 from sim import Robot
 from sim.tuning import identify
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.excitation import excite
 from sim.tuning.identification.logs import Log, read_logs
-from sim.tuning.identification.plant import Drive, Motors, Plant, Segment
+from sim.tuning.identification.plant import Motors, Plant, Segment
 from sim.tuning.identification.unknowns import PER_JOINT
 
 pytest.importorskip("scipy")

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Drive, Motors, Plant, Segment
+from sim.tuning.identification.plant import Motors, Plant, Segment
 from sim.tuning.identification.regression import STRONG, Regression, smooth
 from sim.tuning.identification.unknowns import PER_JOINT
 
