@@ -34,7 +34,7 @@ TRIES = 6
 _ONE_STEP = 1.0
 """Relative tolerance of the sum of squares that ends least_squares with its first good step."""
 _INSIDE = 1e-9
-"""Least distance of the start from the bounds, over typical sizes."""
+"""Least distance of points from the bounds, over typical sizes."""
 
 
 class Solution(NamedTuple):
@@ -62,7 +62,7 @@ def fit(
     factors = _Factors(problem, left)
     scale, spread = problem.unknowns.scale, problem.unknowns.spread
     bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
-    x = np.clip(start / scale, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
+    x = _inside(start / scale, bounds)
     cost, last = np.inf, x
     if not np.isfinite(factors.at(x * scale)).all():
         remedy = "check the params that drove the robot, --timestep and the units of the logs"
@@ -91,7 +91,11 @@ def fit(
         most = min(TRIES, factors.left) + 1
         options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
         last = x
-        x = least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x
+        x = _inside(least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x, bounds)
+
+
+def _inside(x: Float64, bounds: tuple[Float64, Float64]) -> Float64:
+    return np.clip(x, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
 
 
 def _deviations(factors: Float64, prior: Float64) -> Float64:

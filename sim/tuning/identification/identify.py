@@ -165,10 +165,14 @@ class _Steps:
 
 
 def _variants(drive: Drive) -> list[Drive]:
-    """Return ways in which the law may measure: without noise, or differences of positions with their noise."""
+    """Return ways in which the law may measure: rates or differences of positions, with the sensors' noise or without.
+
+    Without noise, positions and rates are those of the simulation.
+    """
     if drive.params is None:
         return [drive]
-    return [drive, replace(drive, noisy=True, measured_rate=False)]
+    quiet = replace(drive, measured_rate=False)
+    return [*([drive] if drive.measured_rate else []), quiet, replace(quiet, noisy=True)]
 
 
 def _fit_all(problems: list[Problem], state: State, record: History, steps: _Steps) -> list[Solution]:

@@ -45,7 +45,7 @@ class Unknowns:
     names: tuple[tuple[str, int | None], ...]
     """Kind and joint of each, None for delay and payload."""
     scale: Float64
-    """Typical sizes."""
+    """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
 
     @classmethod
     def of(cls, inertia: Float64, effort: Float64, speed: Float64, payload: bool) -> Unknowns:
@@ -63,7 +63,7 @@ class Unknowns:
         if payload:
             names.append(("payload", None))
             scale.append(0.2)
-        return cls(len(inertia), tuple(names), np.array(scale))
+        return cls(len(inertia), tuple(names), 2.0 ** np.round(np.log2(scale)))
 
     @property
     def low(self) -> Float64:

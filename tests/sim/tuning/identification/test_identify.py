@@ -136,21 +136,26 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
     time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
-    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 2}
-    whole = identify(arm, log, **options)
+    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 9}
+    seen = []
+    whole = identify(arm, log, **options, progress=lambda steps: (seen.append(step) or step for step in steps))
 
     def stop(steps):
         for step in steps:
-            if step == 1:
+            if step == last:
                 raise KeyboardInterrupt
             yield step
 
-    with pytest.raises(KeyboardInterrupt):
-        identify(arm, log, **options, history=tmp_path / "fit.json", progress=stop)
-    resumed = identify(arm, log, **options, history=tmp_path / "fit.json")
-    assert np.array_equal(resumed.estimate, whole.estimate)
+    for last in (1, len(seen) - 1):  # the second while the fit with noise runs
+        history = tmp_path / f"fit{last}.json"
+        with pytest.raises(KeyboardInterrupt):
+            identify(arm, log, **options, history=history, progress=stop)
+        resumed = identify(arm, log, **options, history=history)
+        assert np.array_equal(resumed.estimate, whole.estimate)
+        assert np.array_equal(resumed.uncertainty.deviation, whole.uncertainty.deviation)
+    assert json.loads(history.read_text())["done"]
     with pytest.raises(bp.InvalidArgumentError, match=r"another fit \(seed differ\)"):
-        identify(arm, log, **options, seed=1, history=tmp_path / "fit.json")
+        identify(arm, log, **options, seed=1, history=history)
 
 
 @pytest.mark.slow
