@@ -63,7 +63,7 @@ class Unknowns:
         if payload:
             names.append(("payload", None))
             scale.append(0.2)
-        return cls(len(inertia), tuple(names), 2.0 ** np.round(np.log2(scale)))
+        return cls(len(inertia), tuple(names), np.exp2(np.round(np.log2(np.array(scale, np.float64)))))
 
     @property
     def low(self) -> Float64:
