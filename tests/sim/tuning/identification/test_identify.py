@@ -217,3 +217,23 @@ def test_the_intervals_hold_the_truth(arm, mujoco_log):
         assert found.held_out_error[1] < 0.1 * found.held_out_error[0]
     print(np.round(inside, 2), np.mean(inside), sorted(worst, reverse=True)[:5])
     assert np.mean(inside) >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["setpoint", "effort"])
+def test_the_motors_of_a_panda_are_found(panda, mujoco_log, kind):
+    """Its seven arm joints, from ten seconds in MuJoCo."""
+    truth, params = mujoco_log["plausible"](panda, 5), panda.designed("effort")
+    every = 2 if kind == "setpoint" else 1  # the noise in efforts between the rows of a log is not known
+    table = mujoco_log["simulate"](panda, truth, excite(panda, 10.0), params, moving=7, every=every, seed=5)
+    log = Log("log", tuple(range(7)), kind, table["time"], table["qpos"], table["time"], table[kind], False)
+    of_arm = bp.PIDParams(*(leaf[:, :7] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    found = identify(panda, log, params=of_arm if kind == "setpoint" else None)
+    for number in range(7):
+        for name in ("armature", "damping", "friction", "strength"):
+            estimate, low, high = found.interval(name, number)
+            wanted = float(getattr(truth, name)[number])
+            assert abs(estimate - wanted) < 0.05 * wanted, (name, number)
+            assert low - 0.02 * wanted < wanted < high + 0.02 * wanted, (name, number)
+    assert found.interval("delay")[0] == pytest.approx(truth.delay, abs=2e-4)
+    assert found.held_out_error[1] < 0.1 * found.held_out_error[0]
