@@ -69,7 +69,6 @@ class Problem:
     unknowns: Unknowns
     executor: Executor | None = None
     windows: list[Window] = field(init=False)
-
     noise: Float64 = field(init=False)
     """Twice the noise of the sensors (joints,) [rad or m]."""
     stretches: list[list[NDArray[np.intp]]] = field(init=False)
@@ -95,7 +94,7 @@ class Problem:
 
     @property
     def shoots(self) -> bool:
-        """Whether the initial states of the windows are unknown."""
+        """True if the initial states of the windows are unknown."""
         return self.drive.params is None
 
     def residuals(self, points: Float64) -> list[Float64]:

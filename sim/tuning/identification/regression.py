@@ -5,10 +5,9 @@ With the measured motion filtered without phase lag, and the effort u filtered a
     s u(t - d) + b + c - h - (M q'')_j = A q''_j + B q'_j + F sgn(q'_j)
 
 which is solved by least squares with A, B, F >= 0, for each delay d of a grid, where the joint moves fast enough not to
-stick (J. Swevers, W. Verdonck and J. De
-Schutter, "Dynamic model identification for industrial robots", IEEE Control Systems Magazine 27(5), 2007; M. Gautier,
-"Dynamic identification of robots with power model", ICRA 1997). Under the PID law u is computed from the filtered
-positions. A weak prior keeps what the log does not show at strength 1.
+stick (J. Swevers, W. Verdonck and J. De Schutter, "Dynamic model identification for industrial robots", IEEE Control
+Systems Magazine 27(5), 2007; M. Gautier, "Dynamic identification of robots with power model", ICRA 1997). Under the PID
+law u is computed from the filtered positions. A weak prior keeps what the log does not show at strength 1.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ MEMORY = 1.0
 """Longest lag of the autocovariance [s]."""
 MODEL_ERROR = 2.0
 """Factor of the standard deviations that allows for errors of the model, such as friction near rest under a law that
-sees noise. Without it a quarter of the intervals missed the truth on a log of a panda in MuJoCo with known motors."""
+sees noise. Without it 30 % of the intervals missed the truth on logs of a two-joint arm in MuJoCo."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED = 0.1

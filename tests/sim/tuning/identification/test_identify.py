@@ -1,4 +1,5 @@
 import json
+import os
 import runpy
 from pathlib import Path
 
@@ -220,12 +221,13 @@ def test_the_intervals_hold_the_truth(arm, mujoco_log):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", range(int(os.environ.get("BATCHPID_SOAK_SEEDS", "1"))))
 @pytest.mark.parametrize("kind", ["setpoint", "effort"])
-def test_the_motors_of_a_panda_are_found(panda, mujoco_log, kind):
+def test_the_motors_of_a_panda_are_found(panda, mujoco_log, kind, seed):
     """Its seven arm joints, from ten seconds in MuJoCo."""
-    truth, params = mujoco_log["plausible"](panda, 5), panda.designed("effort")
+    truth, params = mujoco_log["plausible"](panda, seed), panda.designed("effort")
     every = 2 if kind == "setpoint" else 1  # the noise in efforts between the rows of a log is not known
-    table = mujoco_log["simulate"](panda, truth, excite(panda, 10.0), params, moving=7, every=every, seed=5)
+    table = mujoco_log["simulate"](panda, truth, excite(panda, 10.0), params, moving=7, every=every, seed=seed)
     log = Log("log", tuple(range(7)), kind, table["time"], table["qpos"], table["time"], table[kind], False)
     of_arm = bp.PIDParams(*(leaf[:, :7] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
     found = identify(panda, log, params=of_arm if kind == "setpoint" else None)
