@@ -28,11 +28,17 @@ from numpy.typing import NDArray
 
 from sim.engine.calls import EngineCalls, PythonCalls
 
-extension: Any
-try:
-    extension = importlib.import_module("sim.engine.native._gateway")
-except ImportError:
-    extension = None
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(f"sim.engine.native.{name}")
+    except ImportError:
+        return None
+
+
+extension = _imported("_gateway")
+batch_extension = _imported("_batch_dynamics")
+"""Functions of :mod:`sim.engine.batch_dynamics`; they call nothing of SAPIEN. None if they were not built."""
 
 SWITCH = "BATCHPID_NATIVE"
 """Environment variable: "0" switches the native calls off."""

@@ -2,12 +2,6 @@
 
 #pragma once
 
-#define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
-#define Py_LIMITED_API 0x030B0000
-#endif
-#include <Python.h>
-
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -15,6 +9,8 @@
 #include <exception>
 #include <typeinfo>
 #include <vector>
+
+#include "buffer.h"
 
 namespace sapien::physx {
 class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
@@ -63,30 +59,6 @@ inline void apply(Functions const &call, Articulation *robot, float *qf, std::pt
 }
 
 inline constexpr char GATEWAY[] = "batchpid.gateway";
-
-// Contiguous buffer of a Python object, released at the end of the scope.
-class Buffer {
- public:
-  bool open(PyObject *object, Py_ssize_t count, Py_ssize_t size, int flags) {
-    if (PyObject_GetBuffer(object, &view_, flags) != 0) return false;
-    held_ = true;
-    if ((size == 0 || view_.itemsize == size) && view_.len == count * view_.itemsize) return true;
-    PyErr_SetString(PyExc_ValueError, "an array of the gateway has a wrong size or type");
-    return false;
-  }
-  ~Buffer() {
-    if (held_) PyBuffer_Release(&view_);
-  }
-  template <class T>
-  T *as() const {
-    return static_cast<T *>(view_.buf);
-  }
-  Py_ssize_t itemsize() const { return view_.itemsize; }
-
- private:
-  Py_buffer view_{};
-  bool held_ = false;
-};
 
 inline Gateway *gateway_of(PyObject *capsule) {
   return static_cast<Gateway *>(PyCapsule_GetPointer(capsule, GATEWAY));

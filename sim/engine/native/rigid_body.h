@@ -1,5 +1,7 @@
-// Mass matrix of a tree of rigid bodies by the composite-rigid-body algorithm; the equations stand in
-// sim/engine/rigid_body.py.
+// Rigid-body dynamics of a tree on a fixed base: mass matrix by the composite-rigid-body algorithm, passive forces by
+// the recursive Newton-Euler algorithm. The equations stand in sim/engine/rigid_body.py and sim/engine/batch_dynamics.py.
+//
+// A number N is a double, or a vector of them: one for each of several robots.
 
 #pragma once
 
@@ -11,14 +13,25 @@
 
 namespace batchpid {
 
+template <class N>
 struct Vector {
-  double x, y, z;
+  N x, y, z;
 };
 
-inline Vector operator+(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vector operator*(double s, Vector a) { return {s * a.x, s * a.y, s * a.z}; }
-inline double dot(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vector cross(Vector a, Vector b) {
+template <class N>
+Vector<N> operator+(Vector<N> a, Vector<N> b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class S, class N>
+Vector<N> operator*(S s, Vector<N> a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+template <class N>
+N dot(Vector<N> a, Vector<N> b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class N>
+Vector<N> cross(Vector<N> a, Vector<N> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
@@ -28,77 +41,167 @@ struct BodyRow {
   T rotation[3][3], position[3], mass, center[3], tensor[3][3];
 };
 
-// Body at a pose: axes and origin of its frame; then, of all that its joint moves, mass, first moment and inertia tensor.
-struct BodyState {
-  Vector axes[3], origin;
-  double mass;
-  Vector first;
-  Vector tensor[3];  // rows
+// Mass, first moment and inertia tensor (its rows), in the axes of the base and about its origin.
+template <class N>
+struct Inertia {
+  N mass;
+  Vector<N> first;
+  Vector<N> tensor[3];
+
+  void add(Inertia const &other) {
+    mass += other.mass;
+    first = first + other.first;
+    for (int k = 0; k < 3; ++k) tensor[k] = tensor[k] + other.tensor[k];
+  }
+  Vector<N> linear(Vector<N> turning, Vector<N> moving) const { return mass * moving + cross(turning, first); }
+  Vector<N> angular(Vector<N> turning, Vector<N> moving) const {
+    Vector<N> const turned{dot(tensor[0], turning), dot(tensor[1], turning), dot(tensor[2], turning)};
+    return turned + cross(first, moving);
+  }
 };
 
-template <class T>
-Vector in_axes(Vector const (&axes)[3], T x, T y, T z) {
-  return double(x) * axes[0] + double(y) * axes[1] + double(z) * axes[2];
+template <class N>
+Inertia<N> point_mass(N mass, Vector<N> place) {
+  Inertia<N> made{mass, mass * place, {}};
+  N const square = dot(place, made.first);
+  made.tensor[0] = {square, N{}, N{}};
+  made.tensor[1] = {N{}, square, N{}};
+  made.tensor[2] = {N{}, N{}, square};
+  N const places[3] = {place.x, place.y, place.z};
+  for (int k = 0; k < 3; ++k) made.tensor[k] = made.tensor[k] + -places[k] * made.first;
+  return made;
 }
 
-// Write the mass matrix (dof, dof) at the pose qpos (dof,). tree (dof, 2): the joint above, or -1; whether it slides.
-template <class T>
-void mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, T const *qpos, T *matrix,
-                 std::vector<BodyState> &bodies) {
-  bodies.resize(static_cast<std::size_t>(dof));
-  BodyState *body = bodies.data();
+// Body at a pose: axes and origin of its frame, and the inertia of it, or of all that its joint moves.
+template <class N>
+struct BodyState {
+  Vector<N> axes[3], origin;
+  Inertia<N> inertia;
+};
+
+template <class N, class T>
+Vector<N> in_axes(Vector<N> const (&axes)[3], T x, T y, T z) {
+  return x * axes[0] + y * axes[1] + z * axes[2];
+}
+
+template <class N>
+Vector<N> turning(BodyState<N> const &body, bool slides) {
+  return slides ? Vector<N>{} : body.axes[0];
+}
+template <class N>
+Vector<N> moving(BodyState<N> const &body, bool slides) {
+  return slides ? body.axes[0] : cross(body.origin, body.axes[0]);
+}
+
+// Write the states of the bodies at a pose. tree (dof, 2): the joint above, or -1; whether it slides.
+template <class N, class T>
+void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, N const *cosine, N const *sine,
+                  N const *qpos, BodyState<N> *body) {
+  BodyState<N> base{};
+  base.axes[0].x = base.axes[1].y = base.axes[2].z = N(1.0);
   for (std::int64_t j = 0; j < dof; ++j) {
-    BodyState base{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}, 0, {0, 0, 0}, {}};
-    BodyState const &above = tree[2 * j] < 0 ? base : body[tree[2 * j]];
+    BodyState<N> const &above = tree[2 * j] < 0 ? base : body[tree[2 * j]];
     BodyRow<T> const &row = rows[j];
-    BodyState &at = body[j];
+    BodyState<N> &at = body[j];
+    auto const in = [](auto const &axes, auto const(&v)[3]) { return in_axes(axes, double(v[0]), double(v[1]), double(v[2])); };
     for (int k = 0; k < 3; ++k) {
-      at.axes[k] = in_axes(above.axes, row.rotation[0][k], row.rotation[1][k], row.rotation[2][k]);
+      double const column[3] = {double(row.rotation[0][k]), double(row.rotation[1][k]), double(row.rotation[2][k])};
+      at.axes[k] = in(above.axes, column);
     }
-    at.origin = above.origin + in_axes(above.axes, row.position[0], row.position[1], row.position[2]);
+    at.origin = above.origin + in(above.axes, row.position);
     if (tree[2 * j + 1]) {
-      at.origin = at.origin + double(qpos[j]) * at.axes[0];
+      at.origin = at.origin + qpos[j] * at.axes[0];
     } else {
-      double const c = std::cos(double(qpos[j])), s = std::sin(double(qpos[j]));
-      Vector const y = at.axes[1], z = at.axes[2];
-      at.axes[1] = c * y + s * z;
-      at.axes[2] = c * z + -s * y;
+      Vector<N> const y = at.axes[1], z = at.axes[2];
+      at.axes[1] = cosine[j] * y + sine[j] * z;
+      at.axes[2] = cosine[j] * z + -sine[j] * y;
     }
-    Vector const center = at.origin + in_axes(at.axes, row.center[0], row.center[1], row.center[2]);
-    at.mass = row.mass;
-    at.first = at.mass * center;
-    double const square = dot(center, at.first);
-    at.tensor[0] = {square, 0, 0};
-    at.tensor[1] = {0, square, 0};
-    at.tensor[2] = {0, 0, square};
-    double const centers[3] = {center.x, center.y, center.z};
-    for (int k = 0; k < 3; ++k) at.tensor[k] = at.tensor[k] + -centers[k] * at.first;
+    at.inertia = point_mass(N(double(row.mass)), at.origin + in(at.axes, row.center));
     for (int k = 0; k < 3; ++k) {  // R T R^T: the sum of (T column k in the base's axes) times axis k
-      Vector const turned = in_axes(at.axes, row.tensor[0][k], row.tensor[1][k], row.tensor[2][k]);
-      at.tensor[0] = at.tensor[0] + turned.x * at.axes[k];
-      at.tensor[1] = at.tensor[1] + turned.y * at.axes[k];
-      at.tensor[2] = at.tensor[2] + turned.z * at.axes[k];
+      Vector<N> const turned = in(at.axes, row.tensor[k]);
+      Vector<N> *tensor = at.inertia.tensor;
+      tensor[0] = tensor[0] + turned.x * at.axes[k];
+      tensor[1] = tensor[1] + turned.y * at.axes[k];
+      tensor[2] = tensor[2] + turned.z * at.axes[k];
     }
   }
-  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = 0;
+}
+
+// Write the mass matrix (dof, dof) of the bodies; each then has the inertia of all that its joint moves.
+template <class N, class T>
+void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, T *matrix) {
+  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = T{};
   for (std::int64_t j = dof - 1; j >= 0; --j) {
-    BodyState const &moved = body[j];
-    if (tree[2 * j] >= 0) {
-      BodyState &above = body[tree[2 * j]];
-      above.mass += moved.mass;
-      above.first = above.first + moved.first;
-      for (int k = 0; k < 3; ++k) above.tensor[k] = above.tensor[k] + moved.tensor[k];
-    }
-    Vector const zero{0, 0, 0}, axis = moved.axes[0];
-    Vector const w = tree[2 * j + 1] ? zero : axis, v = tree[2 * j + 1] ? axis : cross(moved.origin, axis);
-    Vector const linear = moved.mass * v + cross(w, moved.first);
-    Vector const turned{dot(moved.tensor[0], w), dot(moved.tensor[1], w), dot(moved.tensor[2], w)};
-    Vector const angular = turned + cross(moved.first, v);
+    Inertia<N> const &moved = body[j].inertia;
+    if (tree[2 * j] >= 0) body[tree[2 * j]].inertia.add(moved);
+    Vector<N> const w = turning(body[j], tree[2 * j + 1]), v = moving(body[j], tree[2 * j + 1]);
+    Vector<N> const linear = moved.linear(w, v), angular = moved.angular(w, v);
     for (std::int64_t i = j; i >= 0; i = tree[2 * i]) {
-      Vector const a = body[i].axes[0];
-      double const product = tree[2 * i + 1] ? dot(a, linear) : dot(a, angular) + dot(cross(body[i].origin, a), linear);
+      Vector<N> const a = body[i].axes[0];
+      N const product = tree[2 * i + 1] ? dot(a, linear) : dot(a, angular) + dot(cross(body[i].origin, a), linear);
       matrix[i * dof + j] = matrix[j * dof + i] = static_cast<T>(product);
     }
+  }
+}
+
+// Write the mass matrix (dof, dof) at the pose qpos (dof,).
+template <class T>
+void mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, T const *qpos, T *matrix,
+                 std::vector<BodyState<double>> &bodies) {
+  bodies.resize(static_cast<std::size_t>(dof));
+  std::vector<double> angle, cosine, sine;
+  angle.assign(qpos, qpos + dof);
+  cosine.resize(angle.size());
+  sine.resize(angle.size());
+  for (std::size_t j = 0; j < angle.size(); ++j) {
+    cosine[j] = std::cos(angle[j]);
+    sine[j] = std::sin(angle[j]);
+  }
+  place_bodies(dof, tree, rows, cosine.data(), sine.data(), angle.data(), bodies.data());
+  composite_mass_matrix(dof, tree, bodies.data(), matrix);
+}
+
+// Velocity and acceleration of a body, and the wrench on it, about the origin.
+template <class N>
+struct BodyMotion {
+  Vector<N> turning, moving, turning_change, moving_change;
+  Vector<N> torque, force;
+
+  // Add the wrench that moves an inertia with the body.
+  void accelerate(Inertia<N> const &inertia) {
+    Vector<N> const linear = inertia.linear(turning, moving), angular = inertia.angular(turning, moving);
+    force = force + inertia.linear(turning_change, moving_change) + cross(turning, linear);
+    torque = torque + inertia.angular(turning_change, moving_change) + cross(turning, angular) + cross(moving, linear);
+  }
+};
+
+// Write the efforts (dof,) of the wrenches of all bodies; each body above gets those of the bodies below, too.
+template <class N>
+void efforts_of_wrenches(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, BodyMotion<N> *motion,
+                         N *effort) {
+  for (std::int64_t j = dof - 1; j >= 0; --j) {
+    BodyMotion<N> const &at = motion[j];
+    effort[j] = dot(turning(body[j], tree[2 * j + 1]), at.torque) + dot(moving(body[j], tree[2 * j + 1]), at.force);
+    if (tree[2 * j] < 0) continue;
+    BodyMotion<N> &above = motion[tree[2 * j]];
+    above.torque = above.torque + at.torque;
+    above.force = above.force + at.force;
+  }
+}
+
+// Write the motions of the bodies, without acceleration of the joints; gravity (3,) is an acceleration of the base.
+template <class N>
+void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, N const *qvel,
+                 double const *gravity, BodyMotion<N> *motion) {
+  BodyMotion<N> base{};
+  base.moving_change = {N(-gravity[0]), N(-gravity[1]), N(-gravity[2])};
+  for (std::int64_t j = 0; j < dof; ++j) {
+    BodyMotion<N> const &above = tree[2 * j] < 0 ? base : motion[tree[2 * j]];
+    Vector<N> const w = qvel[j] * turning(body[j], tree[2 * j + 1]), v = qvel[j] * moving(body[j], tree[2 * j + 1]);
+    BodyMotion<N> &at = motion[j];
+    at = BodyMotion<N>{above.turning + w, above.moving + v, above.turning_change, above.moving_change, {}, {}};
+    at.turning_change = at.turning_change + cross(at.turning, w);
+    at.moving_change = at.moving_change + cross(at.turning, v) + cross(at.moving, w);
   }
 }
 

@@ -134,7 +134,7 @@ extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
 template <class T>
 void mass_matrices(std::int64_t count, std::int64_t dof, Array **in, Array *out) {
   static_assert(sizeof(BodyRow<T>) == 25 * sizeof(T));
-  std::vector<BodyState> bodies;
+  std::vector<BodyState<double>> bodies;
   auto const *rows = reinterpret_cast<BodyRow<T> const *>(in[1]->data);
   for (std::int64_t n = 0; n < count; ++n) {
     mass_matrix(dof, data<std::int32_t const>(in[0]), rows, data<T const>(in[2]) + n * dof,

@@ -1,0 +1,308 @@
+// Dynamics of many robots of one kind, and steps of their joints with friction; the equations stand in
+// sim/engine/batch_dynamics.py. Nothing of SAPIEN is needed.
+
+#include <algorithm>
+#include <memory>
+
+#include "buffer.h"
+#include "rigid_body.h"
+
+using namespace batchpid;
+
+namespace {
+
+// Compile a function twice, for processors with AVX2 and without; the results are the same, since no operation is fused.
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2"), flatten))
+#else
+#define FOR_EACH_PROCESSOR
+#endif
+
+constexpr int WIDTH = 4;
+
+// Numbers of WIDTH robots. Each is rounded as a double is, so that results do not depend on a robot's company.
+struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherwise with AVX2 than without
+  typedef double Packed __attribute__((vector_size(WIDTH * sizeof(double))));
+  Packed of;
+
+  Lanes() : of{} {}
+  Lanes(Packed packed) : of(packed) {}
+  Lanes(double each) : of(Packed{} + each) {}
+  void operator+=(Lanes b) { of += b.of; }
+  void operator-=(Lanes b) { of -= b.of; }
+  friend Lanes operator-(Lanes a) { return -a.of; }
+  friend Lanes operator+(Lanes a, Lanes b) { return a.of + b.of; }
+  friend Lanes operator-(Lanes a, Lanes b) { return a.of - b.of; }
+  friend Lanes operator*(Lanes a, Lanes b) { return a.of * b.of; }
+  friend Lanes operator/(Lanes a, Lanes b) { return a.of / b.of; }
+  friend Lanes at_least(Lanes a, Lanes low) { return a.of < low.of ? low.of : a.of; }
+  friend Lanes at_most(Lanes a, Lanes high) { return a.of > high.of ? high.of : a.of; }
+  friend Lanes zero_outside(Lanes a, Lanes low, Lanes q, Lanes high) {
+    return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
+  }
+};
+
+constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
+char const *const TREE = "batchpid.Tree";
+
+// Constants of a robot. Followers move with their leaders: q = rest + multiplier * q_leader.
+struct Tree {
+  BodyRow<double> const *bodies() const { return reinterpret_cast<BodyRow<double> const *>(rows.data()); }
+
+  std::int64_t dof, joints;
+  std::vector<std::int32_t> tree;
+  std::vector<double> rows;  // of BodyRow
+  std::vector<std::int32_t> leader;  // of each of dof: a number below `joints`, or -1
+  std::vector<double> multiplier, rest;
+  std::int64_t carrier;  // body that carries the payload
+  double point[3], gravity[3];
+};
+
+// Storage for WIDTH robots.
+struct Workspace {
+  std::vector<Lanes> qpos, qvel, cosine, sine, matrix, effort, loaded;
+  std::vector<BodyState<Lanes>> bodies;
+  std::vector<BodyMotion<Lanes>> motions;
+
+  explicit Workspace(std::int64_t dof) {
+    auto const n = static_cast<std::size_t>(dof);
+    for (auto *leaf : {&qpos, &qvel, &cosine, &sine, &effort, &loaded}) leaf->resize(n);
+    matrix.resize(n * n);
+    bodies.resize(n);
+    motions.resize(n);
+  }
+};
+
+Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
+
+template <class T>
+bool copy(PyObject *array, Py_ssize_t count, std::vector<T> &to) {
+  Buffer from;
+  if (!from.open(array, count, sizeof(T), PyBUF_C_CONTIGUOUS)) return false;
+  to.assign(from.as<T>(), from.as<T>() + count);
+  return true;
+}
+
+// tree(tree, rows, leader, multiplier, rest, joints, carrier, point, gravity)
+PyObject *make_tree(PyObject *, PyObject *arguments) {
+  PyObject *tree, *rows, *leader, *multiplier, *rest;
+  auto made = std::make_unique<Tree>();
+  Py_ssize_t dof, joints, carrier;
+  if (!PyArg_ParseTuple(arguments, "OOOOOnnn(ddd)(ddd)", &tree, &rows, &leader, &multiplier, &rest, &dof, &joints,
+                        &carrier, &made->point[0], &made->point[1], &made->point[2], &made->gravity[0],
+                        &made->gravity[1], &made->gravity[2])) {
+    return nullptr;
+  }
+  made->dof = dof;
+  made->joints = joints;
+  made->carrier = carrier;
+  if (!copy(tree, 2 * dof, made->tree) || !copy(rows, dof * COLUMNS, made->rows) || !copy(leader, dof, made->leader) ||
+      !copy(multiplier, dof, made->multiplier) || !copy(rest, dof, made->rest)) {
+    return nullptr;
+  }
+  return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
+}
+
+// Copy a column of each of WIDTH rows, from row `first` on; the last row stands for those that there are not.
+Lanes gather(double const *table, std::int64_t columns, std::int64_t column, std::int64_t first, std::int64_t rows) {
+  Lanes out;
+  for (int k = 0; k < WIDTH; ++k) out.of[k] = table[std::min(first + k, rows - 1) * columns + column];
+  return out;
+}
+
+void scatter(Lanes value, double *table, std::int64_t columns, std::int64_t column, std::int64_t first,
+             std::int64_t rows) {
+  for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = value.of[k];
+}
+
+// Set positions, velocities, cosines and sines of all joints from those of the logged ones.
+void set_state(Tree const &tree, Workspace &work, double const *qpos, double const *qvel, std::int64_t first,
+               std::int64_t rows) {
+  for (std::int64_t i = 0; i < tree.dof; ++i) {
+    Lanes &q = work.qpos[i];
+    q = tree.rest[i];
+    work.qvel[i] = {};
+    if (tree.leader[i] >= 0) {
+      q += tree.multiplier[i] * gather(qpos, tree.joints, tree.leader[i], first, rows);
+      work.qvel[i] = tree.multiplier[i] * gather(qvel, tree.joints, tree.leader[i], first, rows);
+    }
+    for (int k = 0; k < WIDTH; ++k) {
+      work.cosine[i].of[k] = std::cos(q.of[k]);
+      work.sine[i].of[k] = std::sin(q.of[k]);
+    }
+  }
+}
+
+// Write mass matrix, passive force without payload and passive force of the payload of rows of robots.
+FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, double const *qpos, double const *qvel,
+                                       double const *payload, double *const (&out)[3]) {
+  std::int64_t const joints = tree.joints, dof = tree.dof;
+  std::int64_t const sizes[3] = {joints * joints, joints, joints};
+  std::int32_t const *above = tree.tree.data();
+  Workspace work(dof);
+  std::vector<Lanes> matrix(static_cast<std::size_t>(joints * joints)), force(joints), loaded(joints);
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    set_state(tree, work, qpos, qvel, first, rows);
+    BodyState<Lanes> *bodies = work.bodies.data();
+    BodyMotion<Lanes> *motions = work.motions.data();
+    place_bodies(dof, above, tree.bodies(), work.cosine.data(), work.sine.data(), work.qpos.data(), bodies);
+    move_bodies(dof, above, bodies, work.qvel.data(), tree.gravity, motions);
+    BodyState<Lanes> &carrier = bodies[tree.carrier];
+    Vector<Lanes> const place = carrier.origin + in_axes(carrier.axes, tree.point[0], tree.point[1], tree.point[2]);
+    Inertia<Lanes> const load = point_mass(gather(payload, 1, 0, first, rows), place);
+    motions[tree.carrier].accelerate(load);
+    efforts_of_wrenches(dof, above, bodies, motions, work.loaded.data());
+    for (std::int64_t i = 0; i < dof; ++i) {
+      motions[i].torque = motions[i].force = Vector<Lanes>{};
+      motions[i].accelerate(bodies[i].inertia);
+    }
+    efforts_of_wrenches(dof, above, bodies, motions, work.effort.data());
+    carrier.inertia.add(load);
+    composite_mass_matrix(dof, above, bodies, work.matrix.data());
+    for (auto *leaf : {&matrix, &force, &loaded}) std::fill(leaf->begin(), leaf->end(), Lanes{});
+    for (std::int64_t i = 0; i < dof; ++i) {
+      std::int64_t const a = tree.leader[i];
+      if (a < 0) continue;
+      force[a] += tree.multiplier[i] * work.effort[i];
+      loaded[a] += tree.multiplier[i] * work.loaded[i];
+      for (std::int64_t j = 0; j < dof; ++j) {
+        std::int64_t const b = tree.leader[j];
+        if (b >= 0) matrix[a * joints + b] += tree.multiplier[i] * tree.multiplier[j] * work.matrix[i * dof + j];
+      }
+    }
+    std::vector<Lanes> const *leaves[3] = {&matrix, &force, &loaded};
+    for (int leaf = 0; leaf < 3; ++leaf) {
+      for (std::int64_t k = 0; k < sizes[leaf]; ++k) scatter((*leaves[leaf])[k], out[leaf], sizes[leaf], k, first, rows);
+    }
+  }
+}
+
+// dynamics(tree, qpos, qvel, payload, matrix, force, payload_force)
+PyObject *dynamics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Tree const *tree = tree_of(arguments[0]);
+  if (tree == nullptr) return nullptr;
+  std::int64_t const rows = PyObject_Size(arguments[1]), joints = tree->joints;
+  std::int64_t const sizes[6] = {joints, joints, 1, joints * joints, joints, joints};
+  Buffer arrays[6];
+  for (int i = 0; i < 6; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i < 3 ? 0 : PyBUF_WRITABLE);
+    if (!arrays[i].open(arguments[i + 1], rows * sizes[i], sizeof(double), flags)) return nullptr;
+  }
+  write_dynamics(*tree, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
+                 {arrays[3].as<double>(), arrays[4].as<double>(), arrays[5].as<double>()});
+  Py_RETURN_NONE;
+}
+
+// Replace a symmetric positive definite matrix (n, n) by its inverse, by Cholesky's factor; nan if it is not definite.
+void invert(std::int64_t n, std::vector<Lanes> &matrix, std::vector<Lanes> &factor) {
+  auto const root = [](Lanes x) {
+    for (int k = 0; k < WIDTH; ++k) x.of[k] = std::sqrt(x.of[k]);
+    return x;
+  };
+  Lanes *a = matrix.data(), *l = factor.data();
+  for (std::int64_t j = 0; j < n; ++j) {  // L, with the inverses of its diagonal
+    for (std::int64_t i = j; i < n; ++i) {
+      Lanes sum = a[i * n + j];
+      for (std::int64_t k = 0; k < j; ++k) sum -= l[i * n + k] * l[j * n + k];
+      l[i * n + j] = i == j ? 1.0 / root(sum) : sum * l[j * n + j];
+    }
+  }
+  for (std::int64_t j = 0; j < n; ++j) {  // L^-1, below the diagonal
+    for (std::int64_t i = j + 1; i < n; ++i) {
+      Lanes sum = l[i * n + j] * l[j * n + j];
+      for (std::int64_t k = j + 1; k < i; ++k) sum += l[i * n + k] * l[k * n + j];
+      l[i * n + j] = -sum * l[i * n + i];
+    }
+  }
+  for (std::int64_t i = 0; i < n; ++i) {
+    for (std::int64_t j = 0; j <= i; ++j) {
+      Lanes sum{};
+      for (std::int64_t k = i; k < n; ++k) sum += l[k * n + i] * l[k * n + j];
+      a[i * n + j] = a[j * n + i] = sum;
+    }
+  }
+}
+
+// Arrays of `step`, in this order.
+enum Leaf { QPOS, QVEL, FRICTION, MATRIX, EFFORT, ADDED, LIMIT, KEEP, CREEP, LOW, HIGH, LEAVES };
+
+// Step rows of robots: QPOS, QVEL and FRICTION are changed.
+FOR_EACH_PROCESSOR void step_rows(std::int64_t rows, std::int64_t joints, double *const (&table)[LEAVES], double dt,
+                                  long sweeps) {
+  auto const n = static_cast<std::size_t>(joints);
+  std::vector<Lanes> inverse(n * n), factor(n * n), free(n), kept(n), creep(n), weight(n), limit(n), f(n), effort(n);
+  auto const along = [&](std::int64_t j, std::vector<Lanes> const &column) {
+    Lanes sum{};
+    for (std::int64_t k = 0; k < joints; ++k) sum += inverse[j * joints + k] * column[k];
+    return dt * sum;
+  };
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    auto const at = [&](Leaf leaf, std::int64_t j) { return gather(table[leaf], joints, j, first, rows); };
+    for (std::int64_t k = 0; k < joints * joints; ++k) {
+      inverse[k] = gather(table[MATRIX], joints * joints, k, first, rows);
+    }
+    for (std::int64_t j = 0; j < joints; ++j) inverse[j * joints + j] += at(ADDED, j);
+    invert(joints, inverse, factor);
+    Lanes const keep = gather(table[KEEP], 1, 0, first, rows);
+    for (std::int64_t j = 0; j < joints; ++j) effort[j] = at(EFFORT, j);
+    for (std::int64_t j = 0; j < joints; ++j) {
+      Lanes const v = at(QVEL, j);
+      free[j] = v + along(j, effort);
+      kept[j] = keep * v;
+      creep[j] = at(CREEP, j);
+      weight[j] = 1.0 / (dt * inverse[j * joints + j] + creep[j]);
+      limit[j] = at(LIMIT, j);
+      f[j] = at(FRICTION, j);
+    }
+    for (long sweep = 0; sweep < sweeps; ++sweep) {
+      for (std::int64_t j = 0; j < joints; ++j) {
+        effort[j] = f[j] + weight[j] * (free[j] - along(j, f) - kept[j] - creep[j] * f[j]);
+        effort[j] = at_most(at_least(effort[j], -limit[j]), limit[j]);
+      }
+      std::swap(f, effort);
+    }
+    for (std::int64_t j = 0; j < joints; ++j) {
+      Lanes const low = table[LOW][j], high = table[HIGH][j], v = free[j] - along(j, f), q = at(QPOS, j) + dt * v;
+      scatter(at_most(at_least(q, low), high), table[QPOS], joints, j, first, rows);
+      scatter(zero_outside(v, low, q, high), table[QVEL], joints, j, first, rows);
+      scatter(f[j], table[FRICTION], joints, j, first, rows);
+    }
+  }
+}
+
+// step(qpos, qvel, friction, matrix, effort, added, limit, keep, creep, low, high, dt, sweeps)
+PyObject *step(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  std::int64_t const rows = PyObject_Size(arguments[QPOS]), joints = PyObject_Size(arguments[LOW]);
+  std::int64_t const own = rows * joints;
+  std::int64_t const sizes[LEAVES] = {own, own, own, own * joints, own, own, own, rows, own, joints, joints};
+  Buffer arrays[LEAVES];
+  double *table[LEAVES];
+  for (int i = 0; i < LEAVES; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i <= FRICTION ? PyBUF_WRITABLE : 0);
+    if (!arrays[i].open(arguments[i], sizes[i], sizeof(double), flags)) return nullptr;
+    table[i] = arrays[i].as<double>();
+  }
+  double const dt = PyFloat_AsDouble(arguments[LEAVES]);
+  long const sweeps = PyLong_AsLong(arguments[LEAVES + 1]);
+  if (PyErr_Occurred()) return nullptr;
+  step_rows(rows, joints, table, dt, sweeps);
+  Py_RETURN_NONE;
+}
+
+template <class Function>
+PyCFunction method(Function function) {
+  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
+}
+
+PyMethodDef METHODS[] = {
+    {"tree", make_tree, METH_VARARGS, nullptr},
+    {"dynamics", method(dynamics), METH_FASTCALL, nullptr},
+    {"step", method(step), METH_FASTCALL, nullptr},
+    {nullptr, nullptr, 0, nullptr},
+};
+
+PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_batch_dynamics", nullptr, -1, METHODS, nullptr, nullptr, nullptr, nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__batch_dynamics() { return PyModule_Create(&MODULE); }
