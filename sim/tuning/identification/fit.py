@@ -28,13 +28,33 @@ from sim.tuning.identification.problem import Evaluation, Problem
 Float64 = NDArray[np.float64]
 GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
 """The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
-STEP standard deviations of the unknowns."""
+STEP standard deviations of the unknowns; and if linear residuals promise less than LEAST_GAIN."""
 TRIES = 6
 """Most evaluations for one good step."""
 _ONE_STEP = 1.0
 """Relative tolerance of the sum of squares that ends least_squares with its first good step."""
+_DELAYS = np.arange(1, 9) / 4
+"""Changes of a delay that are tried at the end, over the time step."""
 _INSIDE = 1e-9
 """Least distance of points from the bounds, over typical sizes."""
+
+
+class Step(NamedTuple):
+    """State of a fit before a step: all that the rest of the fit depends on."""
+
+    theta: Float64
+    """Point (unknowns,)."""
+    left: int
+    """Evaluations that are left."""
+    last: Float64
+    """Point before the last step; ``theta`` at the start."""
+    cost: float
+    """Cost there; inf at the start."""
+
+    @classmethod
+    def first(cls, theta: Float64, evaluations: int) -> Step:
+        """Return the state at the start of a fit."""
+        return cls(theta, evaluations, theta, np.inf)
 
 
 class Solution(NamedTuple):
@@ -46,24 +66,19 @@ class Solution(NamedTuple):
     sizes: Float64
     """Sizes of the residuals (stretches, joints) [rad or m]."""
     windows: list[Evaluation]
-    left: int
-    """Evaluations that are left."""
 
 
-def fit(
-    problem: Problem, start: Float64, left: int, step: Callable[[Float64, int, float], None] = lambda *_: None
-) -> Solution:
-    """Return the best point from ``start`` on, after ``left`` evaluations at most.
+def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = lambda *_: None) -> Solution:
+    """Return the best point from ``begin`` on.
 
-    ``step`` is called before each step with the point, the number of evaluations that are left, and the cost.
+    ``report`` is called before each step with the state and the cost.
     """
     from scipy.optimize import least_squares
 
-    factors = _Factors(problem, left)
+    factors = _Factors(problem, begin.left)
     scale, spread = problem.unknowns.scale, problem.unknowns.spread
     bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
-    x = _inside(start / scale, bounds)
-    cost, last = np.inf, x
+    x, last, cost = _inside(begin.theta / scale, bounds), begin.last / scale, begin.cost
     if not np.isfinite(factors.at(x * scale)).all():
         remedy = "check the params that drove the robot, --timestep and the units of the logs"
         raise InvalidArgumentError(
@@ -72,12 +87,20 @@ def fit(
     while True:
         factors.keep(x * scale)
         sizes = factors.sizes(x * scale)
-        before, cost = cost, float(problem.costs(sizes).mean())
-        step(x * scale, factors.left, cost)
+        determinants = np.concatenate([window.determinant for window in factors.windows(x * scale)])
+        before, cost = cost, float(problem.costs(sizes, determinants).mean())
+        report(Step(x * scale, factors.left, last * scale, before), cost)
         gain = before - cost
-        moved = np.max(np.abs(x - last) / _deviations(factors.at(x * scale) / sizes[..., None, None], scale / spread))
-        if factors.left <= 0 or gain < LEAST_GAIN or (gain < GAIN and moved < STEP):
-            return Solution(x * scale, cost, sizes, factors.windows(x * scale), factors.left)
+        weighed = factors.at(x * scale) / sizes[..., None, None]
+        moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
+        done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or _promised(weighed) < LEAST_GAIN * problem.count
+        if done and factors.left > 0:
+            factors.left -= 1
+            if (other := _at_other_delay(problem, x * scale, factors.windows(x * scale))) is not None:
+                x, last = _inside(other / scale, bounds), x
+                continue
+        if done or factors.left <= 0:
+            return Solution(x * scale, cost, sizes, factors.windows(x * scale))
 
         def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
             found = factors.at(x * scale)[..., -1] / sizes[..., None]
@@ -94,6 +117,20 @@ def fit(
         x = _inside(least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x, bounds)
 
 
+def _at_other_delay(problem: Problem, theta: Float64, known: list[Evaluation]) -> Float64 | None:
+    """Return ``theta`` with another delay that is better, None if there is none.
+
+    Efforts that jump from step to step are smoothed by a delay of a broken number of steps, and not by a whole one: the
+    likelihood may have a maximum in each step, of which a fit finds the next one.
+    """
+    delay = problem.unknowns.names.index(("delay", None))
+    points = np.tile(theta, (2 * len(_DELAYS) + 1, 1))
+    points[1:, delay] += problem.drive.timestep * np.r_[-_DELAYS[::-1], _DELAYS]
+    costs = problem.costs_near(problem.unknowns.clip(points), known)
+    best = int(np.argmin(costs))
+    return points[best] if costs[best] < costs[0] - LEAST_GAIN else None
+
+
 def _inside(x: Float64, bounds: tuple[Float64, Float64]) -> Float64:
     return np.clip(x, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
 
@@ -101,7 +138,18 @@ def _inside(x: Float64, bounds: tuple[Float64, Float64]) -> Float64:
 def _deviations(factors: Float64, prior: Float64) -> Float64:
     """Return the standard deviations of the unknowns for white noise, from the weighted factors."""
     table = factors[..., :-1].reshape(-1, len(prior))
-    return np.sqrt(np.diagonal(np.linalg.inv(table.T @ table + np.diag(prior**2))))
+    root = np.linalg.qr(np.vstack([table, np.diag(prior)]), mode="r")
+    return np.linalg.norm(np.linalg.inv(root), axis=1)
+
+
+def _promised(factors: Float64) -> float:
+    """Return the decrease of the negative logarithm of the likelihood that linear residuals would allow."""
+    table = factors.reshape(-1, factors.shape[-1])
+    if not np.isfinite(table).all():
+        return np.inf
+    residuals = table[:, -1]
+    explained = table[:, :-1] @ np.linalg.lstsq(table[:, :-1], residuals)[0]
+    return 0.5 * float(explained @ explained)
 
 
 class _Factors:
@@ -138,7 +186,7 @@ class _Factors:
     def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
         problem, scale = self._problem, self._problem.unknowns.scale
         windows = problem.evaluate(theta)
-        sizes = problem.sizes([window.residual for window in windows])
+        sizes = problem.sizes([window.white for window in windows])
         count = len(theta) + 1
         factors = np.zeros((*sizes.shape, count, count))
         places = [
@@ -146,7 +194,7 @@ class _Factors:
         ]
         for number, (window, rows) in enumerate(places):
             for joint in range(sizes.shape[1]):
-                table = np.column_stack([window.jacobian[rows, joint] * scale, window.residual[rows, joint]])
+                table = np.column_stack([window.jacobian[rows, joint] * scale, window.white[rows, joint]])
                 if np.isfinite(table[:, -1]).all():
                     factor = np.linalg.qr(np.nan_to_num(table), mode="r")
                     factors[number, joint, : len(factor)] = factor

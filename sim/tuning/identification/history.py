@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
+from sim.tuning.identification.fit import Step
 
 
 class State(NamedTuple):
-    """State of a fit before a step: all that the rest of the fit depends on."""
+    """State of a fit of all variants: all that the rest of the fit depends on."""
 
-    theta: NDArray[np.float64]
-    """Point (unknowns,)."""
-    left: int
-    """Evaluations that are left."""
+    step: Step
+    """State of the variant that is being fitted."""
     done: tuple[list[float], ...] = ()
     """Solutions of the variants of the drive that were fitted before."""
 
@@ -35,7 +33,9 @@ class History:
         try:
             document = json.loads(Path(path).read_text())
             theirs = document["settings"]
-            self.state = State(np.array(document["theta"], float), int(document["left"]), tuple(document["done"]))
+            theta, last = (np.array(document[name], float) for name in ("theta", "last"))
+            cost = np.inf if document["cost"] is None else float(document["cost"])
+            self.state = State(Step(theta, int(document["left"]), last, cost), tuple(document["done"]))
             different = sorted(k for k in {*theirs, *self._settings} if theirs.get(k) != self._settings.get(k))
             problem = f"is of another fit ({', '.join(different)} differ)" if different else None
         except (ValueError, KeyError, TypeError) as error:
@@ -47,5 +47,13 @@ class History:
     def write(self, state: State) -> None:
         """Write the file."""
         if self._path is not None:
-            document = {"settings": self._settings, **state._asdict(), "theta": state.theta.tolist()}
+            theta, left, last, cost = state.step
+            document = {
+                "settings": self._settings,
+                "theta": theta.tolist(),
+                "left": left,
+                "last": last.tolist(),
+                "cost": cost if np.isfinite(cost) else None,
+                "done": state.done,
+            }
             write_atomically(self._path, json.dumps(document))

@@ -24,7 +24,7 @@ from batchpid.versions import package_versions
 from sim.options import Compensation
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
-from sim.tuning.identification.fit import Solution, fit
+from sim.tuning.identification.fit import Solution, Step, fit
 from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Motors, Plant
@@ -73,7 +73,8 @@ def identify(
     hold
         Commands hold from row to row of a file: :func:`sim.tuning.identification.logs.read_logs`.
     evaluations
-        Most evaluations of the fit; one simulates the robot, and a changed one for each unknown.
+        Most evaluations of each fit, with and without noise in the law; one simulates the robot, and a changed one for
+        each unknown.
     seed
         Of CMA-ES, which finds where the fit begins.
     workers
@@ -127,10 +128,13 @@ def identify(
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = ProcessPoolExecutor(processes, mp_context=get_context("spawn")) if processes > 1 else nullcontext()
     with pool as executor:
-        problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in _variants(drive)]
+        problems = [
+            Problem(robot, joints, each, found, motions, unknowns, executor) for each in _variants(drive, motions)
+        ]
         ideal = _ideal(robot, joints)
-        state = record.state or State(begin(problems[0], regression, ideal, seed), evaluations)
-        solutions = _fit_all(problems, state, record, _Steps(evaluations, progress))
+        state = record.state or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
+        steps = _Steps(len(problems), evaluations, progress)
+        solutions = _fit_all(problems, state, record, steps)
         problem, best = min(zip(problems, solutions, strict=True), key=lambda pair: pair[1].cost)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
@@ -150,44 +154,48 @@ def identify(
 
 
 class _Steps:
-    """Progress of a fit: a bar over its evaluations."""
+    """Progress of fits: a bar over their evaluations."""
 
-    def __init__(self, evaluations: int, progress: Callable[[Any], Any] | None) -> None:
-        self._bar = (progress or (lambda items: items))(range(evaluations))
-        self._steps, self._left, self._done = iter(self._bar), evaluations, 0
+    def __init__(self, fits: int, evaluations: int, progress: Callable[[Any], Any] | None) -> None:
+        self.evaluations = evaluations
+        self._bar = (progress or (lambda items: items))(range(fits * evaluations))
+        self._steps, self._shown = iter(self._bar), 0
 
-    def __call__(self, left: int, cost: float) -> None:
-        """Advance the bar to so many evaluations ``left``, and show the typical error that belongs to ``cost``."""
-        while self._left > left and next(self._steps, None) is not None:
-            self._left -= 1
+    def __call__(self, fits: int, left: int, cost: float) -> None:
+        """Advance the bar to so many complete ``fits`` and evaluations ``left``, and show the typical error."""
+        while self._shown < (fits + 1) * self.evaluations - left and next(self._steps, None) is not None:
+            self._shown += 1
         if hasattr(self._bar, "set_postfix"):
             self._bar.set_postfix(error=f"{np.exp(cost):.3g}")
 
 
-def _variants(drive: Drive) -> list[Drive]:
-    """Return ways in which the law may measure: rates or differences of positions, with the sensors' noise or without.
+def _variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
+    """Return ways in which the law may measure: with the sensors' noise or without, rates or differences of positions.
 
     Without noise, positions and rates are those of the simulation.
     """
     if drive.params is None:
         return [drive]
     quiet = replace(drive, measured_rate=False)
-    return [*([drive] if drive.measured_rate else []), quiet, replace(quiet, noisy=True)]
+    seen = any(motion.sensor.size.any() for motion in motions)
+    return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
 
 
 def _fit_all(problems: list[Problem], state: State, record: History, steps: _Steps) -> list[Solution]:
     """Return the solution of each of ``problems``, each begun with that of the one before, from ``state`` on."""
-    solutions = [fit(problem, np.array(theta), 0) for problem, theta in zip(problems, state.done, strict=False)]
-    theta, left = state.theta, state.left
+    solutions = [
+        fit(problem, Step.first(np.array(theta), 0)) for problem, theta in zip(problems, state.done, strict=False)
+    ]
+    begin = state.step
     for problem in problems[len(state.done) :]:
         done = tuple(solution.theta.tolist() for solution in solutions)
 
-        def step(theta: Float64, left: int, cost: float, done: tuple[list[float], ...] = done) -> None:
-            record.write(State(theta, left, done))
-            steps(left, cost)
+        def report(step: Step, cost: float, done: tuple[list[float], ...] = done) -> None:
+            record.write(State(step, done))
+            steps(len(done), step.left, cost)
 
-        solutions.append(fit(problem, theta, left, step))
-        theta, left = solutions[-1].theta, solutions[-1].left
+        solutions.append(fit(problem, begin, report))
+        begin = Step.first(solutions[-1].theta, steps.evaluations)
     return solutions
 
 
@@ -230,14 +238,15 @@ def _unknowns(
     plant = Plant(robot, joints, drive)
     qpos = np.concatenate([motion.qpos[::200] for motion in motions])
     matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
-    inertia = np.diagonal(matrix, axis1=1, axis2=2).mean(0) + motors.armature[0]
+    links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors.armature[0]
+    inertia = links + armature
     speed, acceleration = (
         np.sqrt(np.mean(np.concatenate([getattr(motion, name) for motion in motions]) ** 2, axis=0))
         for name in ("qvel", "qacc")
     )
     speed = np.maximum(speed, 1e-3)
     effort = np.maximum(inertia * acceleration + motors.friction[0], inertia * 0.1)
-    return Unknowns.of(inertia, effort, speed, payload)
+    return Unknowns.of(links, armature, effort, speed, payload)
 
 
 def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:

@@ -9,6 +9,9 @@ likelihood is, over the number of rows and joints::
 f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or
 later than it did, the size is large, and the stretch counts little.
 
+What moves the robot besides and is not known, as the sensors' noise between the rows, is taken out of residuals and
+Jacobian (:mod:`sim.tuning.identification.wander`); the simulated motion is the mean of several draws of it.
+
 Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
 change.
 
@@ -33,13 +36,16 @@ from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
 from sim.tuning.identification.regression import Motion
 from sim.tuning.identification.unknowns import Unknowns
+from sim.tuning.identification.wander import spread, whiten
 from sim.tuning.identification.windows import Window, cut, project, rows_of, simulate, whole
 
 Float64 = NDArray[np.float64]
-CHUNK = 32
+CHUNK = 48
 """Most simulations at once."""
 STRETCH = 0.5
 """Length of the stretches of a log [s], about."""
+NOISES = 2
+"""Least size of residuals, over the noise of the sensor."""
 LEAST_NOISE = 1e-6
 """Least noise of a sensor, over the range of the motion."""
 WORST = 1e6
@@ -53,8 +59,14 @@ class Evaluation(NamedTuple):
 
     residual: Float64
     """Measured less simulated positions (rows, joints) [rad or m]."""
+    white: Float64
+    """Those of the fitted rows without wander (rows, joints)."""
     jacobian: Float64
-    """Change of the simulated positions with the unknowns (rows, joints, unknowns)."""
+    """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
+    wander: Float64
+    """Wander over the noise (rows, joints, columns)."""
+    determinant: Float64
+    """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
 
 
 @dataclass
@@ -70,7 +82,7 @@ class Problem:
     executor: Executor | None = None
     windows: list[Window] = field(init=False)
     noise: Float64 = field(init=False)
-    """Twice the noise of the sensors (joints,) [rad or m]."""
+    """Least sizes of residuals (joints,) [rad or m]."""
     stretches: list[list[NDArray[np.intp]]] = field(init=False)
     """Numbers of the fitted rows in each stretch of each window."""
 
@@ -84,8 +96,8 @@ class Problem:
         self.stretches = [self._divided(window) for window in self.windows]
         self._rows = [len(rows) for stretches in self.stretches for rows in stretches]
         qpos = np.concatenate([log.qpos for log in self.logs])
-        measured = np.sqrt(np.mean([(motion.noise**2).mean(0) for motion in self.motions], axis=0))
-        self.noise = np.maximum(2 * measured, LEAST_NOISE * (np.ptp(qpos, axis=0) + 1e-3))
+        measured = np.sqrt(np.mean([motion.sensor.size**2 for motion in self.motions], axis=0))
+        self.noise = np.maximum(NOISES * measured, LEAST_NOISE * (np.ptp(qpos, axis=0) + 1e-3))
 
     def _divided(self, window: Window) -> list[NDArray[np.intp]]:
         rows = np.flatnonzero(window.fitted)
@@ -93,19 +105,33 @@ class Problem:
         return [part for part in np.array_split(rows, max(1, int(seconds / STRETCH))) if len(part)]
 
     @property
+    def count(self) -> int:
+        """Number of fitted positions."""
+        return sum(self._rows) * len(self.joints)
+
+    @property
+    def draws(self) -> int:
+        """Number of draws of noise that the law is given, or of jitter of the efforts; 0 if it is known."""
+        return min(len(window.errors) for window in self.windows) if self.shoots or self.drive.noisy else 0
+
+    @property
     def shoots(self) -> bool:
         """True if the initial states of the windows are unknown."""
         return self.drive.params is None
 
     def residuals(self, points: Float64) -> list[Float64]:
-        """Return the residuals (points, rows, joints) of each window.
+        """Return the residuals (points, rows, joints) of each window, without noise that is not known.
 
-        What initial states explain is left out, with their effect at the first point.
+        What initial states explain is left out of those of windows that shoot, with their effect at the first point.
         """
+        joints = len(self.joints)
+        states = np.eye(2 * joints).reshape(-1, 2, joints) if self.shoots else np.zeros((0, 2, joints))
         found = []
-        for window, (positions, basis) in zip(self.windows, self._simulate(points), strict=True):
+        simulated = self._simulate(points, np.zeros(len(points), int), states)
+        for window, (positions, effect) in zip(self.windows, simulated, strict=True):
             residual = window.measured - positions
-            found.append(residual if basis is None else np.stack([project(basis, each, None)[0] for each in residual]))
+            none = np.zeros((*residual.shape[1:], 0))
+            found.append(np.stack([project(effect, each, none)[0] for each in residual]) if self.shoots else residual)
         return found
 
     def sizes(self, residuals: list[Float64]) -> Float64:
@@ -118,48 +144,65 @@ class Problem:
             ]
             return np.sqrt(np.stack(squares, axis=-2) + self.noise**2)
 
-    def costs(self, sizes: Float64) -> Float64:
+    def costs(self, sizes: Float64, determinants: Float64 | float = 0.0) -> Float64:
         """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).
 
         They are finite where a simulation diverges, too.
         """
-        return np.average(np.log(np.fmin(sizes, WORST)), axis=-2, weights=self._rows)
+        return np.average(np.log(np.fmin(sizes, WORST)) + determinants, axis=-2, weights=self._rows)
 
     def evaluate(self, theta: Float64) -> list[Evaluation]:
         """Return residuals and Jacobian of each window at one point (unknowns,)."""
-        steps = self.unknowns.steps(theta)
+        changes, joints = self.unknowns.changes(theta), len(self.joints)
+        inverse, count = np.linalg.inv(changes).T, len(changes) + 1
+        points = np.vstack([theta, theta + changes, np.tile(theta, (self.draws, 1))])
+        draws = np.r_[np.zeros(count, int), 1 + np.arange(self.draws)]
+        states = np.eye(2 * joints).reshape(-1, 2, joints)[0 if self.shoots else joints :]
         found = []
-        points = np.vstack([theta, theta + np.diag(steps)])
-        for window, (positions, basis) in zip(self.windows, self._simulate(points), strict=True):
-            residual = window.measured - positions[0]
-            jacobian = ((positions[1:] - positions[0]) / steps[:, None, None]).transpose(1, 2, 0)
-            if basis is not None:
-                residual, jacobian = project(basis, residual, jacobian)
-            found.append(Evaluation(residual, jacobian))
+        simulated = self._simulate(points, draws, states)
+        for window, stretches, (positions, effect) in zip(self.windows, self.stretches, simulated, strict=True):
+            drawn = positions[count:] if self.draws else positions[:1]
+            residual = window.measured - drawn.mean(0)
+            jacobian = (positions[1:count] - positions[0]).transpose(1, 2, 0) @ inverse
+            wander = spread(drawn)
+            if self.shoots:
+                _, wander = project(effect, residual, wander)
+                residual, jacobian = project(effect, residual, jacobian)
+            else:
+                wander = np.concatenate([wander, effect * window.speed_error], axis=2)
+            wander /= (self.noise / NOISES)[:, None]
+            white, jacobian, determinant = whiten(wander, stretches, residual, jacobian)
+            found.append(Evaluation(residual, white, jacobian, wander, determinant))
         return found
+
+    def costs_near(self, points: Float64, evaluations: list[Evaluation]) -> Float64:
+        """Return the costs (points,) of ``points``, with the wander of the first one, that of ``evaluations``."""
+        whites = []
+        for residuals, known, stretches in zip(self.residuals(points), evaluations, self.stretches, strict=True):
+            moved = (residuals - residuals[0] + known.residual).transpose(1, 2, 0)
+            whites.append(whiten(known.wander, stretches, known.residual, moved)[1].transpose(2, 0, 1))
+        return self.costs(self.sizes(whites)).mean(1)
 
     def lags(self, seconds: float) -> list[int]:
         """Return how many rows of each log are ``seconds`` long."""
         return [round(seconds / float(np.median(np.diff(log.time)))) for log in self.logs]
 
-    def _simulate(self, points: Float64) -> list[tuple[Float64, Float64 | None]]:
+    def _simulate(self, points: Float64, draws: NDArray[np.intp], states: Float64) -> list[tuple[Float64, Float64]]:
         """Return for each window the positions (points, rows, joints), and the effect of its initial state.
 
-        The effect, at the first point, is (rows, joints, states), None if the state is known.
+        ``draws`` (points,) are the numbers of the noise. The effect, at the first point, is that of changes ``states``
+        (states, 2, joints) of positions and velocities, over the change (rows, joints, states).
         """
-        count, joints = len(points), len(self.joints)
-        states = np.zeros((count, 2, joints))
-        numbers = np.arange(count)
-        if self.shoots:
-            states = np.concatenate([states, STATE_STEP * np.eye(2 * joints).reshape(-1, 2, joints)])
-            numbers = np.r_[numbers, np.zeros(2 * joints, int)]
-        motors = self.unknowns.motors(points[numbers])
+        count = len(points)
+        numbers = np.r_[np.arange(count), np.zeros(len(states), int)]
+        states = np.concatenate([np.zeros((count, *states.shape[1:])), STATE_STEP * states])
+        motors, draws = self.unknowns.motors(points[numbers]), draws[numbers]
         groups = [list(group) for _, group in groupby(self.windows, lambda w: (w.segment.command.shape, w.past))]
         tasks, places = [], []
         for number, group in enumerate(groups):
             most = max(1, CHUNK // len(group))
             parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
-            tasks += [(group, motors.take(part), states[part]) for part in parts]
+            tasks += [(group, motors.take(part), states[part], draws[part]) for part in parts]
             places += [number] * len(parts)
         simulated = self._map(tasks)
         found = []
@@ -168,7 +211,7 @@ class Problem:
             for at in range(len(group)):
                 positions = np.concatenate([piece[at] for piece in pieces])
                 effect = (positions[count:] - positions[0]) / STATE_STEP
-                found.append((positions[:count], effect.transpose(1, 2, 0) if self.shoots else None))
+                found.append((positions[:count], effect.transpose(1, 2, 0)))
         return found
 
     def _map(self, tasks: list[Any]) -> list[list[Float64]]:

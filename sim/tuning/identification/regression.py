@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from sim.tuning.identification.drive import Drive, Law
 from sim.tuning.identification.logs import Log
+from sim.tuning.identification.noise import Noise, split
 from sim.tuning.identification.plant import Motors, Plant
 
 Float64 = NDArray[np.float64]
@@ -31,8 +32,6 @@ DELAYS = np.arange(0.0, 0.03, DELAY_STEP)
 """Delays that are tried [s]."""
 MOVES, LEAST_ROWS = 0.4, 50
 """Speed, over its root mean square, below which a joint may stick, and the fewest rows that are left without those."""
-NOISE_CUTOFF = 60.0
-"""Frequency [Hz] above which what was measured counts as noise."""
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 STOPPING = 5e-3
@@ -54,8 +53,10 @@ class Motion(NamedTuple):
     qvel: Float64
     qacc: Float64
     command: Float64
-    noise: Float64
-    """Noise of the measured positions above NOISE_CUTOFF: that of the log's rows, and between them drawn alike."""
+    sensor: Noise
+    """Noise of the measured positions."""
+    jitter: Noise | None
+    """That of the efforts of a log of efforts that change between its rows; None where the commands are known."""
 
 
 class Start(NamedTuple):
@@ -77,26 +78,12 @@ def smooth(log: Log, timestep: float) -> Motion:
     pad = min(len(raw) - 1, round(0.5 / timestep))
     qpos = sosfiltfilt(sections, raw, axis=0, padlen=pad)
     qvel = np.gradient(qpos, timestep, axis=0)
-    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time), _noise(log, time))
-
-
-def _noise(log: Log, time: Float64) -> Float64:
-    """Return the noise of the measured positions at ``time``; 0 if the rows are too far apart to tell it."""
-    from scipy.interpolate import make_interp_spline
-    from scipy.signal import butter, sosfiltfilt
-
-    timestep, period = time[1] - time[0], float(np.median(np.diff(log.time)))
-    if (share := 1 - 2 * NOISE_CUTOFF * period) < 0.5:
-        return np.zeros((len(time), log.qpos.shape[1]))
-    raw = make_interp_spline(log.time, log.qpos)(time)
-    sections = butter(4, NOISE_CUTOFF, fs=1 / timestep, output="sos")
-    slow = sosfiltfilt(sections, raw, axis=0, padlen=min(len(raw) - 1, 1000))
-    step = np.clip(np.rint((log.time - time[0]) / timestep).astype(int), 0, len(time) - 1)
-    found = log.qpos - slow[step]
-    size = 1.4826 * np.median(np.abs(found), axis=0) / np.sqrt(share)  # the median is blind to jerks of the joint
-    noise = size * np.random.default_rng(0).standard_normal(raw.shape)
-    noise[step] = np.clip(found, -4 * size, 4 * size)
-    return noise
+    command, jitter = log.commands_at(time), None
+    if log.kind == "effort" and not log.held:
+        efforts, jitter = split(log.command_time, log.command, time, given=True)
+        command = efforts + jitter.values if jitter.size.any() else command
+    sensor = split(log.time, log.qpos, time)[1]
+    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), command, sensor, jitter)
 
 
 class Regression:
@@ -116,7 +103,8 @@ class Regression:
             v, a = motion.qvel[rows], motion.qacc[rows]
             empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
             effort = motion.command if drive.params is None else _law_efforts(drive, plant, motion)
-            if drive.through and (held := plant.compensation(motion.qpos, motion.qvel)) is not None:
+            unloaded = np.zeros((len(motion.qpos), 1))
+            if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
             if drive.params is None:  # the law's efforts are of filtered positions already
                 effort = sosfiltfilt(sections, effort, axis=0)

@@ -26,10 +26,12 @@ MEMORY = 1.0
 MODEL_ERROR = 2.0
 """Factor of the standard deviations that allows for errors of the model, such as friction near rest under a law that
 sees noise. Without it 30 % of the intervals missed the truth on logs of a two-joint arm in MuJoCo."""
+LEAST_DEVIATION = 5e-3
+"""Least standard deviation of an unknown, over its estimate: no model is better."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
-RESOLVED = 0.1
-"""Largest half width of an interval, over the estimate, of an unknown that counts as identified."""
+RESOLVED, DELAY_RESOLVED = 0.05, 0.1
+"""Largest half width of an interval, over the estimate, of an unknown that counts as identified, and of the delay."""
 
 
 class Uncertainty(NamedTuple):
@@ -50,7 +52,8 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     normal, spread = np.zeros((count, count)), np.zeros((count, count))
     covariances = _autocovariances(problem, point, int(size.max()))
     weights = _sizes_of_rows(problem, point)
-    for (_, jacobian), window, sigma in zip(point.windows, problem.windows, weights, strict=True):
+    for evaluation, window, sigma in zip(point.windows, problem.windows, weights, strict=True):
+        jacobian = evaluation.jacobian
         for joint in range(jacobian.shape[1]):
             columns = np.nan_to_num(jacobian[window.fitted, joint] * unknowns.scale) / sigma[:, joint, None]
             if not len(columns):
@@ -68,17 +71,18 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     prior = (unknowns.scale / unknowns.spread) ** 2
     inverse = np.linalg.inv(normal + np.diag(prior))
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
-    white = np.diagonal(inverse)
-    deviation = MODEL_ERROR * unknowns.scale * np.sqrt(np.maximum(np.diagonal(covariance), white))
+    variance = np.maximum(np.diagonal(covariance), np.diagonal(inverse))
+    deviation = np.hypot(MODEL_ERROR * unknowns.scale * np.sqrt(variance), LEAST_DEVIATION * np.abs(point.theta))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
-    identified = INTERVAL * deviation <= RESOLVED * np.abs(point.theta)
+    resolved = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind, _ in unknowns.names])
+    identified = INTERVAL * deviation <= resolved * np.abs(point.theta)
     return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
 
 
 def _autocovariances(problem: Problem, point: Solution, lags: int) -> Float64:
     """Return the tapered autocovariances of the weighted residuals of each joint (lags, joints)."""
     weights = _sizes_of_rows(problem, point)
-    parts = [r[w.fitted] / s for (r, _), w, s in zip(point.windows, problem.windows, weights, strict=True)]
+    parts = [e.white[w.fitted] / s for e, w, s in zip(point.windows, problem.windows, weights, strict=True)]
     parts = [part for part in parts if len(part)]
     lags = max(2, min(lags, min(map(len, parts)) // 2))
     total = np.zeros((lags, parts[0].shape[1]))

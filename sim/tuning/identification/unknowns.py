@@ -35,6 +35,8 @@ _SPREAD = {
 _PRIOR = {"strength": 1.0, "stopping": 5e-3}
 _STEP = 2e-3
 """Change of an unknown for a finite difference, in units of its scale."""
+_STRENGTH_STEP = 1e-2
+"""Change of a strength, over it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +48,17 @@ class Unknowns:
     """Kind and joint of each, None for delay and payload."""
     scale: Float64
     """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
+    inertia: Float64
+    """Typical inertia that the joints show without armature (joints,)."""
 
     @classmethod
-    def of(cls, inertia: Float64, effort: Float64, speed: Float64, payload: bool) -> Unknowns:
-        """Return the unknowns of joints of so much inertia, effort and speed (joints,), root mean squares."""
+    def of(cls, links: Float64, armature: Float64, effort: Float64, speed: Float64, payload: bool) -> Unknowns:
+        """Return the unknowns of joints.
+
+        Parameters are typical values (joints,): inertia of the links and of the motor, and root mean squares of effort
+        and speed.
+        """
+        inertia = links + armature
         sizes = {
             "armature": inertia,
             "damping": effort / speed,
@@ -63,7 +72,7 @@ class Unknowns:
         if payload:
             names.append(("payload", None))
             scale.append(0.2)
-        return cls(len(inertia), tuple(names), np.exp2(np.round(np.log2(np.array(scale, np.float64)))))
+        return cls(len(inertia), tuple(names), np.exp2(np.round(np.log2(np.array(scale, np.float64)))), links)
 
     @property
     def low(self) -> Float64:
@@ -85,9 +94,20 @@ class Unknowns:
         """Means of the prior: ideal motors."""
         return np.array([_PRIOR.get(kind, 0.0) for kind, _ in self.names])
 
-    def steps(self, theta: Float64) -> Float64:
-        """Return the changes for finite differences at ``theta``."""
-        return np.maximum(_STEP * np.abs(theta), 0.5 * _STEP * self.scale)
+    def changes(self, theta: Float64) -> Float64:
+        """Return the changes (changes, unknowns) for finite differences at ``theta``.
+
+        A motor that is stronger moves its joint alike if inertia, damping, friction and bias grow with it: all but what
+        couples the joints. So each strength is changed with those, to find the little that is left.
+        """
+        steps = np.maximum(_STEP * np.abs(theta), 0.5 * _STEP * self.scale)
+        table, n = np.diag(steps), self.joints
+        strengths = PER_JOINT.index("strength") * n + np.arange(n)
+        table[strengths, strengths] = _STRENGTH_STEP * theta[strengths]
+        for kind in ("armature", "damping", "friction", "bias"):
+            own = PER_JOINT.index(kind) * n + np.arange(n)
+            table[strengths, own] = _STRENGTH_STEP * (theta[own] + (self.inertia if kind == "armature" else 0.0))
+        return table
 
     def clip(self, theta: Float64) -> Float64:
         """Return ``theta`` within the bounds."""

@@ -18,6 +18,8 @@ WINDOW = 0.3
 """Length of a window of a log of efforts [s]."""
 SETTLE = 0.3
 """Time after the start of a log under the PID law in which the initial state is forgotten [s]: it is not fitted."""
+START, RESTS = 0.03, 0.05
+"""Length of the part of a log that gives its initial state [s]; initial speed by prior, over its root mean square."""
 HELD_OUT = 0.25
 """Share of each log, at its end, that is kept to judge."""
 
@@ -39,25 +41,44 @@ class Window(NamedTuple):
     """Number of its first row in the log."""
     fitted: Any
     """Rows that are fitted; the others are kept to judge (rows,) bool."""
+    errors: Float64
+    """Draws of the error of the segment's noise, or of logged efforts (draws, past + steps, joints)."""
+    speed_error: Float64
+    """Standard deviations of the velocity at its start (joints,)."""
+
+    def drawn(self, draw: int) -> Segment:
+        """Return the segment with a draw of the errors, from 1 on; without any for 0."""
+        if not draw:
+            return self.segment
+        changed = "command" if self.past else "noise"
+        return self.segment._replace(**{changed: getattr(self.segment, changed) + self.errors[draw - 1]})
 
 
 _plants: dict[int, Plant] = {}
 
 
 def simulate(
-    about: tuple[Robot, tuple[int, ...], Drive], windows: list[Window], motors: Motors, states: Float64
+    about: tuple[Robot, tuple[int, ...], Drive],
+    windows: list[Window],
+    motors: Motors,
+    states: Float64,
+    draws: NDArray[np.intp],
 ) -> list[Float64]:
-    """Return for each of ``windows`` the positions (candidates, rows, joints) of all candidates at its rows."""
+    """Return for each of ``windows`` the positions (candidates, rows, joints) of all candidates at its rows.
+
+    ``states`` are added to the states at the start of a window; ``draws`` are the numbers of the candidates' noise.
+    """
     robot, joints, drive = about
     key = hash((robot.urdf, joints, repr(drive)))
     if key not in _plants:
         _plants.clear()
         _plants[key] = Plant(robot, joints, drive)
-    segments = [
-        window.segment._replace(qpos=window.segment.qpos + shift[0], qvel=window.segment.qvel + shift[1])
-        for window in windows
-        for shift in states
-    ]
+    segments = []
+    for window in windows:
+        drawn = {draw: window.drawn(draw) for draw in set(draws.tolist())}
+        for shift, draw in zip(states, draws.tolist(), strict=True):
+            qpos, qvel, *given = drawn[draw]
+            segments.append(Segment(qpos + shift[0], qvel + shift[1], *given))
     count = len(states)
     everyone = motors.take(np.tile(np.arange(count), len(windows)))
     out = _plants[key].simulate(everyone, segments, windows[0].past)
@@ -70,17 +91,18 @@ def simulate(
     return found
 
 
-def project(basis: Float64, residual: Float64, columns: Float64 | None) -> tuple[Float64, Float64 | None]:
-    """Return residual (rows, joints) and Jacobian without what ``basis`` (rows, joints, states) explains."""
+def project(basis: Float64, residual: Float64, columns: Float64) -> tuple[Float64, Float64]:
+    """Return residual (rows, joints) and ``columns`` (rows, joints, n) without what ``basis`` explains.
+
+    ``basis`` is (rows, joints, states).
+    """
     if not (np.isfinite(basis).all() and np.isfinite(residual).all()):
         return residual, columns
     flat = basis.reshape(-1, basis.shape[2])
     q, _ = np.linalg.qr(flat / (np.linalg.norm(flat, axis=0) + 1e-12))
     left = residual.reshape(-1) - q @ (q.T @ residual.reshape(-1))
-    if columns is not None:
-        table = columns.reshape(len(flat), -1)
-        columns = (table - q @ (q.T @ table)).reshape(columns.shape)
-    return left.reshape(residual.shape), columns
+    table = columns.reshape(len(flat), -1)
+    return left.reshape(residual.shape), (table - q @ (q.T @ table)).reshape(columns.shape)
 
 
 def rows_of(window: Window) -> slice:
@@ -96,13 +118,35 @@ def _window(
     rows = np.flatnonzero((at >= first + settle / dt - 1e-6) & (at <= last + 1e-6))
     index = np.floor(at[rows] + 1e-6).astype(int)
     part = np.clip(at[rows] - index, 0, 1)[:, None]
-    before = log.time[0] + dt * np.arange(first - past, first)
-    command = np.vstack([log.commands_at(before), motion.command[first:last]]) if past else motion.command[first:last]
-    noise = np.zeros_like(command)
-    noise[past:] = motion.noise[first:last]
-    segment = Segment(motion.qpos[first], motion.qvel[first], command, noise)
+    steps = np.maximum(np.arange(first - past, last), 0)
+    command, given = motion.command[steps], (motion.jitter if past else motion.sensor)
+    noise = np.zeros_like(command) if past else motion.sensor.values[steps]
+    errors = np.zeros((0, *command.shape)) if given is None else given.errors[:, steps]
+    start = (motion.qpos[first], motion.qvel[first], np.zeros(len(log.joints))) if first else _start(log, motion)
+    segment = Segment(start[0], start[1], command, noise)
     fitted = log.time[rows] <= log.time[0] + (1 - HELD_OUT) * log.seconds
-    return Window(number, segment, past, index - first, part, log.qpos[rows], int(rows[0]), fitted)
+    compared = index - first, part, log.qpos[rows], int(rows[0]), fitted
+    return Window(number, segment, past, *compared, errors, start[2])
+
+
+def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
+    """Return position, velocity and its standard deviation (joints,) at the start of a log.
+
+    The filter of ``motion`` is not to be trusted there: a parabola through the first rows is, with the prior that the
+    robot rests.
+    """
+    time = log.time - log.time[0]
+    count = max(4, int((time <= START).sum()))
+    end = time[count - 1]
+    columns = np.vander(time[:count] / end, 3, increasing=True)
+    rest = np.maximum(RESTS * np.sqrt((motion.qvel**2).mean(0)), 1e-9)
+    noise = np.maximum(motion.sensor.size, 1e-9)
+    found = []
+    for qpos, weight in zip(log.qpos[:count].T, (noise / (rest * end)) ** 2, strict=True):
+        inverse = np.linalg.inv(columns.T @ columns + np.diag([0.0, weight, 0.0]))
+        found.append([*(inverse @ columns.T @ (qpos - qpos[0]))[:2], np.sqrt(inverse[1, 1])])
+    position, velocity, deviation = np.array(found).T
+    return log.qpos[0] + position, velocity / end, np.maximum(deviation * noise / end, 0.1 * rest)
 
 
 def whole(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:

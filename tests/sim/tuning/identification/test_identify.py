@@ -11,9 +11,12 @@ from sim import Robot
 from sim.tuning import identify
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.excitation import excite
+from sim.tuning.identification.fit import Step, fit
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Motors, Plant, Segment
-from sim.tuning.identification.unknowns import PER_JOINT
+from sim.tuning.identification.problem import Problem
+from sim.tuning.identification.regression import smooth
+from sim.tuning.identification.unknowns import PER_JOINT, Unknowns
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
@@ -48,9 +51,9 @@ def as_log(robot: Robot, table: dict, kind: str) -> Log:
 
 @pytest.fixture(scope="module")
 def runs(arm, mujoco_log):
-    """Truth, and logs of 1.6 s of setpoints and of efforts."""
+    """Truth, and logs of 3 s of setpoints and of efforts."""
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
-    table = mujoco_log["simulate"](arm, truth, excite(arm, 1.6, lowest=0.6), params, every=1, seed=1)
+    table = mujoco_log["simulate"](arm, truth, excite(arm, 3.0, lowest=0.6), params, every=1, seed=1)
     return truth, as_log(arm, table, "setpoint"), as_log(arm, table, "effort")
 
 
@@ -68,6 +71,38 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
         segment = Segment(table["qpos"][0], np.zeros(2), table[kind], np.zeros((len(table[kind]), 2)))
         moved = plant.simulate(motors, [segment], 0)[0, :-1]
         np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
+
+
+def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
+    """The change of a strength for finite differences moves a joint only by what couples it to others."""
+    inertia = Plant(arm, (1,), Drive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
+        np.zeros((1, 1)), np.zeros((1, 1))
+    )
+    unknowns = Unknowns.of(inertia[0, 0], np.array([0.02]), np.ones(1), np.ones(1), payload=False)
+    theta = unknowns.point(Motors(*(row(value) for value in (0.02, 0.1, 0.2, 0.9, 0.05, 0.004, 0.005, 0.0))))
+    changes = unknowns.changes(theta)
+    assert np.linalg.matrix_rank(changes / unknowns.scale) == len(theta)
+    params = bp.make_params(1, kp=40.0, ki=10.0, kd=2.0)
+    plant = Plant(arm, (1,), Drive(1 / 2000, params, "gravity+coriolis"))
+    command = 0.3 * np.sin(9.0 * np.arange(2000) / 2000)[:, None]
+    segment = Segment(np.zeros(1), np.zeros(1), command, np.zeros_like(command))
+    moved = [
+        plant.simulate(unknowns.motors(point[None]), [segment], 0)[0]
+        for point in (theta, theta + changes[unknowns.names.index(("strength", 0))])
+    ]
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)
+
+
+def test_a_fit_leaves_a_delay_that_is_best_nearby_only(arm, runs):
+    truth, _, efforts = runs
+    joints, drive = (0, 1), Drive(1 / 2000, None, "gravity+coriolis")
+    motions = [smooth(efforts, 1 / 2000)]
+    unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
+    problem = Problem(arm, joints, drive, [efforts], motions, unknowns)
+    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
+    theta = unknowns.point(Motors(*per_joint, row(truth.delay + 7e-4), row(0.0095), row(0.0)))
+    found = fit(problem, Step.first(theta, 20)).theta
+    assert found[unknowns.names.index(("delay", None))] == pytest.approx(truth.delay, abs=1e-4)
 
 
 def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
@@ -109,7 +144,7 @@ def test_known_motors_are_found(arm, runs, kind):
     assert document["delay"][0] == pytest.approx(truth.delay, abs=2e-4)
     before, after = document["held_out_error"]
     assert after < before / 10
-    assert known >= 8
+    assert known >= 9
     assert inside >= known - 1
     actuators = found.actuators()
     assert actuators.command_delay[0, 0] == pytest.approx(document["delay"][0])

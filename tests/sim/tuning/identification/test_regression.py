@@ -1,7 +1,5 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
@@ -41,19 +39,3 @@ def test_joints_that_stick_half_of_the_time_are_found(panda):
     found = Regression(plant, [log], [motion], False).at(0.002, 0.0, STRONG).motors
     for kind in ("armature", "friction", "strength"):
         np.testing.assert_allclose(getattr(found, kind), getattr(sticky, kind), rtol=0.2, err_msg=kind)
-
-
-@given(st.floats(1e-6, 1e-3), st.integers(1, 2))
-def test_the_noise_of_a_log_is_told_from_its_motion(size, every):
-    rng, time = np.random.default_rng(0), DT * np.arange(4000)
-    motion = np.stack([np.sin(6 * time), 0.2 * np.sin(20 * time)], axis=1)
-    noise = size * rng.standard_normal(motion.shape)
-    found = smooth(log_of(motion + noise, motion, every), DT).noise
-    np.testing.assert_allclose(found.std(0), size, rtol=0.2)
-    rows = found[::every]
-    assert all(np.corrcoef(rows[:, joint], noise[::every, joint])[0, 1] > 0.8 for joint in range(2))
-
-
-def test_rows_that_are_far_apart_tell_no_noise():
-    motion = np.sin(DT * np.arange(4000))[:, None]
-    assert not smooth(log_of(motion, motion, 20), DT).noise.any()

@@ -1,0 +1,57 @@
+r"""Wander: motion by what a log does not tell, and residuals without it.
+
+A law that is given the noise n of the sensors moves the robot by it. Between the rows of a log that noise is not known.
+It is drawn several times; the deviations of the simulated motions from their mean, over the root of their number less
+1, are columns of W. So is the motion by a standard deviation of an unknown initial velocity. Residuals r of white noise
+of size sigma and of wander have the covariance::
+
+    C = sigma^2 (I + W W^T / n^2),     r_white = (I + W W^T / n^2)^(-1/2) r
+
+r_white takes the place of r, and its Jacobian that of the Jacobian; half the logarithm of det(I + W W^T / n^2) is added
+to the negative logarithm of the likelihood (generalized least squares; L. Ljung, System Identification, 2nd edition,
+Prentice Hall, 1999, section 7.2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+
+def spread(draws: Float64) -> Float64:
+    """Return the columns (rows, joints, draws) of W for positions of several draws (draws, rows, joints)."""
+    return (draws - draws.mean(0)).transpose(1, 2, 0) / np.sqrt(max(len(draws) - 1, 1))
+
+
+def whiten(
+    wander: Float64, stretches: list[NDArray[np.intp]], residual: Float64, jacobian: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """Return residuals and Jacobian without wander in the rows of ``stretches``, and half log-determinants.
+
+    Parameters
+    ----------
+    wander
+        W over the noise n (rows, joints, columns).
+    residual, jacobian
+        (rows, joints) and (rows, joints, unknowns).
+
+    Returns
+    -------
+    residual, jacobian, determinants
+        The last one over the number of rows (stretches, joints).
+    """
+    determinants = np.zeros((len(stretches), residual.shape[1]))
+    if not np.isfinite(wander).all():
+        return residual, jacobian, determinants
+    white, jacobian = residual.copy(), jacobian.copy()
+    for number, rows in enumerate(stretches):
+        for joint in range(residual.shape[1]):
+            directions, sizes, _ = np.linalg.svd(wander[rows, joint], full_matrices=False)
+            shrink = (1 - 1 / np.sqrt(1 + sizes**2))[:, None]
+            table = np.column_stack([white[rows, joint], jacobian[rows, joint]])
+            table -= directions @ (shrink * (directions.T @ table))
+            white[rows, joint], jacobian[rows, joint] = table[:, 0], table[:, 1:]
+            determinants[number, joint] = 0.5 * np.log1p(sizes**2).sum() / len(rows)
+    return white, jacobian, determinants
