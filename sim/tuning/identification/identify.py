@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
@@ -26,7 +27,7 @@ from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.fit import Solution, Step, fit
 from sim.tuning.identification.history import History, State
-from sim.tuning.identification.logs import Log, read_logs
+from sim.tuning.identification.logs import Log, LogWarning, at_limits, read_logs
 from sim.tuning.identification.plant import Motors, Plant
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import Motion, best_drive, smooth
@@ -90,6 +91,11 @@ def identify(
         An option is out of range, a file holds no log of this robot, or a history is of another fit.
     MissingDependencyError
         A package is missing.
+
+    Warns
+    -----
+    LogWarning
+        A joint is at a limit.
     """
     for package in ("scipy", "cmaes"):
         if find_spec(package) is None:
@@ -216,6 +222,9 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
         if log.kind != kind:
             remedy = "give the params that drove the robot" if log.kind == "setpoint" else "give no params"
             raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
+        if stopped := at_limits(robot, log):
+            message = "; ".join(stopped) + ": stops are no part of the model; record between the limits"
+            warnings.warn(message, LogWarning, stacklevel=4)
     return found
 
 

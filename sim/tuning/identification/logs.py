@@ -36,8 +36,14 @@ CommandKind = Literal["setpoint", "effort"]
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a log."""
+AT_LIMIT = 1e-3
+"""Distance to a joint limit at which a joint counts as stopped by it, over its range."""
 BEYOND = {"rad": 0.3, "m": 0.05}
 """Distance beyond a joint limit at which a position counts as given in another unit."""
+
+
+class LogWarning(UserWarning):
+    """A log holds what the model of the robot does not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +242,21 @@ def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
         remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
         raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
     return log
+
+
+def at_limits(robot: Robot, log: Log) -> list[str]:
+    """Return a line for each joint that ``log`` shows at a limit, where a stop acts and not the motor alone."""
+    lines = []
+    for column, joint in zip(log.qpos.T, log.joints, strict=True):
+        low, high = robot.lower[joint], robot.upper[joint]
+        if robot.continuous[joint] or not np.isfinite(high - low):
+            continue
+        touching = (column < low + AT_LIMIT * (high - low)) | (column > high - AT_LIMIT * (high - low))
+        if touching.any():
+            limits = f"limits {low:g} to {high:g} {robot.units[joint]}"
+            place = f"{log.source}: joint {robot.joint_names[joint]!r} is at its limit"
+            lines.append(f"{place} in {touching.mean():.2g} of the rows ({limits})")
+    return lines
 
 
 def setpoint_csv(robot: Robot, motion: Trajectory) -> str:

@@ -3,7 +3,8 @@ import pytest
 
 import batchpid as bp
 from sim import Robot, Runner, write_recording
-from sim.tuning.identification.logs import logs_of_rollout, read_logs
+from sim.tuning import identify
+from sim.tuning.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
 
 ROWS = 60
 
@@ -162,3 +163,16 @@ def test_a_damaged_or_linked_hdf5_log_is_refused(panda, tmp_path, columns):
     for each in (path, linked):
         with pytest.raises(bp.BatchPIDError, match="cannot be read as a log"):
             read_logs(panda, [each])
+
+
+def test_a_joint_at_its_limit_is_told(panda):
+    rows = np.arange(400) / 1000
+    setpoints = np.clip(panda.start, panda.lower + 0.01, panda.upper - 0.01) * np.ones((400, 1))
+    setpoints[:, 0] += 0.1 * np.sin(20 * rows)
+    free = Log("free.csv", tuple(range(panda.dof)), "setpoint", rows, setpoints, rows, setpoints, False)
+    assert at_limits(panda, free) == []
+    setpoints[:100, 3] = panda.upper[3] + 1e-3
+    (line,) = at_limits(panda, free)
+    assert line.startswith("free.csv: joint 'panda_joint4' is at its limit in 0.25 of the rows")
+    with pytest.warns(LogWarning, match="'panda_joint4' is at its limit"):
+        identify(panda, free, params=panda.designed("effort"), evaluations=1, workers=0, payload=False)
