@@ -24,6 +24,8 @@ NEUTRAL: dict[str, float] = {
     "velocity_noise": 0.0,
 }
 """Numbers of a joint, with the value that is off."""
+TABLE = "limit_efforts"
+"""Numbers of each point of a joint's position-dependent limit."""
 JOINT_SIDE = ("coulomb", "static", "viscous", "armature")
 """Fields that act on the joint and not on the signals: :class:`sim.Runner` gives them to the simulator."""
 SENSOR_SIDE = (

@@ -93,7 +93,7 @@ class Actuators(NamedTuple):
         if self.continuous is not None:
             options["continuous"] = self.continuous > 0
         if self.limit_positions is not None:
-            options["position_limit"] = options.pop("limit_positions")[0], options.pop("limit_efforts")[0]
+            options["position_limit"] = options.pop("limit_positions"), options.pop("limit_efforts")
         if self.seed is not None:
             options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
         if self.max_delay is not None and not is_traced(self.max_delay):
@@ -175,7 +175,7 @@ def make_actuators(
         Largest effort that the motor delivers, >= 0 [N m or N].
     position_limit
         Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there [N m or N], both
-        (points,) or (joints, points). Linear between the points, constant outside.
+        (points,), (joints, points) or (envs, joints, points). Linear between the points, constant outside.
     coulomb, viscous
         Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to that of the robot's description, by
         the model of :mod:`batchpid.friction`.
@@ -242,25 +242,26 @@ def make_actuators(
 
 
 def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Any, Any]:
-    """Return the positions and efforts of a limit that depends on the position (1, joints, points)."""
+    """Return the positions and efforts of a limit that depends on the position (1 | envs, joints, points)."""
     if table is None:
         return None, None
-    remedy = "give positions and efforts, both (points,) or (joints, points), with two points or more"
+    remedy = "give positions and efforts (points,), (joints, points) or (envs, joints, points), with two points or more"
     if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
         raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
     rows = [read_array("position_limit", each).astype(build.dtype) for each in table]
     for each in rows:
-        if each.ndim not in (1, 2) or each.shape[-1] < 2 or (each.ndim == 2 and len(each) != build.joints):
+        if each.ndim not in (1, 2, 3) or each.shape[-1] < 2 or (each.ndim > 1 and each.shape[-2] != build.joints):
             raise InvalidArgumentError("position_limit", f"has shape {each.shape}", remedy=remedy)
     if rows[0].shape[-1] != rows[1].shape[-1]:
         problem = f"has {rows[0].shape[-1]} positions and {rows[1].shape[-1]} efforts"
         raise InvalidArgumentError("position_limit", problem, remedy=remedy)
-    positions, efforts = (np.broadcast_to(each, (build.joints, each.shape[-1])) for each in rows)
-    rising = np.isfinite(positions).all(1) & (np.diff(positions) >= 0).all(1)
-    entries("position_limit", positions[:, 0], rising, "has positions that do not ascend", build.names)
-    good = (efforts >= 0).all(1) & (np.isfinite(efforts).all(1) | np.isinf(efforts).all(1))
-    entries("position_limit", efforts[:, 0], good, "has an effort < 0 or not finite", build.names)
-    return (None, None) if np.isinf(efforts).all() else (build.freeze(positions[None]), build.freeze(efforts[None]))
+    shape = (1, build.joints, rows[0].shape[-1])
+    positions, efforts = (np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows)
+    rising = np.isfinite(positions).all(2) & (np.diff(positions) >= 0).all(2)
+    entries("position_limit", positions[..., 0], rising, "has positions that do not ascend", build.names)
+    good = (efforts >= 0).all(2) & (np.isfinite(efforts).all(2) | np.isinf(efforts).all(2))
+    entries("position_limit", efforts[..., 0], good, "has an effort < 0 or not finite", build.names)
+    return (None, None) if np.isinf(efforts).all() else (build.freeze(positions), build.freeze(efforts))
 
 
 def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:

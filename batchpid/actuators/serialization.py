@@ -42,7 +42,8 @@ def dumps_actuators(
     """Return ``actuators`` as text in ``format``, "yaml" or "json", with one name per joint.
 
     ``about`` is kept with them, e.g. where they come from: plain numbers, strings, lists, mappings. Raises
-    InvalidArgumentError for names that do not fit, or an unknown format.
+    InvalidArgumentError for names that do not fit, an unknown format, or a limit by position that differs from env to
+    env.
     """
     joints, options = names("joint_names", joint_names, actuators.num_joints), actuators.options()
     document: dict[str, Any] = {"format": FORMAT}
@@ -57,9 +58,12 @@ def dumps_actuators(
         joint: {name: documents.plain(column[:, index]) for name, column in options.items()}
         for index, joint in enumerate(joints)
     }
+    if table is not None and max(map(len, table)) > 1:
+        remedy = "save those of one env: actuators.for_envs(slice(k, k + 1))"
+        raise InvalidArgumentError("actuators", "have a position_limit for each env, and a file has one", remedy=remedy)
     for index, joint in enumerate(joints if table is not None else ()):
-        if np.isfinite(table[1][index]).all():
-            document["joints"][joint][_TABLE] = [rows[index].tolist() for rows in table]
+        if np.isfinite(table[1][0, index]).all():
+            document["joints"][joint][_TABLE] = [rows[0, index].tolist() for rows in table]
     return documents.render(document, format)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.actuators import JOINT_SIDE
-from batchpid.actuators.fields import NEUTRAL
+from batchpid.actuators.fields import NEUTRAL, TABLE
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import choice
 from sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
@@ -84,17 +84,19 @@ def prepared_actuators(
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
     values: dict[str, NDArray[Any]] = {}
     for leaf, each in randomization.actuators.items():
-        nominal = getattr(known, choice("actuators", leaf, list(NEUTRAL)))
-        if nominal is None and np.isinf(NEUTRAL[leaf]):
-            remedy = f"give the runner actuators with {leaf}"
+        neutral = {**NEUTRAL, TABLE: np.inf}[choice("actuators", leaf, [*NEUTRAL, TABLE])]
+        nominal = getattr(known, leaf)
+        if nominal is None and np.isinf(neutral):
+            remedy = f"give the runner actuators with {'position_limit' if leaf == TABLE else leaf}"
             raise InvalidArgumentError(f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy)
-        values[leaf] = np.full((1, robot.dof), NEUTRAL[leaf]) if nominal is None else np.asarray(nominal)
+        values[leaf] = np.full((1, robot.dof), neutral) if nominal is None else np.asarray(nominal)
         for _, chosen, distribution in parts(f"actuators.{leaf}", each, robot.joint_names):
             for end in np.clip(distribution.support, -_HUGE, _HUGE):
                 rows = np.array(values[leaf])
                 rows[:, chosen] = distribution.apply(rows[:, chosen], end)
-                paired: dict[str, Any] = dict.fromkeys(_PAIRED, 1.0) if leaf in _PAIRED else {}
-                checked = bp.make_actuators(robot.dof, **(paired | {leaf: rows}), joint_names=robot.joint_names)
+                options: dict[str, Any] = dict.fromkeys(_PAIRED, 1.0) if leaf in _PAIRED else {}
+                options |= {"position_limit": (known.limit_positions[0], rows[0])} if leaf == TABLE else {leaf: rows}
+                checked = bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
                 delay = max(delay, 0.0 if checked.max_delay is None else float(checked.max_delay[0, 0]))
     like = bp.make_actuators(robot.dof, command_delay=1e-3, position_noise=1.0, max_delay=max(delay, 1e-3))
     noisy = known.seed is None and not values.keys().isdisjoint(("position_noise", "velocity_noise"))

@@ -149,9 +149,14 @@ class Randomization:
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
     def apply(self, name: str, nominal: Any, draws: Draws, robot: Robot) -> Float64:
-        """Return the values of a field (envs, joints or links) that result from ``nominal``, which broadcasts to it."""
+        """Return the values of a field (envs, joints or links) that result from ``nominal``, which broadcasts to it.
+
+        All entries of a joint's table (1, joints, points) change by one draw.
+        """
         drawn = draws.values[name]
-        values = np.array(np.broadcast_to(nominal, drawn.shape))
+        if np.ndim(nominal) == 3:
+            drawn = drawn[..., None]
+        values = np.array(np.broadcast_to(nominal, np.broadcast_shapes(np.shape(nominal), drawn.shape)))
         for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):
             values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
         return values

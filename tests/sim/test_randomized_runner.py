@@ -81,6 +81,25 @@ def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
     assert np.abs(moved[:, 0] - moved[:, 1]).max() > 0.01
 
 
+def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
+    points = np.linspace(PANDA.lower, PANDA.upper, 3).T
+    actuators = bp.make_actuators(PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1))))
+    scale = Randomization(seed=1, actuators={"limit_efforts": Uniform(0.1, 1, operation="scale")})
+    runs = []
+    for options in ({}, {"workers": 2}, {"pack_size": 1}):
+        with make(actuators=actuators, randomization=scale, **options) as runner:
+            draws = runner.draws["actuators.limit_efforts"]
+            runs.append(episodes(runner))
+    for run in runs[1:]:
+        for ours, expected in zip(run, runs[0], strict=True):
+            assert_identical(ours, expected)
+    assert draws.shape == (N, PANDA.dof)
+    drawn = actuators._replace(limit_efforts=actuators.limit_efforts * draws[..., None])
+    for options in ({}, {"workers": 2, "pack_size": 1}):
+        with make(actuators=drawn, randomization=None, **options) as runner:
+            assert_identical(runner.rollout(setpoints()), runs[0][0])
+
+
 def test_a_reset_draws_for_the_envs_of_its_mask():
     with make() as runner:
         before, mask = runner.draws, np.arange(N) < 2

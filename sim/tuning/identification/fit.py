@@ -33,8 +33,6 @@ TRIES = 6
 """Most evaluations for one good step."""
 _ONE_STEP = 1.0
 """Relative tolerance of the sum of squares that ends least_squares with its first good step."""
-_DELAYS = np.arange(1, 9) / 4
-"""Changes of a delay that are tried at the end, over the time step."""
 _INSIDE = 1e-9
 """Least distance of points from the bounds, over typical sizes."""
 
@@ -66,6 +64,8 @@ class Solution(NamedTuple):
     sizes: Float64
     """Sizes of the residuals (stretches, joints) [rad or m]."""
     windows: list[Evaluation]
+    promised: float
+    """Further decrease of the cost that linear residuals would allow; what is not small was not reached."""
 
 
 def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = lambda *_: None) -> Solution:
@@ -93,14 +93,10 @@ def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = l
         gain = before - cost
         weighed = factors.at(x * scale) / sizes[..., None, None]
         moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
-        done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or _promised(weighed) < LEAST_GAIN * problem.count
-        if done and factors.left > 0:
-            factors.left -= 1
-            if (other := _at_other_delay(problem, x * scale, factors.windows(x * scale))) is not None:
-                x, last = _inside(other / scale, bounds), x
-                continue
+        promised = _promised(weighed) / problem.count
+        done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or promised < LEAST_GAIN
         if done or factors.left <= 0:
-            return Solution(x * scale, cost, sizes, factors.windows(x * scale))
+            return Solution(x * scale, cost, sizes, factors.windows(x * scale), promised)
 
         def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
             found = factors.at(x * scale)[..., -1] / sizes[..., None]
@@ -115,20 +111,6 @@ def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = l
         options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
         last = x
         x = _inside(least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x, bounds)
-
-
-def _at_other_delay(problem: Problem, theta: Float64, known: list[Evaluation]) -> Float64 | None:
-    """Return ``theta`` with another delay that is better, None if there is none.
-
-    Efforts that jump from step to step are smoothed by a delay of a broken number of steps, and not by a whole one: the
-    likelihood may have a maximum in each step, of which a fit finds the next one.
-    """
-    delay = problem.unknowns.names.index(("delay", None))
-    points = np.tile(theta, (2 * len(_DELAYS) + 1, 1))
-    points[1:, delay] += problem.drive.timestep * np.r_[-_DELAYS[::-1], _DELAYS]
-    costs = problem.costs_near(problem.unknowns.clip(points), known)
-    best = int(np.argmin(costs))
-    return points[best] if costs[best] < costs[0] - LEAST_GAIN else None
 
 
 def _inside(x: Float64, bounds: tuple[Float64, Float64]) -> Float64:

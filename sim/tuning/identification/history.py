@@ -14,12 +14,12 @@ from sim.tuning.identification.fit import Step
 
 
 class State(NamedTuple):
-    """State of a fit of all variants: all that the rest of the fit depends on."""
+    """State of a search: all that the rest of it depends on."""
 
     step: Step
-    """State of the variant that is being fitted."""
-    done: tuple[list[float], ...] = ()
-    """Solutions of the variants of the drive that were fitted before."""
+    """State of the fit that is being done."""
+    done: tuple[tuple[int, list[float]], ...] = ()
+    """Fits that were done: number of the problem, and solution."""
 
 
 class History:
@@ -35,7 +35,10 @@ class History:
             theirs = document["settings"]
             theta, last = (np.array(document[name], float) for name in ("theta", "last"))
             cost = np.inf if document["cost"] is None else float(document["cost"])
-            self.state = State(Step(theta, int(document["left"]), last, cost), tuple(document["done"]))
+            self.state = State(
+                Step(theta, int(document["left"]), last, cost),
+                tuple((int(number), theta) for number, theta in document["done"]),
+            )
             different = sorted(k for k in {*theirs, *self._settings} if theirs.get(k) != self._settings.get(k))
             problem = f"is of another fit ({', '.join(different)} differ)" if different else None
         except (ValueError, KeyError, TypeError) as error:

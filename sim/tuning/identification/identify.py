@@ -25,13 +25,14 @@ from batchpid.versions import package_versions
 from sim.options import Compensation
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
-from sim.tuning.identification.fit import Solution, Step, fit
+from sim.tuning.identification.fit import Step
 from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, LogWarning, at_limits, read_logs
 from sim.tuning.identification.plant import Motors, Plant
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import Motion, best_drive, smooth
 from sim.tuning.identification.result import Fit, Identification
+from sim.tuning.identification.search import Progress, search
 from sim.tuning.identification.start import begin
 from sim.tuning.identification.statistics import uncertainty
 from sim.tuning.identification.unknowns import Unknowns
@@ -139,9 +140,8 @@ def identify(
         ]
         ideal = _ideal(robot, joints)
         state = record.state or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
-        steps = _Steps(len(problems), evaluations, progress)
-        solutions = _fit_all(problems, state, record, steps)
-        problem, best = min(zip(problems, solutions, strict=True), key=lambda pair: pair[1].cost)
+        bar = Progress(len(problems), evaluations, progress)
+        problem, best = search(problems, state, evaluations, record, bar)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
     before = [residual[0] for residual in before]
@@ -159,22 +159,6 @@ def identify(
     )
 
 
-class _Steps:
-    """Progress of fits: a bar over their evaluations."""
-
-    def __init__(self, fits: int, evaluations: int, progress: Callable[[Any], Any] | None) -> None:
-        self.evaluations = evaluations
-        self._bar = (progress or (lambda items: items))(range(fits * evaluations))
-        self._steps, self._shown = iter(self._bar), 0
-
-    def __call__(self, fits: int, left: int, cost: float) -> None:
-        """Advance the bar to so many complete ``fits`` and evaluations ``left``, and show the typical error."""
-        while self._shown < (fits + 1) * self.evaluations - left and next(self._steps, None) is not None:
-            self._shown += 1
-        if hasattr(self._bar, "set_postfix"):
-            self._bar.set_postfix(error=f"{np.exp(cost):.3g}")
-
-
 def _variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
     """Return ways in which the law may measure: with the sensors' noise or without, rates or differences of positions.
 
@@ -185,24 +169,6 @@ def _variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
     quiet = replace(drive, measured_rate=False)
     seen = any(motion.sensor.size.any() for motion in motions)
     return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
-
-
-def _fit_all(problems: list[Problem], state: State, record: History, steps: _Steps) -> list[Solution]:
-    """Return the solution of each of ``problems``, each begun with that of the one before, from ``state`` on."""
-    solutions = [
-        fit(problem, Step.first(np.array(theta), 0)) for problem, theta in zip(problems, state.done, strict=False)
-    ]
-    begin = state.step
-    for problem in problems[len(state.done) :]:
-        done = tuple(solution.theta.tolist() for solution in solutions)
-
-        def report(step: Step, cost: float, done: tuple[list[float], ...] = done) -> None:
-            record.write(State(step, done))
-            steps(len(done), step.left, cost)
-
-        solutions.append(fit(problem, begin, report))
-        begin = Step.first(solutions[-1].theta, steps.evaluations)
-    return solutions
 
 
 def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]:

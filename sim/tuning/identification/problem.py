@@ -63,8 +63,6 @@ class Evaluation(NamedTuple):
     """Those of the fitted rows without wander (rows, joints)."""
     jacobian: Float64
     """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
-    wander: Float64
-    """Wander over the noise (rows, joints, columns)."""
     determinant: Float64
     """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
 
@@ -171,17 +169,8 @@ class Problem:
             else:
                 wander = np.concatenate([wander, effect * window.speed_error], axis=2)
             wander /= (self.noise / NOISES)[:, None]
-            white, jacobian, determinant = whiten(wander, stretches, residual, jacobian)
-            found.append(Evaluation(residual, white, jacobian, wander, determinant))
+            found.append(Evaluation(residual, *whiten(wander, stretches, residual, jacobian)))
         return found
-
-    def costs_near(self, points: Float64, evaluations: list[Evaluation]) -> Float64:
-        """Return the costs (points,) of ``points``, with the wander of the first one, that of ``evaluations``."""
-        whites = []
-        for residuals, known, stretches in zip(self.residuals(points), evaluations, self.stretches, strict=True):
-            moved = (residuals - residuals[0] + known.residual).transpose(1, 2, 0)
-            whites.append(whiten(known.wander, stretches, known.residual, moved)[1].transpose(2, 0, 1))
-        return self.costs(self.sizes(whites)).mean(1)
 
     def lags(self, seconds: float) -> list[int]:
         """Return how many rows of each log are ``seconds`` long."""

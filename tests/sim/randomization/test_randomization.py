@@ -202,6 +202,7 @@ def test_it_is_what_its_dict_describes():
         ({"actuators": {"delay": Uniform(0, 1)}}, "actuators: unknown option"),
         ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay: out of range"),
         ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
+        ({"actuators": {"limit_efforts": Uniform(0, 2)}}, "actuators.limit_efforts: is off"),
         ({"payload": 0.5}, "payload: is no distribution"),
         ({"payload": {"panda_hand": Uniform(0, 1)}}, "payload: is no distribution"),
         ({"friction": {}}, "friction: is no distribution"),

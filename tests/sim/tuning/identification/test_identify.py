@@ -11,11 +11,13 @@ from sim import Robot
 from sim.tuning import identify
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.excitation import excite
-from sim.tuning.identification.fit import Step, fit
+from sim.tuning.identification.fit import Step
+from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Motors, Plant, Segment
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import smooth
+from sim.tuning.identification.search import Progress, search
 from sim.tuning.identification.unknowns import PER_JOINT, Unknowns
 
 pytest.importorskip("scipy")
@@ -93,16 +95,17 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)
 
 
-def test_a_fit_leaves_a_delay_that_is_best_nearby_only(arm, runs):
+def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     truth, _, efforts = runs
     joints, drive = (0, 1), Drive(1 / 2000, None, "gravity+coriolis")
-    motions = [smooth(efforts, 1 / 2000)]
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
-    problem = Problem(arm, joints, drive, [efforts], motions, unknowns)
+    problem = Problem(arm, joints, drive, [efforts], [smooth(efforts, 1 / 2000)], unknowns)
     per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
     theta = unknowns.point(Motors(*per_joint, row(truth.delay + 7e-4), row(0.0095), row(0.0)))
-    found = fit(problem, Step.first(theta, 20)).theta
-    assert found[unknowns.names.index(("delay", None))] == pytest.approx(truth.delay, abs=1e-4)
+    begin, delay = State(Step.first(theta, 20)), unknowns.names.index(("delay", None))
+    same, found = search([problem], begin, 20, History(None, {}), Progress(1, 20, None))
+    assert same is problem
+    assert found.theta[delay] == pytest.approx(truth.delay, abs=1e-4)
 
 
 def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
