@@ -80,14 +80,15 @@ def test_bad_files_are_refused_by_file_joint_and_key(text, said, tmp_path):
     assert str(path) in str(caught.value)
 
 
-def test_limits_by_position_that_differ_from_env_to_env_are_in_no_file():
+def test_limits_by_position_that_differ_from_env_to_env_are_in_no_file(tmp_path):
     efforts = np.arange(1.0, 13.0).reshape(2, 2, 3)
     both = bp.make_actuators(2, position_limit=([0.0, 1.0, 2.0], efforts))
     assert both.num_envs == 2
     assert np.array_equal(both.replace(strength=0.5).limit_efforts, efforts)
     with pytest.raises(bp.InvalidArgumentError, match="for each env, and a file has one"):
-        bp.dumps_actuators(both, ["a", "b"])
+        bp.save_actuators(tmp_path / "a.yaml", both, ["a", "b"])
     for env in range(2):
         own = both.for_envs(slice(env, env + 1))
-        again, _ = bp.loads_actuators(bp.dumps_actuators(own, ["a", "b"]))
+        bp.save_actuators(tmp_path / "a.yaml", own, ["a", "b"])
+        again, _ = bp.load_actuators(tmp_path / "a.yaml")
         assert np.array_equal(again.limit_efforts[0], efforts[env])

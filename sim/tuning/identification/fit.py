@@ -29,7 +29,7 @@ Float64 = NDArray[np.float64]
 GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
 """The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
 STEP standard deviations of the unknowns; and if linear residuals promise less than LEAST_GAIN."""
-TRIES = 6
+TRIES = 4
 """Most evaluations for one good step."""
 _ONE_STEP = 1.0
 """Relative tolerance of the sum of squares that ends least_squares with its first good step."""

@@ -67,7 +67,8 @@ def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluation
         return len(done), Step.first(start, evaluations)
     variants, neighbours = done[: len(problems)], iter(done[len(problems) :])
     number, best = min(variants, key=lambda each: each[1].cost)
-    if len(done) - len(problems) >= NEIGHBOURS:
+    jumps = problems[number].drive.noisy or problems[number].shoots
+    if not jumps or len(done) - len(problems) >= NEIGHBOURS:
         return None
     for direction in (-1, 1):
         at = best

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.tuning.identification.fit import Solution
-from sim.tuning.identification.problem import Problem
+from sim.tuning.identification.problem import NOISES, Problem
 
 Float64 = NDArray[np.float64]
 MEMORY = 1.0
@@ -26,12 +26,17 @@ MEMORY = 1.0
 MODEL_ERROR = 2.0
 """Factor of the standard deviations that allows for errors of the model, such as friction near rest under a law that
 sees noise. Without it 30 % of the intervals missed the truth on logs of a two-joint arm in MuJoCo."""
-LEAST_DEVIATION, LEAST_OF_BIAS = 5e-3, 1.5e-2
+LEAST_DEVIATION, LEAST_OF_BIAS = 5e-3, 1e-2
 """Least standard deviation of an unknown, over its estimate, and of a bias: no model is better."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED, DELAY_RESOLVED = 0.05, 0.1
 """Largest half width of an interval, over the estimate, of an unknown that counts as identified, and of the delay."""
+
+LEAST_MOTION = 30.0
+"""Least standard deviation of a joint's positions, over their noise, of a joint that is moved and not only shaken."""
+UNFINISHED = 3e-3
+"""Decrease of the cost that a fit may leave unreached; beyond, it did not find an optimum, and nothing is known."""
 
 
 class Uncertainty(NamedTuple):
@@ -75,8 +80,15 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     deviation = np.hypot(MODEL_ERROR * unknowns.scale * np.sqrt(variance), LEAST_DEVIATION * np.abs(point.theta))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
     resolved = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind, _ in unknowns.names])
-    identified = INTERVAL * deviation <= resolved * np.abs(point.theta)
+    moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
+    known = np.array([joint is None or moves[joint] for _, joint in unknowns.names]) & (point.promised < UNFINISHED)
+    identified = known & (INTERVAL * deviation <= resolved * np.abs(point.theta))
     return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
+
+
+def _motion(problem: Problem) -> Float64:
+    """Return the standard deviations of the fitted positions (joints,) [rad or m]."""
+    return np.concatenate([window.measured[window.fitted] for window in problem.windows]).std(0)
 
 
 def _autocovariances(problem: Problem, point: Solution, lags: int) -> Float64:

@@ -11,13 +11,14 @@ from sim import Robot
 from sim.tuning import identify
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.excitation import excite
-from sim.tuning.identification.fit import Step
+from sim.tuning.identification.fit import Step, fit
 from sim.tuning.identification.history import History, State
 from sim.tuning.identification.logs import Log, read_logs
 from sim.tuning.identification.plant import Motors, Plant, Segment
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import smooth
 from sim.tuning.identification.search import Progress, search
+from sim.tuning.identification.statistics import uncertainty
 from sim.tuning.identification.unknowns import PER_JOINT, Unknowns
 
 pytest.importorskip("scipy")
@@ -169,6 +170,24 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     assert document["joints"]["shoulder"]["damping"] == [None, None, None]
     assert found.actuators().strength[0, 0] == 1.0
     assert found.uncertainty.singular_values[-1] < 1e-3
+
+
+def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothing(arm, runs):
+    truth, _, efforts = runs
+    unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
+    drive, motion = Drive(1 / 2000, None, "gravity+coriolis"), smooth(efforts, 1 / 2000)
+    problem = Problem(arm, (0, 1), drive, [efforts], [motion], unknowns)
+    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
+    theta = unknowns.point(Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0)))
+    found = fit(problem, Step.first(theta, 10))
+    of_elbow = np.array([joint == 1 for _, joint in unknowns.names])
+    known = uncertainty(problem, found).identified
+    assert known[of_elbow].sum() >= 4
+    assert not uncertainty(problem, found._replace(promised=0.1)).identified.any()
+    problem.noise[1] = 0.1 * np.std(efforts.qpos[:, 1])
+    shaken = uncertainty(problem, found).identified
+    assert not shaken[of_elbow].any()
+    assert np.array_equal(shaken[~of_elbow], known[~of_elbow])
 
 
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
