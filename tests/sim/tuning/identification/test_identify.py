@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import load_bundled
 
 import batchpid as bp
 from sim import Robot
@@ -280,19 +281,25 @@ def test_the_intervals_hold_the_truth(arm, mujoco_log):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(int(os.environ.get("BATCHPID_SOAK_SEEDS", "1"))))
 @pytest.mark.parametrize("kind", ["setpoint", "effort"])
-def test_the_motors_of_a_panda_are_found(panda, mujoco_log, kind, seed):
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
     """Its seven arm joints, from ten seconds in MuJoCo."""
-    truth, params = mujoco_log["plausible"](panda, seed), panda.designed("effort")
+    robot = load_bundled(name)
+    truth, params = mujoco_log["plausible"](robot, seed), robot.designed("effort")
     every = 2 if kind == "setpoint" else 1  # the noise in efforts between the rows of a log is not known
-    table = mujoco_log["simulate"](panda, truth, excite(panda, 10.0), params, moving=7, every=every, seed=seed)
+    table = mujoco_log["simulate"](robot, truth, excite(robot, 10.0), params, moving=7, every=every, seed=seed)
     log = Log("log", tuple(range(7)), kind, table["time"], table["qpos"], table["time"], table[kind], False)
     of_arm = bp.PIDParams(*(leaf[:, :7] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
-    found = identify(panda, log, params=of_arm if kind == "setpoint" else None)
+    found = identify(robot, log, params=of_arm if kind == "setpoint" else None)
+    inside = []
     for number in range(7):
-        for name in ("armature", "damping", "friction", "strength"):
-            estimate, low, high = found.interval(name, number)
-            wanted = float(getattr(truth, name)[number])
-            assert abs(estimate - wanted) < 0.05 * wanted, (name, number)
-            assert low - 0.02 * wanted < wanted < high + 0.02 * wanted, (name, number)
+        for unknown in ("armature", "damping", "friction", "strength"):
+            if (interval := found.interval(unknown, number)) is None:
+                continue
+            wanted = float(getattr(truth, unknown)[number])
+            assert abs(interval[0] - wanted) < 0.05 * wanted, (unknown, number)
+            inside.append(interval[1] < wanted < interval[2])
+    assert len(inside) >= (26 if name == "panda" else 18)
+    assert sum(inside) >= len(inside) - 2
     assert found.interval("delay")[0] == pytest.approx(truth.delay, abs=2e-4)
     assert found.held_out_error[1] < 0.1 * found.held_out_error[0]
