@@ -122,6 +122,7 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
 
     spec = mujoco.MjSpec.from_string(robot.urdf)
     spec.option.timestep = timestep
+    spec.compiler.fusestatic = False  # so that the tool link, which carries the payload, stays
     for index, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         if name not in names:
