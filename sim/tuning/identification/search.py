@@ -27,7 +27,7 @@ class Progress:
     def __init__(self, fits: int, evaluations: int, progress: Callable[[Any], Any] | None) -> None:
         self._evaluations = evaluations
         self._bar = (progress or (lambda items: items))(range(fits * evaluations + 2 * NEIGHBOUR_EVALUATIONS))
-        self._steps, self._shown, self._before = iter(self._bar), 0, 0
+        self._steps, self._shown = iter(self._bar), 0
 
     def __call__(self, done: int, left: int, cost: float) -> None:
         """Advance the bar to so many ``done`` fits and evaluations ``left``, and show the typical error."""
