@@ -12,7 +12,9 @@ See docs/actuators.md.
 
 from batchpid.actuators import presets
 from batchpid.actuators.dynamics import (
+    STAGES,
     Coefficients,
+    Stages,
     advance_effort,
     advance_measurement,
     command_limits,
@@ -30,9 +32,11 @@ from batchpid.actuators.state import ActuatorState
 
 __all__ = [
     "JOINT_SIDE",
+    "STAGES",
     "ActuatorState",
     "Actuators",
     "Coefficients",
+    "Stages",
     "advance_effort",
     "advance_measurement",
     "check_actuators",

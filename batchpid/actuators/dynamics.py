@@ -22,6 +22,7 @@ see :mod:`batchpid.friction`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -173,20 +174,29 @@ def measure(
     return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
 
 
-def advance_effort(
-    k: Coefficients, state: ActuatorState, effort: Any, qpos: Any, qvel: Any
-) -> tuple[ActuatorState, Any]:
-    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
+class Stages(NamedTuple):
+    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints), for who compiles them."""
+
+    delivered: Callable[..., tuple[Any]]
+    limits: Callable[..., tuple[Any, Any]]
+    play: Callable[..., tuple[Any, Any]]
+    encode: Callable[..., tuple[Any, Any]]
+
+
+def _motor(k: Coefficients, effort: Any) -> Any:
+    """Return s u + b."""
+    effort = effort if k.strength is None else k.strength * effort
+    return effort if k.bias is None else effort + k.bias
+
+
+def _delivered(k: Coefficients, behind: Any, effort: Any, qpos: Any, qvel: Any) -> tuple[Any]:
+    """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step before, None without."""
     xp = namespace(effort, qpos, qvel)
-    command, behind = state.command, state.effort
-    if k.command is not None:
-        command = delay.push(command, effort, xp)
-        effort = delay.read(command, k.command, None, xp)
     low, high = limits(k.envelope, qpos, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
     if k.intake is not None:
-        behind = motor = clip(behind + k.intake * (motor - behind), low, high, xp)
-    return ActuatorState(command, behind, *state[2:]), motor
+        motor = clip(behind + k.intake * (motor - behind), low, high, xp)
+    return (motor,)
 
 
 def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
@@ -198,8 +208,49 @@ def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
     return limits(k.commands, qpos, qvel)
 
 
+def _play(k: Coefficients, encoder: Any, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+    """Return position and velocity behind the backlash; ``encoder`` is the position of the step before."""
+    xp = namespace(qpos, qvel)
+    behind = wrap(encoder - qpos, k.turns, xp)
+    offset = clip(behind, -k.play, k.play, xp)
+    return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
+
+
+def _encode(k: Coefficients, qpos: Any, qvel: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
+    """Return position and velocity with noise, ``position`` and ``velocity`` or None, in steps of the resolution."""
+    xp = namespace(qpos, qvel)
+    qpos = qpos if position is None else qpos + position
+    qvel = qvel if velocity is None else qvel + velocity
+    if k.position_resolution is not None:
+        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
+    if k.velocity_resolution is not None:
+        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
+    return qpos, qvel
+
+
+STAGES = Stages(_delivered, command_limits, _play, _encode)
+
+
+def advance_effort(
+    k: Coefficients, state: ActuatorState, effort: Any, qpos: Any, qvel: Any, stages: Stages = STAGES
+) -> tuple[ActuatorState, Any]:
+    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
+    xp = namespace(effort, qpos, qvel)
+    command, behind = state.command, state.effort
+    if k.command is not None:
+        command = delay.push(command, effort, xp)
+        effort = delay.read(command, k.command, None, xp)
+    (motor,) = stages.delivered(k, behind, effort, qpos, qvel)
+    return ActuatorState(command, behind if k.intake is None else motor, *state[2:]), motor
+
+
 def advance_measurement(
-    k: Coefficients, state: ActuatorState, qpos: Any, qvel: Any, drawn: tuple[Any, Any] | None = None
+    k: Coefficients,
+    state: ActuatorState,
+    qpos: Any,
+    qvel: Any,
+    drawn: tuple[Any, Any] | None = None,
+    stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any, Any]:
     """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
 
@@ -208,23 +259,17 @@ def advance_measurement(
     xp = namespace(qpos, qvel)
     command, effort, sensor, encoder, key, step = state
     if k.play is not None:
-        behind = wrap(encoder - qpos, k.turns, xp)
-        offset = clip(behind, -k.play, k.play, xp)
-        encoder, qvel = qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
+        encoder, qvel = stages.play(k, encoder, qpos, qvel)
         qpos = encoder
     if k.sensor is not None:
         sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
         seen, joints = delay.read(sensor, k.sensor, k.sensor_turns, xp), qpos.shape[1]
         qpos, qvel = seen[:, :joints], seen[:, joints:]
+    more: tuple[Any, Any] = (None, None)
     if key is not None:
         more = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
-        qpos = qpos if more[0] is None else qpos + more[0]
-        qvel = qvel if more[1] is None else qvel + more[1]
         step = step + _ONE
-    if k.position_resolution is not None:
-        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
-    if k.velocity_resolution is not None:
-        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
+    qpos, qvel = stages.encode(k, qpos, qvel, *more)
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 
@@ -248,12 +293,6 @@ def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorStat
         return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
     return ActuatorState(*(choose(new, old) for new, old in zip(fresh, state, strict=True)))
-
-
-def _motor(k: Coefficients, effort: Any) -> Any:
-    """Return s u + b."""
-    effort = effort if k.strength is None else k.strength * effort
-    return effort if k.bias is None else effort + k.bias
 
 
 def _twice(delay: Any, xp: Any) -> Any:

@@ -12,11 +12,11 @@ from batchpid.actuators import (
     ActuatorState,
     advance_effort,
     advance_measurement,
-    command_limits,
     discretise,
     measurement_noise,
 )
 from sim.loop.snapshot import EPISODE
+from sim.loop.stage_program import compiled_stages
 
 Float64 = NDArray[np.float64]
 
@@ -47,6 +47,7 @@ class JointActuators:
         self.actuators, self.measures = actuators, actuators.measures
         self._state = self._state.matched_to(self._init(qpos))
         self._coefficients = discretise(actuators, self._state, self._timestep, len(qpos))
+        self._stages = compiled_stages(self._coefficients, qpos.shape)
         self._drawn = 0
         self._noise_block: tuple[Any, Any] | None = None
 
@@ -58,23 +59,23 @@ class JointActuators:
 
     def measured(self, qpos: Float64, qvel: Float64) -> tuple[Float64, Float64]:
         """Return the measurement that :meth:`measure` would return, and change nothing."""
-        _, qpos, qvel = advance_measurement(self._coefficients, self._state, qpos, qvel, self._noise())
+        _, qpos, qvel = advance_measurement(self._coefficients, self._state, qpos, qvel, self._noise(), self._stages)
         return qpos, qvel
 
     def measure(self, qpos: Float64, qvel: Float64) -> tuple[Float64, Float64]:
         """Advance the sensors by one sim step; return positions and velocities as measured."""
         drawn = self._noise()
-        self._state, qpos, qvel = advance_measurement(self._coefficients, self._state, qpos, qvel, drawn)
+        self._state, qpos, qvel = advance_measurement(self._coefficients, self._state, qpos, qvel, drawn, self._stages)
         self._drawn += 1
         return qpos, qvel
 
     def limits(self, qpos: Float64, qvel: Float64) -> tuple[Float64 | None, Float64 | None]:
         """Return the least and the largest effort to ask for that the motors do not clip; None for no limit."""
-        return command_limits(self._coefficients, qpos, qvel)
+        return self._stages.limits(self._coefficients, qpos, qvel)
 
     def deliver(self, effort: Float64, qpos: Float64, qvel: Float64) -> Float64:
         """Advance the motors by one sim step; return the efforts that they deliver."""
-        self._state, effort = advance_effort(self._coefficients, self._state, effort, qpos, qvel)
+        self._state, effort = advance_effort(self._coefficients, self._state, effort, qpos, qvel, self._stages)
         return effort
 
     def read(self) -> dict[str, NDArray[Any]]:

@@ -80,6 +80,12 @@ class Symbol:
     def __array_namespace__(self) -> Namespace:
         return self._namespace
 
+    dtype = np.dtype(np.float64)
+
+    def astype(self, _: Any) -> Symbol:
+        """Return it: masks are 1.0 and 0.0."""
+        return self
+
     def copy(self) -> Symbol:
         """Return it: the results of a program are new arrays."""
         return self

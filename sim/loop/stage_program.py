@@ -1,0 +1,96 @@
+"""Elementwise parts of a step as programs of the extension, which makes all their operations in one call.
+
+As the law (:mod:`sim.loop.law_program`) they have one definition, which is traced; results are bit-identical.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from batchpid.actuators import STAGES, Coefficients, Stages
+from sim.engine import native
+from sim.loop import law_program
+from sim.loop.law_program import trace
+
+LEAST_OPERATIONS = 3
+"""Least number of operations for which a call of the extension is faster than NumPy."""
+
+
+def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
+    """Return the stages of actuators with coefficients ``k``, as programs where those are faster.
+
+    ``shape`` is (envs, joints).
+    """
+    if law_program.extension is None or not native.status().active:
+        return STAGES
+    return Stages(*(_compiled(stage, k, shape) for stage in STAGES))
+
+
+def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]) -> Callable[..., Any]:
+    """Return ``stage``, made by programs where it can be; each is traced for the inputs that are none."""
+    programs: dict[tuple[bool, ...], Any] = {}
+
+    def run(given: Coefficients, *inputs: Any) -> Any:
+        none = tuple([each is None for each in inputs])
+        if none not in programs:
+            programs[none] = _program(stage, k, shape, none)
+        if (program := programs[none]) is None or given is not k:
+            return stage(given, *inputs)
+        arrays = tuple([each for each in inputs if each is not None])
+        outputs = tuple([np.empty(shape) for _ in range(program[1])])
+        try:
+            law_program.extension.run(program[0], arrays, outputs)
+        except ValueError:  # one is not contiguous
+            law_program.extension.run(program[0], tuple(map(np.ascontiguousarray, arrays)), outputs)
+        return outputs
+
+    return run
+
+
+def _program(
+    stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int], none: tuple[bool, ...]
+) -> tuple[Any, int] | None:
+    """Return the program of ``stage`` and the number of its results; None if NumPy is to do it."""
+    constants: list[Any] = []
+    numbers = _numbered(k, shape, constants)
+
+    def function(*symbols: Any) -> Any:
+        inputs = iter(symbols[len(constants) :])
+        return stage(_symbolic(numbers, symbols), *(None if each else next(inputs) for each in none))
+
+    try:
+        found = trace(function, len(constants), none.count(False))
+    except (TypeError, AttributeError, AssertionError):  # it has tables, or no limits
+        return None
+    if len(found.operations) < LEAST_OPERATIONS * 5 * np.int32().itemsize:
+        return None
+    given = (*constants, *(np.array(number) for number in found.literals))
+    program = law_program.extension.program(*found[:3], none.count(False), given, *shape)
+    return program, len(found.results) // np.int32().itemsize
+
+
+class _Place(int):
+    """Number of a constant."""
+
+
+def _numbered(leaf: Any, shape: tuple[int, int], constants: list[Any]) -> Any:
+    """Return ``leaf`` with the arrays that programs take as places in ``constants``, to which they are added."""
+    if isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 and leaf.shape in (shape, (1, shape[1])):
+        constants.append(leaf)
+        return _Place(len(constants) - 1)
+    return _each(leaf, partial(_numbered, shape=shape, constants=constants))
+
+
+def _symbolic(leaf: Any, symbols: tuple[Any, ...]) -> Any:
+    if isinstance(leaf, _Place):
+        return symbols[leaf]
+    return _each(leaf, partial(_symbolic, symbols=symbols))
+
+
+def _each(leaf: Any, change: Callable[[Any], Any]) -> Any:
+    """Return a named tuple with its leaves changed, another leaf as it is."""
+    return type(leaf)(*map(change, leaf)) if isinstance(leaf, tuple) else leaf

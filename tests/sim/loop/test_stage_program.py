@@ -1,0 +1,90 @@
+"""Programs of the stages of actuators give what NumPy gives, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.actuators import STAGES, discretise
+from sim.engine import native
+from sim.loop import law_program
+from sim.loop.actuators import JointActuators
+from sim.loop.stage_program import compiled_stages
+
+DT, SHAPE = 1 / 2000, (3, 4)
+needs_extension = pytest.mark.skipif(
+    law_program.extension is None or not native.status().active, reason="there are no native calls"
+)
+EFFECTS = {
+    "command_delay": 0.0033,
+    "sensor_delay": 0.0021,
+    "lag": 0.004,
+    "strength": 0.9,
+    "bias": 0.1,
+    "effort_limit": 40.0,
+    "backlash": 0.1,
+    "position_resolution": 1e-2,
+    "velocity_resolution": 1e-2,
+    "position_noise": 1e-2,
+    "velocity_noise": 1e-2,
+    "envelope": (60.0, 2.0),
+    "position_limit": ([-1.0, 0.0, 1.0], [20.0, 50.0, 30.0]),
+    "continuous": [True, False, True, False],
+}
+
+
+def built(names, rng):
+    """Return actuators with the effects ``names``; numbers of envs and joints differ."""
+    options = {name: value for name, value in EFFECTS.items() if name in names}
+    if "envelope" in options:
+        options["saturation_effort"], options["no_load_speed"] = options.pop("envelope")
+    for name, value in options.items():
+        if isinstance(value, float) and rng.random() < 0.5:
+            options[name] = value * rng.uniform(0.0 if "delay" in name else 0.5, 1.0, SHAPE)
+    return bp.make_actuators(SHAPE[1], **options, seed=1)
+
+
+@needs_extension
+@given(st.sets(st.sampled_from(sorted(EFFECTS))), st.integers(0, 100))
+def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
+    rng = np.random.default_rng(seed)
+    start = rng.normal(size=SHAPE)
+    both = [JointActuators(built(names, np.random.default_rng(seed)), start, DT, 0) for _ in range(2)]
+    both[1]._stages = STAGES
+    for _ in range(12):
+        qpos, qvel, effort = rng.normal(size=SHAPE), 3 * rng.normal(size=SHAPE), 80 * rng.normal(size=SHAPE)
+        effort[0, 0] = rng.choice([effort[0, 0], np.nan, np.inf, -0.0])
+        found = []
+        for each in both:
+            measured = each.measure(qpos, qvel)
+            with np.errstate(invalid="ignore"):
+                delivered = each.deliver(effort, qpos, qvel)
+            found.append([*measured, *each.limits(*measured), delivered, *each.read().values()])
+        for ours, expected in zip(*found, strict=True):
+            assert (ours is None) == (expected is None)
+            if ours is not None:
+                np.testing.assert_array_equal(ours, expected)
+
+
+@needs_extension
+def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
+    qpos = np.zeros(SHAPE)
+    many = JointActuators(built(EFFECTS.keys() - {"position_limit"}, np.random.default_rng(0)), qpos, DT, 0)
+    k, state = many._coefficients, many._state
+    stages = compiled_stages(k, SHAPE)
+    for stage, inputs in (("delivered", (qpos,) * 4), ("limits", (qpos,) * 2), ("play", (qpos,) * 3)):
+        run = getattr(stages, stage)
+        run(k, *inputs)
+        (program,) = run.__closure__[[*run.__code__.co_freevars].index("programs")].cell_contents.values()
+        assert program is not None, stage
+    stronger = discretise(bp.make_actuators(SHAPE[1], strength=2.0), state, DT, SHAPE[0])
+    np.testing.assert_array_equal(stages.delivered(stronger, qpos, qpos + 1.0, qpos, qpos)[0], 2.0)
+
+
+def test_without_the_extension_stages_are_numpys(monkeypatch):
+    monkeypatch.setattr(law_program, "extension", None)
+    k = JointActuators(bp.make_actuators(SHAPE[1], strength=0.5), np.zeros(SHAPE), DT, 0)._coefficients
+    assert compiled_stages(k, SHAPE) is STAGES
