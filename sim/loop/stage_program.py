@@ -68,7 +68,7 @@ def _program(
         return None
     if len(found.operations) < LEAST_OPERATIONS * 5 * np.int32().itemsize:
         return None
-    given = (*constants, *(np.array(number) for number in found.literals))
+    given = (*map(np.ascontiguousarray, constants), *map(np.array, found.literals))
     program = law_program.extension.program(*found[:3], none.count(False), given, *shape)
     return program, len(found.results) // np.int32().itemsize
 

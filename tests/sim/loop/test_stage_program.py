@@ -44,7 +44,12 @@ def built(names, rng):
     for name, value in options.items():
         if isinstance(value, float) and rng.random() < 0.5:
             options[name] = value * rng.uniform(0.0 if "delay" in name else 0.5, 1.0, SHAPE)
-    return bp.make_actuators(SHAPE[1], **options, seed=1)
+    actuators = bp.make_actuators(SHAPE[1], **options, seed=1)
+    if rng.random() < 0.5:  # draws need not be contiguous
+        resolution = actuators.position_resolution
+        turned = None if resolution is None else np.asfortranarray(np.broadcast_to(resolution, SHAPE))
+        actuators = actuators._replace(position_resolution=turned)
+    return actuators
 
 
 @needs_extension
