@@ -133,7 +133,8 @@ def report(found: Identification) -> str:
     text = [table(rows, ["95 % intervals, SI units", *PER_JOINT], "lrrrrr"), ""]
     text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
     if ("payload", None) in found.unknowns.names:
-        text.append(f"payload at the tool: {cell('payload')} kg")
+        payload = cell("payload")
+        text.append(f"payload at the tool: {'none that shows' if payload == '-' else f'{payload} kg'}")
     if found.drive.params is None and found.drive.compensate == "none":
         text.append("gravity: within the logged efforts")
     elif found.drive.compensate != "none":
