@@ -37,6 +37,8 @@ class IdentifyCommand:
     compensate: flags.Compensate = "gravity+coriolis+friction"
     timestep: float = 1 / 2000
     """Time step of the control that drove the robot [s]."""
+    sim_steps: int = 1
+    """Sim steps of each: 4 or so for a real robot under control at 500 Hz, otherwise its hold is taken for delay."""
     hold: flags.Switch = False
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
     no_payload: flags.Switch = False
@@ -82,6 +84,7 @@ class IdentifyCommand:
             params=None if self.params is None else _params(robot, self.params),
             compensate=self.compensate,
             timestep=self.timestep,
+            sim_steps=self.sim_steps,
             payload=not self.no_payload,
             hold=self.hold,
             evaluations=self.evaluations,

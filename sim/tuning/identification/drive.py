@@ -19,7 +19,7 @@ class Drive:
     """Control of the robot in a log."""
 
     timestep: float
-    """Time step of control and simulation [s]."""
+    """Time step of the simulation [s]."""
     params: bp.PIDParams | None
     """Params of the PID law, of the logged joints; None for a log of efforts."""
     compensate: str
@@ -30,6 +30,8 @@ class Drive:
     """True if the compensation is that of the robot with its payload."""
     noisy: bool = False
     """True if the law is given the positions of the log, with their noise, False if it is given those without."""
+    substeps: int = 1
+    """Sim steps of a step of the law, whose effort holds meanwhile."""
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
 
@@ -41,7 +43,7 @@ class Law:
         params = drive.params
         assert params is not None
         self._params, self._measured = params, drive.measured_rate
-        self._k = bp.discretise(params, drive.timestep, len(qpos))
+        self._k = bp.discretise(params, drive.timestep * drive.substeps, len(qpos))
         self._state = bp.init(params, qpos)
 
     def effort(

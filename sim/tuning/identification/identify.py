@@ -48,6 +48,7 @@ def identify(
     params: bp.PIDParams | None = None,
     compensate: Compensation = "gravity+coriolis+friction",
     timestep: float = 1 / 2000,
+    sim_steps: int = 1,
     payload: bool = True,
     hold: bool = False,
     evaluations: int = 25,
@@ -69,7 +70,10 @@ def identify(
         What the robot compensates by itself, "none" for nothing. Whether that passes through its motors is found. A
         log of efforts that holds them in full has "none"; where the log tells, this is found, too.
     timestep
-        Time step of the control that drove the robot, and of the simulation [s].
+        Time step of the control that drove the robot [s].
+    sim_steps
+        Sim steps of each. More than one where the robot, or its simulator, moved in smaller steps than its control:
+        a real robot under control at 500 Hz or less. Otherwise half the difference is taken for delay.
     payload
         Find a payload at the tool, too.
     hold
@@ -104,6 +108,7 @@ def identify(
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
     timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
+    control, timestep = timestep, timestep / integer("sim_steps", sim_steps, 1, 100)
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
@@ -113,7 +118,7 @@ def identify(
     if params is not None:
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
-    drive = Drive(timestep, params, compensate.removesuffix("+friction"), measured_rate=measured)
+    drive = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
     motions = [smooth(log, timestep) for log in found]
     drive, regression = best_drive(robot, joints, drive, found, motions, payload)
     unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
@@ -122,7 +127,8 @@ def identify(
         "logs": [log.source for log in found],
         "command": kind,
         "compensate": compensate,
-        "timestep": timestep,
+        "timestep": control,
+        "sim_steps": sim_steps,
         "payload": payload,
         "evaluations": evaluations,
         "seed": seed,

@@ -142,10 +142,10 @@ class Plant:
                     if drive.through and c is not None:
                         u, c = u + c, None
                 else:
-                    known = self._dynamics.at(q, v, unloaded).matrix if in_units else passive.matrix
-                    asked = law.effort(
-                        command[now], q + noise[now] if drive.noisy else q, v, known, c if drive.through else None
-                    )
+                    if step % drive.substeps == 0:
+                        known = self._dynamics.at(q, v, unloaded).matrix if in_units else passive.matrix
+                        seen = q + noise[now] if drive.noisy else q
+                        asked = law.effort(command[now], seen, v, known, c if drive.through else None)
                     history[now % longest] = asked
                     u = history[(now - whole) % longest, rows] * (1 - part)
                     u += history[(now - whole - 1) % longest, rows] * part

@@ -170,6 +170,9 @@ def _law_efforts(drive: Drive, plant: Plant, motion: Motion) -> Float64:
     matrix = plant.mass_matrix(motion.qpos[:1], none)
     efforts = np.empty_like(motion.qpos)
     for step in range(len(motion.qpos)):
+        if step % drive.substeps:
+            efforts[step] = efforts[step - 1]
+            continue
         q, v = motion.qpos[step : step + 1], motion.qvel[step : step + 1]
         if needs and step % 8 == 0:
             matrix = plant.mass_matrix(q, none)

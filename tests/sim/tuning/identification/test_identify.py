@@ -110,6 +110,23 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     assert found.theta[delay] == pytest.approx(truth.delay, abs=1e-4)
 
 
+def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
+    truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
+    motion = excite(arm, 3.0, rate=2000.0, lowest=0.6).position
+    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
+    motors = Motors(*per_joint, row(truth.delay), row(0.005), row(0.0))
+    drive = Drive(1 / 2000, params, "gravity+coriolis", substeps=4)
+    segment = Segment(motion[0], np.zeros(2), motion, np.zeros_like(motion))
+    qpos = Plant(arm, (0, 1), drive).simulate(motors, [segment], 0)[0, :-1:4]
+    time = np.arange(len(qpos)) / 500
+    noisy = qpos + 1e-5 * np.random.default_rng(0).standard_normal(qpos.shape)
+    log = Log("log", (0, 1), "setpoint", time, noisy, time, motion[::4], False)
+    options = {"params": params, "timestep": 1 / 500, "workers": 0, "payload": False}
+    delays = [identify(arm, log, **options, sim_steps=steps).interval("delay")[0] for steps in (4, 1)]
+    assert delays[0] == pytest.approx(truth.delay, abs=5e-5)
+    assert delays[1] == pytest.approx(truth.delay + 7.5e-4, abs=1e-4)  # half of what the effort holds longer
+
+
 def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
     plant = Plant(arm, (0, 1), Drive(1 / 2000, arm.designed("effort"), "gravity"))
     rng = np.random.default_rng(0)
