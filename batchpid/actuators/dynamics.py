@@ -175,12 +175,16 @@ def measure(
 
 
 class Stages(NamedTuple):
-    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints), for who compiles them."""
+    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints); a loop may compile them."""
 
     delivered: Callable[..., tuple[Any]]
+    """Effort of the step before, effort asked for, position and velocity -> effort delivered."""
     limits: Callable[..., tuple[Any, Any]]
+    """:func:`command_limits`."""
     play: Callable[..., tuple[Any, Any]]
+    """Encoder's position of the step before, position and velocity -> both behind the backlash."""
     encode: Callable[..., tuple[Any, Any]]
+    """Position, velocity and the noise of each -> both as measured."""
 
 
 def _motor(k: Coefficients, effort: Any) -> Any:

@@ -12,7 +12,7 @@ A of a body, and its inertia I, from the base to the tips::
     V_j = V_above + s_j q'_j       A_j = A_above + V_j x s_j q'_j       F_j = I_j A_j + V_j x* I_j V_j
 
 and back, h_j = s_j . (sum of the F of all that joint j moves). The base has the acceleration -g. Without the extension
-Pinocchio computes both, on SAPIEN's model: they agree to 1e-9.
+Pinocchio computes both, on SAPIEN's model: they agree to 1e-9, with a payload to the rounding of SAPIEN's masses.
 
 A step of length dt under efforts tau and Coulomb friction of at most F, with D = M + added inertia (diagonal)::
 
@@ -27,12 +27,13 @@ limits.
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import native
+from sim.engine.building import SceneSpec
 from sim.engine.dynamics import loaded_dynamics, robot_dynamics
 from sim.robot.description import RobotDescription
 
@@ -63,33 +64,11 @@ class Friction(NamedTuple):
     """Velocity that it has besides, per effort of friction (n, joints)."""
 
 
-class BatchDynamics(Protocol):
-    """Dynamics of the ``joints`` that move, of many robots."""
-
-    def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
-        """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
-        ...
-
-    def step(
-        self,
-        state: tuple[Float64, Float64, Float64],
-        matrix: Float64,
-        effort: Float64,
-        added: Float64,
-        friction: Friction,
-        dt: float,
-    ) -> tuple[Float64, Float64, Float64]:
-        """Return positions, velocities and efforts of friction (n, joints) after a step; ``state`` are those before.
-
-        ``matrix`` is that of :meth:`at`, ``effort`` all but friction, ``added`` the inertia on its diagonal.
-        """
-        ...
-
-
 SWEEPS = 2
+"""Sweeps over the joints in a step, begun with the friction of the step before."""
 
 
-def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> BatchDynamics:
+def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | PinocchioBatchDynamics:
     """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension was built."""
     moving = MovingJoints.of(robot, joints)
     if native.batch_extension is not None and os.environ.get(native.SWITCH) != "0":
@@ -134,13 +113,14 @@ class MovingJoints(NamedTuple):
 
 
 class NativeBatchDynamics:
-    """Dynamics by the extension."""
+    """Dynamics by the extension: those of :class:`PinocchioBatchDynamics`."""
 
     def __init__(self, robot: RobotDescription, joints: MovingJoints) -> None:
         bodies, loaded = robot_dynamics(robot, ground=False).bodies, loaded_dynamics(robot, 1.0).bodies
-        carrier = int(np.argmax(loaded.mass - bodies.mass))
-        point = loaded.mass[carrier] * loaded.center[carrier] - bodies.mass[carrier] * bodies.center[carrier]
-        self._joints = joints
+        gained = loaded.mass - bodies.mass
+        carrier = int(np.argmax(gained))
+        moment = loaded.mass[carrier] * loaded.center[carrier] - bodies.mass[carrier] * bodies.center[carrier]
+        self._joints, self._carries = joints, float(gained[carrier] > 0.5)  # 0 where the tool is part of the base
         self._tree = native.batch_extension.tree(
             bodies.tree,
             bodies.table(),
@@ -150,15 +130,17 @@ class NativeBatchDynamics:
             len(bodies.tree),
             len(joints.low),
             carrier,
-            tuple(point / (loaded.mass - bodies.mass)[carrier]),
-            (0.0, 0.0, -9.81),
+            tuple(moment / max(gained[carrier], 0.5)),
+            SceneSpec.gravity,
         )
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
-        """See :meth:`BatchDynamics.at`."""
+        """See :meth:`PinocchioBatchDynamics.at`."""
         count, joints = qpos.shape
         found = Passive(np.empty((count, joints, joints)), np.empty((count, joints)), np.empty((count, joints)))
-        native.batch_extension.dynamics(self._tree, *map(np.ascontiguousarray, (qpos, qvel, payload)), *found)
+        native.batch_extension.dynamics(
+            self._tree, *map(np.ascontiguousarray, (qpos, qvel, self._carries * payload)), *found
+        )
         return found
 
     def step(
@@ -170,7 +152,7 @@ class NativeBatchDynamics:
         friction: Friction,
         dt: float,
     ) -> tuple[Float64, Float64, Float64]:
-        """See :meth:`BatchDynamics.step`."""
+        """See :meth:`PinocchioBatchDynamics.step`."""
         q, v, f = (leaf.copy() for leaf in state)
         native.batch_extension.step(
             q, v, f, matrix, effort, added, *friction, self._joints.low, self._joints.high, dt, SWEEPS
@@ -179,7 +161,7 @@ class NativeBatchDynamics:
 
 
 class PinocchioBatchDynamics:
-    """Dynamics by Pinocchio, and steps by NumPy."""
+    """Dynamics of the joints that move, of many robots: by Pinocchio, and steps by NumPy."""
 
     def __init__(self, robot: RobotDescription, joints: MovingJoints) -> None:
         self._robot, self._joints, self._spread = robot, joints, joints.matrix
@@ -187,7 +169,7 @@ class PinocchioBatchDynamics:
         self._loaded: dict[float, Any] = {}
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
-        """See :meth:`BatchDynamics.at`."""
+        """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
         q, v = self._joints.rest + qpos @ self._spread.T, qvel @ self._spread.T
         still, column = np.zeros_like(q), payload[:, 0]
         force = self._empty.inverse_dynamics(q, v, still)
@@ -217,7 +199,10 @@ class PinocchioBatchDynamics:
         friction: Friction,
         dt: float,
     ) -> tuple[Float64, Float64, Float64]:
-        """See :meth:`BatchDynamics.step`."""
+        """Return positions, velocities and efforts of friction (n, joints) after a step; ``state`` are those before.
+
+        ``matrix`` is that of :meth:`at`, ``effort`` all but friction, ``added`` the inertia on its diagonal.
+        """
         q, v, f = state
         mobility = dt * np.linalg.inv(matrix + added[:, :, None] * np.eye(q.shape[1]))
 

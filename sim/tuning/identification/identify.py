@@ -86,7 +86,7 @@ def identify(
     workers
         Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
     history
-        File (.npz), written after each evaluation. If it exists the fit resumes from it.
+        File (.json), written before each step. If it exists the fit resumes from it.
     progress
         Wraps the range of evaluations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
 
@@ -108,7 +108,8 @@ def identify(
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
     timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
-    control, timestep = timestep, timestep / integer("sim_steps", sim_steps, 1, 100)
+    sim_steps = integer("sim_steps", sim_steps, 1, 100)
+    control, timestep = timestep, timestep / sim_steps
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)

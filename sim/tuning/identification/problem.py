@@ -91,6 +91,8 @@ class Problem:
             for number, (log, motion) in enumerate(zip(self.logs, self.motions, strict=True))
             for window in divide(number, log, motion, self.drive.timestep)
         ]
+        if not self.draws:
+            self.windows = [window._replace(errors=window.errors[:0]) for window in self.windows]  # not to be sent
         self.stretches = [self._divided(window) for window in self.windows]
         self._rows = [len(rows) for stretches in self.stretches for rows in stretches]
         qpos = np.concatenate([log.qpos for log in self.logs])

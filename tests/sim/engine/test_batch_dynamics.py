@@ -84,6 +84,25 @@ def test_a_row_does_not_depend_on_the_others(kind, panda):
             np.testing.assert_array_equal(few, all_rows[rows])
 
 
+@needs_extension
+def test_a_tool_that_is_part_of_the_base_weighs_nothing(tmp_path):
+    fingers = [(f"finger{n}", "0.1") for n in range(2)]
+    links = "".join(
+        f'<link name="{name}"><inertial><mass value="{kg}"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" '
+        f'izz="1e-4"/></inertial></link><joint name="{name}" type="prismatic"><parent link="base"/>'
+        f'<child link="{name}"/><axis xyz="1 0 0"/><limit lower="0" upper="0.1" effort="9" velocity="1"/></joint>'
+        for name, kg in fingers
+    )
+    arm = Robot.load(write(tmp_path, f'<robot name="hand"><link name="base"/>{links}</robot>'))
+    moving = MovingJoints.of(arm, (0, 1))
+    qpos, kg = np.full((3, 2), 0.05), np.array([[0.0], [0.5], [1.0]])
+    found, expected = (
+        kind(arm, moving).at(qpos, 0 * qpos, kg) for kind in (NativeBatchDynamics, PinocchioBatchDynamics)
+    )
+    for leaf, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(leaf, wanted, atol=1e-7)
+
+
 def test_strong_friction_stops_and_limits_hold(panda):
     batch = batch_dynamics(panda, (0, 1))
     qpos = np.array([[0.1, 0.2], [panda.upper[0] - 1e-4, 0.2]])
