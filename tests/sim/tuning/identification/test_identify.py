@@ -308,14 +308,19 @@ def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
     log = Log("log", tuple(range(7)), kind, table["time"], table["qpos"], table["time"], table[kind], False)
     of_arm = bp.PIDParams(*(leaf[:, :7] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
     found = identify(robot, log, params=of_arm if kind == "setpoint" else None)
-    inside = []
+    inside, errors = [], dict.fromkeys(("armature", "damping", "friction", "strength"), 0.0)
     for number in range(7):
-        for unknown in ("armature", "damping", "friction", "strength"):
+        for unknown in errors:
             if (interval := found.interval(unknown, number)) is None:
                 continue
             wanted = float(getattr(truth, unknown)[number])
             assert abs(interval[0] - wanted) < 0.05 * wanted, (unknown, number)
             inside.append(interval[1] < wanted < interval[2])
+            errors[unknown] = max(errors[unknown], abs(interval[0] / wanted - 1))
+    before, after = found.held_out_error
+    print(
+        name, kind, seed, errors, found.interval("delay"), f"{before / after:.0f} times, {np.mean(inside):.2f} inside"
+    )
     assert len(inside) >= (26 if name == "panda" else 18)
     assert sum(inside) >= len(inside) - 2
     assert found.interval("delay")[0] == pytest.approx(truth.delay, abs=2e-4)
