@@ -45,6 +45,33 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
+class ControllerError(InvalidArgumentError):
+    """The caller's own controller raised, or returned an unusable state or effort, in a sim step.
+
+    It closes the runner. ``step`` is the number of the sim step: within its tick, or since the start of the runner
+    after :meth:`at`. The controller's own error, if there is one, is the ``__cause__``; from a worker process, its
+    traceback is a note.
+    """
+
+    def __init__(self, name: str, error: Exception, step: int) -> None:
+        if isinstance(error, InvalidArgumentError):
+            problem, remedy = error.problem, error.remedy
+        else:
+            problem, remedy = f"{name} raised {type(error).__name__}: {error}", "correct the controller"
+        super().__init__("control", problem, remedy=remedy)
+        self.step = step
+
+    def at(self, step: int, timestep: float) -> ControllerError:
+        """Return the error with a message that says when it happened: at ``step`` since the start of the runner."""
+        when = f"in sim step {step} ({step * timestep:g} s)"
+        problem = InvalidArgumentError(
+            "control", f"{self.problem}, {when}", remedy=f"{self.remedy}, and make a new Runner: this one is closed"
+        )
+        error = ControllerError("", problem, step)
+        error.__cause__ = self.__cause__
+        return error
+
+
 class RobotError(BatchPIDError, ValueError):
     """A robot description cannot be used; the message names the file, the element and the remedy."""
 

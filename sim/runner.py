@@ -325,7 +325,7 @@ class Runner:
         CallOrderError
             No tick was sent since the last call.
         """
-        books = self._settle(refusals=True)
+        books = self._settle()
         if books.received is None:
             raise CallOrderError("recv: no tick is under way; call send(setpoint) first")
         assert self._ledger is not None
@@ -660,16 +660,17 @@ class Runner:
 
         def commit(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
             faults, contacts, unrecorded = books.faults, books.contacts, books.unrecorded
-            for done, arrays in enumerate(pool.ticks.first(ticks), start=1):
+            whole = ticks if pool.failure is None else pool.failure.ticks
+            for done, arrays in enumerate(pool.ticks.first(whole), start=1):
                 faults = faults.noting(arrays)
                 if contacts is not None:
                     contacts = contacts.noting(arrays)
                 if self.recorder is not None:
                     time = (books.steps + done * substeps) * self.timestep
                     unrecorded += ((time, arrays.command.setpoint.copy(), _copy(arrays)),)
-            steps = ticks * substeps
+            steps = whole * substeps
             since = books.steps_since_checkpoint + steps
-            spent = tuple([each / ticks for each in seconds])
+            spent = books.work_seconds if pool.failure else tuple([each / ticks for each in seconds])
             books = books._replace(faults=faults, steps=books.steps + steps, steps_since_checkpoint=since)
             return books._replace(work_seconds=spent, unrecorded=unrecorded, contacts=contacts), None
 
@@ -696,13 +697,15 @@ class Runner:
         left = every - self._settle().steps_since_checkpoint % every
         return min(most, -(-left // self.substeps))
 
-    def _settle(self, *, refusals: bool = False) -> _Books:
+    def _settle(self) -> _Books:
         """Complete a command that was sent or interrupted; return the books."""
         if self._ledger is None or self._pool.closed:
-            raise ClosedError("this Runner is closed; make a new one")
+            cause = None if self._ledger is None else self._ledger.cause
+            reason = "" if cause is None else f", since a call failed ({str(cause).splitlines()[0]})"
+            raise ClosedError(f"this Runner is closed{reason}; make a new one")
         ledger = self._ledger
         if not ledger.is_settled or ledger.books.unrecorded:
-            ledger.settle(self._record, refusals=refusals)
+            ledger.settle(self._record)
         return ledger.books
 
     @property

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.coefficients import Coefficients
-from batchpid.errors import BatchPIDError
 from batchpid.friction import Friction, FrictionState
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
@@ -18,7 +17,7 @@ from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Command
 from sim.loop.backend import obstacle
 from sim.loop.control import Control, EffortControl, PIDControl
-from sim.loop.custom import CustomControl
+from sim.loop.custom import CustomControl, controller_errors
 from sim.loop.friction import JointFriction
 from sim.loop.jitted import padded, precision, program_rows, put, shared_call
 from sim.loop.program import Carry, Constants, Layout, compiled
@@ -47,6 +46,7 @@ class CompiledTick:
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         controller = shared_call(options, control) if isinstance(control, CustomControl) else None
         law = control.law if isinstance(control, PIDControl) else None
+        self._controller = options.control if isinstance(control, CustomControl) else None
         self._layout = Layout(law, controller, compensates)
         self._carry: Carry | None = None
         self._matrix: Any = None
@@ -74,11 +74,8 @@ class CompiledTick:
             extra = self._zero if command.feedforward is None else put(command.feedforward)
             # A JAX array either way: with another kind the program would be compiled again.
             command = command._replace(feedforward=extra)
-            try:
+            with controller_errors(self._controller, begin + 1):
                 carry = compiled(self._layout)(span, constants, carry, command)
-            except BatchPIDError as error:  # of the caller's controller, while it is traced
-                error.__notes__ = []  # JAX's, on its own frames
-                raise
             done, status = np.asarray(carry.progress).tolist()
         self._carry = carry
         if status & FAILED:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import ControllerError, InvalidArgumentError
 from sim.engine.building import SceneSpec
 from sim.loop.control import Control, Plant
 from sim.options import Controller, RunnerOptions
@@ -41,7 +42,8 @@ class CustomControl(Control):
     def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
         """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
         self.saturated[mask] = False
-        fresh = flatten(self._controller.init(self._robot, len(mask)))
+        with controller_errors(self._controller):
+            fresh = flatten(self._controller.init(self._robot, len(mask)))
         leaves = {name: np.array(leaf) for name, leaf in flatten(self._of_controller).items()}
         for name, leaf in leaves.items():
             leaf[mask] = fresh[name][mask]
@@ -81,12 +83,19 @@ class CustomControl(Control):
         return {name: leaf.astype(leaves[name].dtype) for name, leaf in new.items()}, effort
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
-        """Call the controller, and saturate."""
+        """Call the controller, and saturate.
+
+        Raises
+        ------
+        ControllerError
+            The controller raised, or returned something unusable.
+        """
         qvel = self._plant.read_qvel() if qvel is None else qvel
         passive = np.zeros_like(qpos) if feedforward is None else feedforward
         setpoint = self._command.setpoint
-        total = np.asarray(self._call(setpoint, qpos, qvel, passive), np.float64)
-        _check_effort(total, qpos)
+        with controller_errors(self._controller, step + 1):
+            total = np.asarray(self._call(setpoint, qpos, qvel, passive), np.float64)
+            _check_effort(total, qpos)
         if self._coupling is not None:
             total = self._coupling.efforts(total)
         effort = self._saturate(total)
@@ -110,9 +119,22 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDA
     return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
 
 
+@contextmanager
+def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
+    """Turn every error of a controller, in sim step ``step`` of a tick, into a ControllerError; None: no controller."""
+    try:
+        yield
+    except Exception as error:
+        if controller is None:
+            raise
+        raise ControllerError(type(controller).__name__, error, step) from error
+
+
 def _check_effort(effort: Any, qpos: Any) -> None:
     if effort.shape != qpos.shape:
-        problem = f"returned an effort of shape {effort.shape}, not {qpos.shape}"
+        rows = effort.shape[:1] == qpos.shape[:1]  # their number depends on how envs are grouped
+        got, wanted = (f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape for a in (effort, qpos))
+        problem = f"returned an effort of shape {got}, not {wanted}"
         raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
 
 

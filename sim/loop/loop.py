@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.errors import ControllerError
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command, Ticks
 from sim.loop.env_group import EnvGroup
+from sim.loop.failure import Failure, RunError, order
 from sim.loop.snapshot import EnvStates, Snapshot
 from sim.loop.variation import make_pack
 from sim.options import RunnerOptions
@@ -94,16 +96,37 @@ class Loop:
             group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
 
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
-        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took."""
+        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took.
+
+        Raises
+        ------
+        RunError
+            A group failed. The others have run on, so that the first failure does not depend on the grouping.
+        """
         began = time.perf_counter()
+        failures = []
         for group, group_ticks in zip(self.groups, self._group_ticks, strict=True):
-            for done, rows in enumerate(group_ticks.first(ticks)):
-                setpoint, rate, feedforward = rows.command
-                command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
-                group.run(self._steps + done * substeps, substeps, command)
-                group.observe(rows)
+            done = 0
+            try:
+                for done, rows in enumerate(group_ticks.first(ticks)):
+                    setpoint, rate, feedforward = rows.command
+                    command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
+                    group.run(self._steps + done * substeps, substeps, command)
+                    group.observe(rows)
+            except Exception as error:
+                failures.append(self._failure(error, group, done, self._steps + done * substeps))
+        if failures:
+            raise RunError(min(failures, key=order))
         self._steps += ticks * substeps
         return time.perf_counter() - began
+
+    def _failure(self, error: Exception, group: EnvGroup, ticks: int, steps: int) -> Failure:
+        """Return the failure of a group after so many whole ticks of a run, and ``steps`` in all."""
+        step = steps + 1
+        if isinstance(error, ControllerError):
+            step = steps + error.step
+            error = error.at(step, self.options.timestep)
+        return Failure(step, self._first_env + group.envs.start, ticks, error)
 
     def snapshot(self) -> EnvStates:
         """Return the state of every env. It is a barrier: the loop goes on as if restored from it."""

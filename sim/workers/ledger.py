@@ -1,7 +1,8 @@
 """Books of the calling process, changed by whole commands only.
 
 A command is a transaction. It begins when its request is noted as pending; from then on it is completed, by this call
-or, after an interrupt (Ctrl-C, or another exception of a signal handler), by the next one. Its changes in this process
+or, after an interrupt (Ctrl-C, or another exception of a signal handler), by the next one. Arguments are checked before
+it begins. If a loop raises after that, the pool is closed, unless the request only reads. Its changes in this process
 are a new value of the books, which a function makes from the value before and from the workers' results. That function
 may be interrupted and called again, and a single assignment makes its value valid.
 """
@@ -13,8 +14,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from batchpid.errors import BatchPIDError, InUseError, WorkerError
-from sim.workers.pool import WorkerPool, is_refusal
+from batchpid.errors import InUseError, WorkerError
+from sim.workers.pool import WorkerPool
 from sim.workers.requests import Request
 
 Books = TypeVar("Books")
@@ -37,6 +38,8 @@ class Ledger(Generic[Books]):
         self._pool = pool
         self.books = books
         """Immutable value; replaced when a command is complete."""
+        self.cause: Exception | None = None
+        """Error that closed the pool."""
         self._pending: tuple[Request, Books, Commit[Books]] | None = None  # with the books before
         self._owner, self._user = os.getpid(), 0  # the process, and the thread in a call
 
@@ -57,10 +60,10 @@ class Ledger(Generic[Books]):
 
         Raises
         ------
-        BatchPIDError
-            Raised by a loop before it changed anything.
         WorkerError
-            A loop raised another error, or a worker was lost for good; the pool is closed.
+            A worker was lost for good; the pool is closed.
+        Exception
+            A loop raised it; the pool is closed, unless the request only reads.
         InUseError
             Another call is in progress, or the pool belongs to another process.
         ClosedError
@@ -72,12 +75,12 @@ class Ledger(Generic[Books]):
         """Send every worker its part of ``request``, as a pending command; raises as :meth:`execute` does."""
         self._exclusive(lambda: self._begin(request, commit, publish))
 
-    def settle(self, publish: Callable[[], None], *, refusals: bool = False) -> None:
+    def settle(self, publish: Callable[[], None]) -> None:
         """Complete a command that was begun, or whose call was interrupted; raises as :meth:`execute` does.
 
-        An error that a loop raised before it changed anything is raised with ``refusals`` only.
+        An error in an interrupted command that only reads is dropped.
         """
-        self._exclusive(lambda: self._settle(publish, refusals))
+        self._exclusive(lambda: self._settle(publish))
 
     def close(self) -> None:
         """End all workers; a loop in this process ends after the running call. May be called again."""
@@ -99,33 +102,34 @@ class Ledger(Generic[Books]):
         self._pending = request.copy(), self.books, commit
         self._guarded(self._pool.begin, self._pending[0])
 
-    def _settle(self, publish: Callable[[], None], refusals: bool = False) -> None:
+    def _settle(self, publish: Callable[[], None]) -> None:
         if self._pending is not None and not self._pool.closed:
             try:
                 self._complete(*self._pending)
-            except BatchPIDError:
-                if refusals or self._pending is not None:
-                    raise  # otherwise the command was refused and has changed nothing
+            except Exception:
+                if self._pool.closed or self._pending is not None:
+                    raise
         publish()
 
     def _complete(self, request: Request, before: Books, commit: Commit[Books]) -> Any:
         results = self._guarded(self._pool.run, request)
-        error = self._pool.error
-        if error is not None:
-            if is_refusal(error):
-                self._pending = None
-            else:
-                self.close()
-            raise error
-        self.books, result = commit(before, results)
+        failure, result = self._pool.failure, None
+        if failure is None or request.counts_ticks:
+            self.books, result = commit(before, results)
         self._pending = None
+        if failure is not None:
+            if request.changes_loop:
+                self.cause = failure.error
+                self.close()
+            raise failure.error
         return result
 
     def _guarded(self, function: Callable[[Request], Any], request: Request) -> Any:
         """Return ``function(request)``; close the pool if a worker was lost for good."""
         try:
             return function(request)
-        except WorkerError:
+        except WorkerError as error:
+            self.cause = error
             self.close()
             raise
 

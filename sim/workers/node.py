@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import pickle
-import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError, WorkerError
 from sim.loop.arrays import Arrays
+from sim.loop.failure import Failure, failure_of
 from sim.workers.requests import ReadDigest, Request, Start
 from sim.workers.worker import WorkerLost
 
@@ -48,10 +47,10 @@ class Answer(NamedTuple):
 
     result: Any
     """Result of the request."""
-    failure: BatchPIDError | None = None
-    """Error to raise in place of the result."""
+    failure: Failure | None = None
+    """Failure of the pool, in place of the result."""
     arrays: Arrays | None = None
-    """Output (ticks, envs, ...), if the request changes the observation."""
+    """Output (ticks, envs, ...) of the ticks that were completed, if the request changes the observation."""
 
 
 class Node:
@@ -75,38 +74,33 @@ class Node:
         envs = start.envs
         self._pool = pool_type(options, start.params, Share(envs.start, envs.stop - envs.start, ticks))
         self._pool.open()
-        digest = self._run(ReadDigest(canonical))
+        digest = self._run(ReadDigest(canonical)).result
         pids = tuple(worker.pid for worker in self._pool.workers)
         return NodeInfo(address, envs, os.getpid(), pids, _processor(), digest)
 
     def execute(self, request: Request) -> Answer:
         """Execute a request, which has the part of this node's envs."""
-
-        def act() -> Answer:
-            result, tick = self._run(request), request.observed_tick
-            return Answer(result, None, None if tick is None else self._pool.arrays.at(slice(tick + 1)))
-
-        return _answer(act)
+        return _answer(lambda: self._run(request))
 
     def beat(self) -> None:
         """Answer, also during a request."""
 
-    def _run(self, request: Request) -> Any:
+    def _run(self, request: Request) -> Answer:
         results = self._pool.run(request)
-        if self._pool.error is not None:
-            raise self._pool.error
-        return request.join(results)
+        failure, tick = self._pool.failure, request.observed_tick
+        if failure is not None:
+            ticks = failure.ticks if request.counts_ticks else 0
+            return Answer(None, failure.portable(), self._pool.arrays.at(slice(ticks)))
+        return Answer(request.join(results), None, None if tick is None else self._pool.arrays.at(slice(tick + 1)))
 
 
 def _answer(act: Callable[[], Answer]) -> Answer:
     try:
         return act()
     except WorkerLost as error:  # without the advice to turn recovery on
-        return Answer(None, WorkerLost(str(error.__cause__ or error)))
-    except BatchPIDError as error:
-        return Answer(None, error)
-    except Exception:
-        return Answer(None, WorkerError(f"raised:\n{traceback.format_exc()}"))
+        return Answer(None, Failure(0, 0, 0, WorkerLost(str(error.__cause__ or error))))
+    except Exception as error:
+        return Answer(None, failure_of(error).portable())
 
 
 def _processor() -> str:

@@ -9,7 +9,7 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
-from batchpid.errors import InvalidArgumentError, WorkerError
+from batchpid.errors import InvalidArgumentError
 from sim.loop.arrays import Arrays
 from sim.workers.background import BACKGROUND, Job
 from sim.workers.cluster import Cluster
@@ -83,15 +83,15 @@ class NodeWorker(Worker):
             raise self._lost(_cause(error)) from error
         result, failure, arrays = answer
         self._call = None
-        if isinstance(failure, WorkerLost):
-            raise self._lost(f"lost a worker: {failure}")
-        if failure is not None:
-            raise WorkerError(f"{self._name} {failure}") if type(failure) is WorkerError else failure
+        if failure is not None and isinstance(failure.error, WorkerLost):
+            raise self._lost(f"lost a worker: {failure.error}")
         if arrays is not None:
             tick = len(arrays.observation.ok)
             for ours, theirs in zip(self._arrays[1:], arrays[1:], strict=True):
                 for table, rows in zip(ours, theirs, strict=True):
                     table[:tick, self._envs] = rows
+        if failure is not None:
+            return failure.of_worker(self._name)
         if self.info is None:
             return self._join(result)
         if self._ticks and self._index == 0:

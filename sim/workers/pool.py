@@ -22,8 +22,9 @@ from functools import partial
 from typing import Any, Literal
 
 import batchpid as bp
-from batchpid.errors import BatchPIDError, ClosedError, WorkerError
+from batchpid.errors import ClosedError
 from sim.loop.arrays import Arrays, Ticks
+from sim.loop.failure import Failure, order
 from sim.options import RunnerOptions
 from sim.workers.background import BACKGROUND
 from sim.workers.cluster import NODE_STEPS, Cluster
@@ -56,7 +57,7 @@ class _Slot:
     phase: Literal["idle", "transfer", "waiting"] = "transfer"
     """Phase of the first request. An interrupt during a transfer leaves the worker unusable."""
     result: Any = None
-    error: Exception | None = None
+    failure: Failure | None = None
     losses: int = 0
     cause: str = ""
     lost_at: float = 0.0
@@ -97,8 +98,8 @@ class WorkerPool:
         self._request: Request | None = None
         self.closed = False
         """True if the running call is to end, and no other to begin."""
-        self.error: Exception | None = None
-        """Error that a loop raised in the last request; of several, one that left its state undefined."""
+        self.failure: Failure | None = None
+        """First failure of a loop in the last request."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
         ticks = ticks or max(1, most_steps // (options.substeps * widest))
@@ -118,8 +119,8 @@ class WorkerPool:
             self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
             self._start(self._slots[-1])
         self._serve()
-        if self.error is not None:
-            raise self.error
+        if self.failure is not None:
+            raise self.failure.error
 
     @property
     def workers(self) -> list[Worker]:
@@ -148,7 +149,7 @@ class WorkerPool:
                 self._attempt(slot, self._send)
 
     def run(self, request: Request) -> list[Any]:
-        """Let every worker execute its part of ``request``; return their results, if there is no :attr:`error`.
+        """Let every worker execute its part of ``request``; return their results, if there is no :attr:`failure`.
 
         A call with a request that :meth:`begin` sent, or whose call was interrupted, continues it.
 
@@ -161,8 +162,8 @@ class WorkerPool:
         """
         self._enqueue(request)
         self._serve()
-        if self.error is None:
-            if request.is_replayed and self._options.recover and not (self._replay and self._replay[-1] is request):
+        if self.failure is None:
+            if request.changes_loop and self._options.recover and not (self._replay and self._replay[-1] is request):
                 self._replay.append(request)
             tick = request.observed_tick
             if tick is not None:
@@ -199,7 +200,7 @@ class WorkerPool:
         """Make ``request`` the one that every worker is to execute, unless it is that already."""
         if self._request is not request:
             for slot in self._slots:
-                slot.queue, slot.error = [request], None
+                slot.queue, slot.failure = [request], None
             self._request = request  # nothing is sent before
 
     def _serve(self) -> None:
@@ -221,8 +222,8 @@ class WorkerPool:
                 next_check = time.monotonic() + _POLL_INTERVAL
         if self.closed:
             raise ClosedError("this Runner was closed during a call")
-        errors = [slot.error for slot in self._slots if slot.error is not None]
-        self.error = next((error for error in errors if not is_refusal(error)), errors[0]) if errors else None
+        failures = [slot.failure for slot in self._slots if slot.failure is not None]
+        self.failure = min(failures, key=order, default=None)
 
     def _attempt(self, slot: _Slot, act: Callable[[_Slot], None]) -> None:
         try:
@@ -232,11 +233,7 @@ class WorkerPool:
         except Exception as error:
             if self.closed:
                 raise ClosedError("this Runner was closed during a call") from error
-            if not self.is_local and not isinstance(error, BatchPIDError):
-                raise  # a signal handler raised it
-            slot.error = error
-            slot.queue.pop(0)
-            slot.phase = "idle"
+            raise  # a signal handler raised it
 
     def _send(self, slot: _Slot) -> None:
         slot.phase = "transfer"
@@ -246,6 +243,8 @@ class WorkerPool:
     def _receive(self, slot: _Slot) -> None:
         slot.phase = "transfer"
         slot.result = slot.worker.receive()
+        if isinstance(slot.result, Failure):
+            slot.failure, slot.result = slot.result, None
         slot.queue.pop(0)
         if not slot.queue and slot.losses:
             self.recoveries += 1
@@ -311,7 +310,7 @@ class WorkerPool:
         request, replay = self._request, self._replay
         again = [] if request is None or (replay and replay[-1] is request) else [request]
         slot.queue = [slot.start, *replay, *again]
-        slot.error = None
+        slot.failure = None
         slot.phase = "waiting"
 
 
@@ -322,8 +321,3 @@ def _poller_of(workers: list[Worker]) -> select.poll:
         if descriptor is not None:
             poller.register(descriptor, select.POLLIN)
     return poller
-
-
-def is_refusal(error: Exception) -> bool:
-    """Return True if a loop raised this before it changed anything."""
-    return isinstance(error, BatchPIDError) and not isinstance(error, WorkerError)

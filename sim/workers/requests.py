@@ -29,8 +29,10 @@ class Request(ABC):
 
     idle_limit = 10.0
     """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
-    is_replayed = True
-    """True if it changes the loop, so that a replacement of a lost worker repeats it."""
+    changes_loop = True
+    """True if a replacement of a lost worker repeats it, and an error in it closes the pool."""
+    counts_ticks = False
+    """True if the ticks before an error count: they are the same for every env."""
 
     @property
     def observed_tick(self) -> int | None:
@@ -126,6 +128,7 @@ class Run(Request):
     use_rate: bool
     use_feedforward: bool
     command: Command = Command(None)  # noqa: RUF009  (immutable)
+    counts_ticks = True
     idle_limit = 0.7  # it only computes
 
     @staticmethod
@@ -215,7 +218,7 @@ class Restore(Request):
 class ReadContentSizes(Request):
     """Read how many numbers a snapshot holds of each env's content."""
 
-    is_replayed = False
+    changes_loop = False
 
     def apply(self, loop: Loop) -> list[int]:
         return loop.content_sizes()
@@ -228,7 +231,7 @@ class ReadContentSizes(Request):
 class ReadPoses(Request):
     """Read the poses of the entities that ``build`` returned."""
 
-    is_replayed = False
+    changes_loop = False
 
     def apply(self, loop: Loop) -> list[NDArray[np.float32]]:
         return loop.poses()
@@ -242,7 +245,7 @@ class ReadDigest(Request):
     """Run the canonical episode, under ``params`` of one env, and read its digest."""
 
     params: bp.PIDParams
-    is_replayed = False
+    changes_loop = False
 
     def for_envs(self, envs: slice) -> Self:
         return self

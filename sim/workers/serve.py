@@ -13,11 +13,10 @@ import socket
 import struct
 import sys
 import time
-import traceback
 from typing import Any
 
-from batchpid.errors import BatchPIDError
 from sim.loop.arrays import Arrays
+from sim.loop.failure import failure_of
 from sim.workers.channel import Channel
 from sim.workers.requests import decode
 from sim.workers.shared_memory import SharedArrays
@@ -43,7 +42,7 @@ def _serve(connection: Channel, memory: int) -> None:
     try:
         loop = start.build(Arrays.from_fields(SharedArrays(layout, memory).arrays))
     except Exception as error:
-        connection.send(_failure(error))
+        connection.send(pickle.dumps(failure_of(error).portable()))
         return
     connection.send(_success(None))
     # The hot loop makes no reference cycles, so that collections would only cost time.
@@ -60,14 +59,9 @@ def _serve(connection: Channel, memory: int) -> None:
         try:
             answer = _success(decode(message).apply(loop))
         except Exception as error:
-            answer = _failure(error)
+            answer = pickle.dumps(failure_of(error).portable())
         connection.send(answer)
 
 
 def _success(result: Any) -> bytes:
-    return DONE.pack(b"D", result) if isinstance(result, float) else pickle.dumps((result, None))
-
-
-def _failure(error: Exception) -> bytes:
-    """Return the message of an error: itself if the parent can raise it unchanged, else its traceback."""
-    return pickle.dumps((None, error if isinstance(error, BatchPIDError) else traceback.format_exc()))
+    return DONE.pack(b"D", result) if isinstance(result, float) else pickle.dumps(result)

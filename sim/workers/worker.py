@@ -23,9 +23,10 @@ from typing import Any
 
 import cloudpickle
 
-from batchpid.errors import BatchPIDError, InvalidArgumentError, WorkerError
+from batchpid.errors import InvalidArgumentError, WorkerError
 from sim.engine import native
 from sim.loop.arrays import Arrays
+from sim.loop.failure import Failure, failure_of
 from sim.loop.loop import Loop
 from sim.workers.background import BACKGROUND, Job
 from sim.workers.channel import Channel
@@ -66,14 +67,12 @@ class Worker(ABC):
 
     @abstractmethod
     def receive(self) -> Any:
-        """Wait for the result of the last request and return it.
+        """Wait for the result of the last request and return it; a Failure if the loop raised.
 
         Raises
         ------
         WorkerLost
             The worker died.
-        WorkerError
-            The loop raised; the message holds the worker's traceback. A BatchPIDError is raised unchanged.
         """
 
     @abstractmethod
@@ -115,7 +114,10 @@ class LocalWorker(Worker):
     def send(self, request: Request) -> None:
         assert self._loop is not None
         request.write(self._loop.arrays, self._start.envs)
-        self._result = request.apply(self._loop)
+        try:
+            self._result = request.apply(self._loop)
+        except Exception as error:
+            self._result = failure_of(error)
 
     def receive(self) -> Any:
         return self._result
@@ -181,12 +183,8 @@ class ProcessWorker(Worker):
             raise self._death() from error
         if message[:1] == b"D":
             return DONE.unpack(message)[1]
-        result, failure = pickle.loads(message)
-        if isinstance(failure, BatchPIDError):
-            raise failure
-        if failure is not None:
-            raise WorkerError(f"{self._name} raised:\n{failure}")
-        return result
+        result = pickle.loads(message)
+        return result.of_worker(self._name) if isinstance(result, Failure) else result
 
     def check_alive(self, idle_limit: float, limit: float) -> None:
         liveness = self._liveness

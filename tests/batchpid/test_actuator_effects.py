@@ -206,10 +206,11 @@ def test_the_command_limits_are_where_the_motor_clips(seed):
     assert (least <= most).all()
     clipped = np.clip(asked, least, most)
     delivered = run_motor(static, asked, q, v)
-    np.testing.assert_allclose(run_motor(static, clipped, q, v), delivered, rtol=1e-12, atol=1e-12)
+    # (limit - bias) / strength rounds, and a line from 40 N m on at 5 rad/s amplifies it.
+    np.testing.assert_allclose(run_motor(static, clipped, q, v), delivered, rtol=1e-10, atol=1e-10)
     works = static.strength[0] > 0 if static.strength is not None else np.ones(joints, bool)
     free = clipped * options.get("strength", 1.0) + options.get("bias", 0.0)
-    np.testing.assert_allclose(delivered[0, 0, works], free[0, works], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(delivered[0, 0, works], free[0, works], rtol=1e-10, atol=1e-10)
 
 
 def test_without_an_envelope_no_command_is_clipped():

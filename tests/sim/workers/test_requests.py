@@ -65,8 +65,8 @@ def test_other_messages_hold_the_whole_request():
 
 
 def test_requests_that_only_read_are_not_replayed():
-    assert not ReadPoses.is_replayed
-    assert Reset.is_replayed
+    assert not ReadPoses.changes_loop
+    assert Reset.changes_loop
 
 
 @pytest.mark.parametrize("change", ["qpos", "mask"])

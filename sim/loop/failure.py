@@ -1,0 +1,58 @@
+"""Errors of a loop during a request, in a form that does not depend on how envs are divided among workers."""
+
+from __future__ import annotations
+
+import traceback
+from typing import NamedTuple
+
+from batchpid.errors import BatchPIDError, ControllerError, WorkerError
+
+
+class Failure(NamedTuple):
+    """Error of a loop during a request; what it has done by then is undefined, apart from whole ticks.
+
+    Of several failures, the first by :func:`order` is reported.
+    """
+
+    step: int
+    """Sim step since the start of the runner; its tick's first where it is not known."""
+    env: int
+    """First env of the group that failed."""
+    ticks: int
+    """Ticks of the request that ended before."""
+    error: Exception
+
+    def portable(self) -> Failure:
+        """Return the failure with an error that another process can raise: of this project, with its traceback.
+
+        The message of a WorkerError lacks the name of the worker, in front.
+        """
+        error, text = self.error, "".join(traceback.format_exception(self.error))
+        if isinstance(error, ControllerError):
+            error.add_note(text)
+        elif not isinstance(error, BatchPIDError):
+            error = WorkerError(f"raised:\n{text}")
+        return self._replace(error=error)
+
+    def of_worker(self, name: str) -> Failure:
+        """Return the failure, of a worker of that name, with the name in the message of a WorkerError."""
+        is_ours = type(self.error) is WorkerError
+        return self._replace(error=WorkerError(f"{name} {self.error}")) if is_ours else self
+
+
+def order(failure: Failure) -> tuple[int, int]:
+    """Return the key by which failures are sorted: the earliest sim step first, then the lowest env."""
+    return failure.step, failure.env
+
+
+class RunError(Exception):
+    """A group of envs failed in :meth:`sim.loop.loop.Loop.run`."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(str(failure.error))
+        self.failure = failure
+
+
+def failure_of(error: Exception) -> Failure:
+    """Return the failure that an exception of a loop stands for."""
+    return error.failure if isinstance(error, RunError) else Failure(0, 0, 0, error)

@@ -1,0 +1,154 @@
+"""An error in the middle of a tick closes the runner: the same error, time and recording for any number of workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from identical import assert_identical
+from robots import load_bundled
+
+from batchpid.errors import BatchPIDError, ClosedError, ControllerError, InvalidArgumentError
+from sim import Runner
+
+ROBOT = load_bundled("panda")
+ENVS, SUBSTEPS, TICKS = 20, 4, 6  # 20 envs: two groups with workers=0
+MARKS = np.repeat(np.arange(float(ENVS))[:, None], ROBOT.dof, 1)
+
+
+class FailsLater:
+    """Controller that fails in some envs, each at a sim step; an env knows its number by its setpoint."""
+
+    def __init__(self, failures, kind="raises"):
+        self.failures, self.kind = failures, kind
+
+    def init(self, robot, num_envs):
+        return np.zeros(num_envs, int)
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        state = state + 1
+        for env, step in self.failures:
+            if ((setpoint[:, 0] == env) & (state == step)).any():
+                return self.fail(env, state, passive)
+        return state, passive + 2 * np.sin(setpoint)
+
+    def fail(self, env, state, passive):
+        if self.kind == "raises":
+            raise ZeroDivisionError(f"mark {env}")
+        if self.kind == "raises an error of ours":
+            raise BatchPIDError(f"mark {env}")
+        return (state, passive[:, :2]) if self.kind == "wrong shape" else None
+
+
+class ListRecorder:
+    path = None
+
+    def __init__(self):
+        self.rows = []
+
+    def append(self, time_, setpoint, observation):
+        self.rows.append((time_, setpoint, observation))
+
+
+def run(runner, way):
+    if way == "rollout":
+        runner.rollout(np.broadcast_to(MARKS, (TICKS, *MARKS.shape)))
+    for _ in range(TICKS):
+        if way == "step":
+            runner.step(MARKS)
+        else:
+            runner.send(MARKS)
+            runner.recv()
+
+
+def outcome(workers, controller, *, kill=False, way="rollout", **options):
+    """Return the error of a run, and what is left of the runner."""
+    with Runner(
+        ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, pack_size=1, timeout=20.0, **options
+    ) as runner:
+        recorder = runner.recorder = ListRecorder()
+        if kill and workers:
+            runner.step(MARKS)
+            os.kill(runner.pids[-1], signal.SIGKILL)
+        elif kill:
+            runner.step(MARKS)
+        with pytest.raises(BatchPIDError) as info:
+            run(runner, way)
+        assert runner.closed
+        with pytest.raises(ClosedError, match="since a call failed"):
+            runner.observe()
+        runner.settle()
+        return type(info.value), str(info.value), runner.time, list(runner.faults), recorder.rows
+
+
+def assert_same(first, second):
+    assert first[:4] == second[:4]
+    assert len(first[4]) == len(second[4])
+    for (time, setpoint, observation), other in zip(first[4], second[4], strict=True):
+        assert time == other[0]
+        np.testing.assert_array_equal(setpoint, other[1])
+        assert_identical(observation, other[2])
+
+
+@settings(max_examples=4, deadline=None)
+@given(
+    workers=st.sampled_from([1, 2]),
+    failures=st.lists(st.tuples(st.integers(0, ENVS - 1), st.integers(1, SUBSTEPS * TICKS)), min_size=1, max_size=3),
+    kind=st.sampled_from(["raises", "raises an error of ours", "wrong shape", "no pair"]),
+    way=st.sampled_from(["rollout", "step", "send"]),
+)
+def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failures, kind, way):
+    controller = FailsLater(sorted(failures), kind)
+    one, other = (outcome(each, controller, way=way) for each in (0, workers))
+    assert_same(one, other)
+    first = min(step for _, step in failures)
+    assert one[0] is ControllerError
+    assert f"in sim step {first} (" in one[1]
+    assert one[2] == pytest.approx((first - 1) // SUBSTEPS * SUBSTEPS / 2000)  # the whole ticks before
+    assert len(one[4]) == (first - 1) // SUBSTEPS
+
+
+@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+def test_a_lost_worker_does_not_change_the_error():
+    controller = FailsLater([(3, 11), (17, 14)])
+    assert_same(outcome(0, controller, kill=True), outcome(2, controller, kill=True))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_controllers_own_traceback_is_shown(workers):
+    runner = Runner(ROBOT, 2, workers=workers, control=FailsLater([(1, 3)]), substeps=SUBSTEPS)
+    with runner, pytest.raises(ControllerError, match="FailsLater raised ZeroDivisionError: mark 1") as info:
+        runner.step(MARKS[:2])
+    error = info.value
+    assert isinstance(error, InvalidArgumentError)
+    assert (error.argument, error.step) == ("control", 3)
+    shown = "".join(getattr(error, "__notes__", [])) if workers else repr(error.__cause__)
+    assert "ZeroDivisionError" in shown
+
+
+def reset_often(runner):
+    for _ in range(6):
+        runner.reset()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_error_in_a_reset_closes_the_runner(workers):
+    class FailsAtReset(FailsLater):
+        def __init__(self):
+            super().__init__([])
+            self.calls = 0
+
+        def init(self, robot, num_envs):
+            self.calls += 1
+            if self.calls > 4:
+                raise BatchPIDError("no more")
+            return super().init(robot, num_envs)
+
+    with Runner(ROBOT, 4, workers=workers, control=FailsAtReset(), pack_size=1) as runner:
+        with pytest.raises(ControllerError, match="no more"):
+            reset_often(runner)
+        assert runner.closed
