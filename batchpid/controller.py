@@ -10,6 +10,7 @@ import numpy as np
 from batchpid import bumpless, law
 from batchpid.backends import JAXBackend, NumPyBackend
 from batchpid.errors import InvalidArgumentError
+from batchpid.leaves import frozen
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 from batchpid.validate import choice, env_mask, instance, integer, names, positive, read_array
@@ -110,6 +111,7 @@ class BatchPID:
         if params.dtype != self._params.dtype:
             problem = f"are {params.dtype}, the controller's {self._params.dtype}"
             raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
+        params = frozen(params)
         self._engine.prepare(params, self._shape)
         self._params, self._stale = params, self._state is not None
 

@@ -7,8 +7,9 @@ checked alone, and it stays a leaf even where it might turn out to be off.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,18 @@ from batchpid.validate import at_least, choice, entries, integer, is_traced, nam
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
 MOST_JOINTS = 100_000
+
+
+Leaves = TypeVar("Leaves", bound=tuple[Any, ...])
+
+
+def frozen(leaves: Leaves) -> Leaves:
+    """Return a named tuple whose NumPy arrays are read-only, so that later writes by the caller do not reach it.
+
+    Arrays that can be written to, by this name or another, are copied. Without any, ``leaves`` itself is returned.
+    """
+    kept = [_read_only(np.array(leaf)) if _can_be_written(leaf) else leaf for leaf in leaves]
+    return leaves if all(map(operator.is_, kept, leaves)) else type(leaves)(*kept)
 
 
 class LeafBuilder:
@@ -135,9 +148,7 @@ class LeafBuilder:
         """Return the leaf in the params' dtype and read-only: params are replaced, not edited."""
         if array is None or is_traced(array):
             return array
-        leaf = np.array(array, dtype=self.dtype)
-        leaf.setflags(write=False)
-        return leaf
+        return _read_only(np.array(array, dtype=self.dtype))
 
     def _by_env_and_joint(self, name: str, array: Any) -> Any:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
@@ -154,6 +165,15 @@ class LeafBuilder:
             f"has shape {array.shape}, not {expected}",
             remedy="give one value, one per joint, or one per env and joint",
         )
+
+
+def _can_be_written(leaf: Any) -> bool:
+    return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
+
+
+def _read_only(array: Any) -> Any:
+    array.setflags(write=False)
+    return array
 
 
 def _is_everywhere(array: Any, value: float) -> bool:

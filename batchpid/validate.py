@@ -218,14 +218,14 @@ def within(argument: str, rows: NDArray[np.float64], far: float, joint_names: Se
 
 def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) -> NDArray[np.float64]:
     """Return ``value`` as one positive number per joint (dof,)."""
-    speeds = array(argument, value, (1, len(joint_names)), joint_names)[0]
+    speeds = array(argument, value, (1, len(joint_names)), joint_names)[0].copy()
     entries(argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none")
     return speeds
 
 
 def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_]:
-    """Return ``value`` as one bool per env (envs,)."""
-    mask = read_array(argument, value, "b")
+    """Return ``value`` as one bool per env (envs,), a copy."""
+    mask = read_array(argument, value, "b").copy()
     if mask.shape != (num_envs,):
         raise InvalidArgumentError(
             argument, f"has shape {mask.shape}, needs ({num_envs},)", remedy="use e.g. mask = ~obs.ok"

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.computed_torque import check_gain_units
 from batchpid.errors import InvalidArgumentError
+from batchpid.leaves import frozen
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
 from sim.cluster import Ray
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
@@ -256,7 +257,7 @@ class RunnerOptions:
         return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
-        """Return ``params`` if they fit the robot, the number of envs and the control.
+        """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the control.
 
         Raises
         ------
@@ -285,7 +286,7 @@ class RunnerOptions:
             )
         if self.randomization is not None:
             check_params(self.randomization, params, self.robot)
-        return params
+        return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
         """Return ``actuators`` as :func:`sim.robot.actuators.fit_actuators` does; None if every effect is off.
@@ -297,9 +298,9 @@ class RunnerOptions:
         """
         fitted = None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
         fitted = None if fitted is None or fitted.is_ideal else fitted
-        if self.randomization is None:
-            return fitted
-        return prepared_actuators(self.randomization, fitted, self.robot, self.control)
+        if self.randomization is not None:
+            fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
+        return None if fitted is None else frozen(fitted)
 
     def about(self) -> dict[str, Any]:
         """Return the options that two runners must share to restore each other's snapshots, as plain values."""

@@ -238,8 +238,14 @@ class Runner:
         seed
             Begin with the first episode of another stream of the randomization: an int s for stream s + k in env k, or
             one for each env. Default: draw for the next episode of each env's stream.
+
+        Raises
+        ------
+        CallOrderError
+            The observation of a tick that was sent has not been received, as for :meth:`step`, :meth:`rollout` and
+            :meth:`restore`.
         """
-        books = self._settle()
+        books = self._received("reset")
         position = self._state("qpos", self.robot.start if qpos is None else qpos)
         velocity = self._state("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
@@ -284,7 +290,7 @@ class Runner:
         substeps
             Sim steps of this tick; default the runner's.
         """
-        self._settle()
+        self._received("step")
         self._run(*self._tick(setpoint, setpoint_rate, feedforward, substeps))
         return _copy(self._pool.present)
 
@@ -298,16 +304,16 @@ class Runner:
     ) -> None:
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
 
-        The two are bit-identical to one :meth:`step`, and take its arguments. Any other call in between, of attributes
-        such as :attr:`time` too, first waits for the tick to end. With ``workers=0`` the tick runs in this call.
+        The two are bit-identical to one :meth:`step`, and take its arguments. Other calls in between, and attributes
+        such as :attr:`time`, first wait for the tick to end; those that change the observation are an error. With
+        ``workers=0`` the tick runs in this call.
 
         Raises
         ------
         CallOrderError
             The observation of the last tick that was sent has not been received.
         """
-        if self._settle().received is not None:
-            raise CallOrderError("send: the last tick's observation has not been received; call recv() first")
+        self._received("send")
         request, commit = self._ticks(*self._tick(setpoint, setpoint_rate, feedforward, substeps))
 
         def commit_sent(books: _Books, seconds: list[Any]) -> tuple[_Books, None]:
@@ -352,7 +358,7 @@ class Runner:
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        steps, pool, dof = self._settle().steps, self._pool, self.robot.dof
+        steps, pool, dof = self._received("rollout").steps, self._pool, self.robot.dof
         shape = read_array("setpoints", setpoints).shape
         if len(shape) not in (2, 3) or shape[0] == 0:
             raise InvalidArgumentError(
@@ -372,7 +378,7 @@ class Runner:
             None if setpoint_rates is None else read("setpoint_rates", setpoint_rates),
             None if feedforwards is None else read("feedforwards", feedforwards),
         )
-        command = self._coupled(command)
+        command = self._coupled(command).map(np.array)  # a copy: ``progress`` may run code of the caller
         if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint)
         seen = empty_observation(ticks, self.num_envs, dof)
@@ -386,7 +392,7 @@ class Runner:
                 for table, rows in zip(seen, pool.arrays.observation, strict=True):
                     table[part] = rows[: done - tick]
         info = replace(info, faults=tuple(self.faults))
-        return Rollout(times, command.setpoint.copy(), seen, self.timestep * self.substeps, info)
+        return Rollout(times, command.setpoint, seen, self.timestep * self.substeps, info)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -419,8 +425,8 @@ class Runner:
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
         self._settle()
-        request = SetParams(self.options.check_params(params))
-        self._execute(request, lambda books, _: (books._replace(params=params), None))
+        checked = self.options.check_params(params)
+        self._execute(SetParams(checked), lambda books, _: (books._replace(params=checked), None))
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -459,10 +465,10 @@ class Runner:
         InvalidArgumentError
             It is of another robot, number of envs, timestep, control, ...
         """
-        self._settle()
+        self._received("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
         snapshot.check(self.options.about())
-        self.options.check_params(snapshot.params)
+        snapshot = replace(snapshot, params=self.options.check_params(snapshot.params))
         sizes = [size for part in self._execute(ReadContentSizes(), _read) for size in part]
         controller = initial_state(self.options, snapshot.params)
         acting = actuators = self.options.check_actuators(snapshot.actuators)
@@ -707,6 +713,14 @@ class Runner:
         if not ledger.is_settled or ledger.books.unrecorded:
             ledger.settle(self._record)
         return ledger.books
+
+    def _received(self, call: str) -> _Books:
+        """Settle before a call that changes the observation, which must not come between a send and its recv."""
+        books = self._settle()
+        if books.received is not None:
+            problem = "the observation of the last tick that was sent has not been received"
+            raise CallOrderError(f"{call}: {problem}; call recv() first")
+        return books
 
     @property
     def _books(self) -> _Books:

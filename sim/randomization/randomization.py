@@ -78,7 +78,12 @@ class Randomization:
         object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
         choice("each", self.each, get_args(Literal["episode", "env"]))
         for group in GROUPS:
-            object.__setattr__(self, group, dict(mapping(group, getattr(self, group))))
+            chosen = mapping(group, getattr(self, group))
+            chosen = {name: dict(each) if isinstance(each, Mapping) else each for name, each in chosen.items()}
+            object.__setattr__(self, group, chosen)
+        for name in (*PHYSICAL, *START):
+            if isinstance(each := getattr(self, name), Mapping):
+                object.__setattr__(self, name, dict(each))
         remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
         for name, each in self.given.items():
             given = list(each.values()) if isinstance(each, Mapping) and name != "payload" else [each]

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.guard import check_guard
+from batchpid.leaves import frozen
 from batchpid.validate import instance
 from sim.robot.parts import Joint
 
@@ -68,8 +69,9 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
         problem, remedy = "limits positions, which this control does not take", "use control 'pid' or 'drive'"
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(robot, None, None) if guard is True else guard
-    check_guard(instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)"), num_envs, robot.joint_names)
-    return limits  # type: ignore[return-value]
+    limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
+    check_guard(limits, num_envs, robot.joint_names)
+    return frozen(limits)
 
 
 def fingerprint(guard: bool | bp.Guard) -> str:

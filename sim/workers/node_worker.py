@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, Self
 
 from batchpid.errors import InvalidArgumentError
 from sim.loop.arrays import Arrays
@@ -26,11 +26,12 @@ _BEAT_INTERVAL = 1.0  # seconds between two such calls
 class NodeWorker(Worker):
     """Caller's end of a node. Ray is called in the background thread, where no signal interrupts it."""
 
-    def __init__(self, cluster: Cluster, start: Start, shared: SharedArrays) -> None:
+    def __init__(self, cluster: Cluster, start: Start, shared: SharedArrays, message: bytes | None = None) -> None:
         self._cluster, self._index, self._envs = cluster, start.index, start.envs
+        self._start, self._shared = start, shared
         self._arrays = Arrays.from_fields(shared.arrays)
         ticks = len(self._arrays.observation.ok)
-        self._message = pickled((cluster.pool_type, start, ticks, cluster.canonical))
+        self._message = pickled((cluster.pool_type, start, ticks, cluster.canonical)) if message is None else message
         self._bell = _Bell()
         self._actor: Any = None
         self._call: Future[Answer] | None = None
@@ -123,6 +124,9 @@ class NodeWorker(Worker):
     def close(self, patience: float) -> None:
         if not sys.is_finalizing():
             BACKGROUND.put(Job(self._kill))  # after the call that opened it, which may have been interrupted
+
+    def successor(self) -> Self:
+        return type(self)(self._cluster, self._start, self._shared, self._message)
 
     def _kill(self) -> None:
         actor, self._actor = self._actor, None

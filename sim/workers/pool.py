@@ -297,7 +297,7 @@ class WorkerPool:
                 slot.cause, slot.lost_at = str(error), time.monotonic()
         slot.phase = "transfer"
         slot.worker.close(0.0)
-        slot.worker = self._make_worker(slot.start, self._shared)
+        slot.worker = slot.worker.successor()
         self._start(slot)
 
     def _start(self, slot: _Slot) -> None:

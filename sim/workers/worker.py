@@ -19,7 +19,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cloudpickle
 
@@ -82,6 +82,10 @@ class Worker(ABC):
         May be called again, after an interrupt too.
         """
 
+    @abstractmethod
+    def successor(self) -> Self:
+        """Return a worker, not open yet, to replace this one: started by the same message, pickled once."""
+
     def fileno(self) -> int | None:
         """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""
         return None
@@ -104,7 +108,7 @@ class LocalWorker(Worker):
     """Loop in this process."""
 
     def __init__(self, start: Start, shared: SharedArrays) -> None:
-        self._start, self._arrays = start, Arrays.from_fields(shared.arrays)
+        self._start, self._shared, self._arrays = start, shared, Arrays.from_fields(shared.arrays)
         self._loop: Loop | None = None
         self._result: Any = None
 
@@ -126,14 +130,18 @@ class LocalWorker(Worker):
         if self._loop is not None:
             self._loop.close()
 
+    def successor(self) -> Self:
+        return type(self)(self._start, self._shared)
+
 
 class ProcessWorker(Worker):
     """Parent's end of a worker process."""
 
     pid: int | None = None
 
-    def __init__(self, start: Start, shared: SharedArrays) -> None:
-        self._message = pickled((start, shared.layout))
+    def __init__(self, start: Start, shared: SharedArrays, message: bytes | None = None) -> None:
+        self._start, self._shared = start, shared
+        self._message = pickled((start, shared.layout)) if message is None else message
         self._name = f"worker {start.index} (envs {start.numbers.start} to {start.numbers.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
         self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
@@ -208,6 +216,9 @@ class ProcessWorker(Worker):
                 self._process.kill()
             self._process.wait()
         self._trace.close()
+
+    def successor(self) -> Self:
+        return type(self)(self._start, self._shared, self._message)
 
     def pin(self, core: int) -> None:
         with contextlib.suppress(OSError):  # it died, or the core is no longer ours

@@ -82,11 +82,8 @@ def test_a_worker_lost_around_a_sent_tick_is_replaced(moment):
 def test_another_call_completes_the_tick_first_and_recv_still_returns_it():
     with make() as runner, make(0) as model:
         for other in (
-            lambda each: each.step(SETPOINTS[1]),
-            lambda each: each.reset(SETPOINTS[2], mask=np.arange(6) < 2),
             lambda each: each.snapshot(),
             lambda each: setattr(each, "params", ROBOT.params(kp=33.0)),
-            lambda each: each.rollout(SETPOINTS[:3]),
             lambda each: each.observe(),
         ):
             runner.send(SETPOINTS[0])
@@ -97,6 +94,23 @@ def test_another_call_completes_the_tick_first_and_recv_still_returns_it():
             assert_identical(runner.observe(), model.observe())
         runner.send(SETPOINTS[0])
         assert runner.time == pytest.approx(model.time + 5 * model.timestep)
+
+
+def test_a_call_that_changes_the_observation_waits_for_recv():
+    with make(0) as runner, make(0) as model:
+        snapshot = runner.snapshot()
+        model.snapshot()
+        runner.send(SETPOINTS[0])
+        for name, argument in (
+            ("step", SETPOINTS[1]),
+            ("reset", SETPOINTS[2]),
+            ("rollout", SETPOINTS[:3]),
+            ("restore", snapshot),
+        ):
+            with pytest.raises(CallOrderError, match=rf"{name}: .*call recv\(\) first"):
+                getattr(runner, name)(argument)
+        assert_identical(runner.recv(), model.step(SETPOINTS[0]))
+        assert_identical(runner.reset(SETPOINTS[2]), model.reset(SETPOINTS[2]))
 
 
 def test_calls_out_of_order_are_named():

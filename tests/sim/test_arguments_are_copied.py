@@ -1,0 +1,257 @@
+"""Writing into an array after a call has no effect: every argument is copied at the boundary."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from identical import assert_identical
+from robots import load_bundled
+
+import batchpid as bp
+from sim import Randomization, Runner, Uniform
+from sim.options import RunnerOptions
+
+ROBOT = load_bundled("panda")
+N, DOF = 4, ROBOT.dof
+
+
+def scribble(value):
+    """Overwrite every array of ``value``, and of the named tuples, objects and mappings in it."""
+    if isinstance(value, np.ndarray):
+        if value.flags.writeable:
+            value[...] = True if value.dtype == bool else 77
+    elif isinstance(value, Mapping):
+        for part in value.values():
+            scribble(part)
+    elif isinstance(value, tuple | list):
+        for part in value:
+            scribble(part)
+    elif hasattr(value, "__dict__"):
+        scribble(vars(value))
+
+
+def own(leaves):
+    """Return named leaves in arrays that can be written to."""
+    return type(leaves)(*(np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves))
+
+
+def limits(robot=ROBOT):
+    return own(bp.make_guard(DOF, rate=np.full(DOF, 1.5)))
+
+
+def motors(lag=0.002):
+    return own(bp.make_actuators(DOF, lag=np.full(DOF, lag), coulomb=np.full(DOF, 0.1)))
+
+
+def gains(kp):
+    return own(ROBOT.params(kp=kp))._replace(kd=np.full((1, DOF), 4.0))
+
+
+def execute(runner, command, rng, disturb):
+    """Execute a command on arrays that are overwritten afterwards, if ``disturb``; return its result."""
+    setpoint = np.clip(ROBOT.start + rng.uniform(-0.1, 0.1, (3, N, DOF)), ROBOT.lower, ROBOT.upper)
+    arrays = SimpleNamespace(
+        setpoint=setpoint[0],
+        setpoints=setpoint,
+        rate=rng.uniform(-0.1, 0.1, (N, DOF)),
+        feedforward=rng.uniform(-0.1, 0.1, (N, DOF)),
+        mask=rng.random(N) < 0.5,
+        params=gains(rng.uniform(20, 40)),
+        actuators=motors(rng.uniform(0.001, 0.003)),
+    )
+    result = None
+    if command == "step":
+        result = runner.step(arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward)
+    elif command == "send":
+        runner.send(arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward)
+        if disturb:
+            scribble(vars(arrays))
+        result = runner.recv()
+    elif command == "rollout":
+        result = runner.rollout(arrays.setpoints, progress=lambda ticks: between(ticks, arrays, disturb))
+    elif command == "reset":
+        result = runner.reset(arrays.setpoint, arrays.rate, arrays.mask)
+    elif command == "params":
+        runner.params = arrays.params
+    elif command == "actuators":
+        runner.actuators = arrays.actuators
+    elif command == "snapshot":
+        arrays.snapshot = runner.snapshot()
+        result = runner.restore(arrays.snapshot)
+    if disturb:
+        scribble(vars(arrays))
+    return result
+
+
+def between(ticks, arrays, disturb):
+    for tick in ticks:
+        yield tick
+        if disturb:
+            scribble(vars(arrays))
+
+
+def run(commands, seed, workers, disturb):
+    """Return the results of the commands, then those after a lost worker."""
+    rng = np.random.default_rng(seed)
+    given_ = SimpleNamespace(
+        params=gains(30.0), guard=limits(), actuators=motors(), speed_limit=np.full((1, DOF), 50.0), control="pid"
+    )
+    names = {f"panda_joint{joint}": Uniform(0.0, 0.1) for joint in (1, 2)}
+    randomization = Randomization(friction=names, params={"kp": names})
+    with Runner(ROBOT, N, workers=workers, substeps=3, randomization=randomization, **vars(given_)) as runner:
+        if disturb:
+            scribble(vars(given_))
+            names.clear()
+        results = [execute(runner, command, rng, disturb) for command in commands]
+        for pid in runner.pids:
+            os.kill(pid, signal.SIGKILL)
+        results += [runner.step(ROBOT.start), runner.params, runner.actuators, runner.options.guard]
+    return results
+
+
+COMMANDS = ("step", "send", "rollout", "reset", "params", "actuators", "snapshot")
+
+
+@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning", "ignore::sim.SetpointWarning")
+@settings(max_examples=4, deadline=None)
+@given(commands=st.permutations(COMMANDS), seed=st.integers(0, 2**32 - 1), workers=st.sampled_from([0, 1]))
+def test_a_runner_keeps_nothing_of_the_callers(commands, seed, workers):
+    for ours, theirs in zip(*(run(commands, seed, workers, disturb) for disturb in (False, True)), strict=True):
+        if isinstance(ours, tuple):
+            for one, other in zip(ours, theirs, strict=True):
+                np.testing.assert_array_equal(one, other)
+        elif ours is not None:
+            assert_identical(ours, theirs)
+
+
+def test_a_runner_keeps_params_and_options_read_only():
+    with Runner(ROBOT, 1, workers=0, params=gains(30.0), guard=limits(), actuators=motors()) as runner:
+        for leaves in (runner.params, runner.options.guard, runner.actuators):
+            assert not any(leaf.flags.writeable for leaf in leaves if isinstance(leaf, np.ndarray))
+
+
+def test_options_of_a_runner_are_copies():
+    speed = np.full((1, DOF), 3.0)
+    options = RunnerOptions(ROBOT, N, speed_limit=speed)
+    speed[:] = 0.0
+    np.testing.assert_array_equal(options.speed_limit, 3.0)
+
+
+INPUTS = ("setpoint", "measurement", "measurement_rate", "setpoint_rate", "feedforward")
+LAWS = {
+    "plain": {},
+    "all": {
+        "derivative_filter_time": 0.01,
+        "setpoint_weight": 0.5,
+        "setpoint_weight_derivative": 0.5,
+        "effort_rate_limit": 1e3,
+        "weight_origin": "start",
+        "continuous": True,
+        "non_finite": "hold",
+    },
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), rates=st.booleans(), data=st.data())
+def test_a_controller_keeps_nothing_of_the_callers(law, backend, seed, rates, data):
+    calls = data.draw(st.lists(st.sampled_from(["call", "reset", "track", "params"]), min_size=3, max_size=6))
+    efforts = [efforts_of(law, backend, calls, seed, rates, disturb) for disturb in (False, True)]
+    np.testing.assert_array_equal(*efforts)
+
+
+def efforts_of(law, backend, calls, seed, rates, disturb):
+    rng = np.random.default_rng(seed)
+    envs, joints = 128, 4  # JAX takes over large and aligned arrays without a copy
+
+    def draw():
+        gains_ = bp.make_params(joints, kp=rng.uniform(1, 9, (envs, joints)), ki=2.0, kd=0.5, **LAWS[law])
+        return own(gains_)
+
+    params = draw()
+    pid = bp.BatchPID(params, envs, 0.01, backend)
+    efforts = []
+    for call in ["call", *calls, "call", "call"]:
+        if disturb:
+            scribble(params)
+        rows = {name: rng.normal(size=(envs, joints)) for name in INPUTS}
+        if not rates:
+            rows = {name: rows[name] for name in INPUTS[:2]}
+        mask = rng.random(envs) < 0.5
+        if call == "call":
+            efforts.append(np.array(pid(**rows)))
+        elif call == "reset":
+            pid.reset(rows["measurement"], mask)
+        elif call == "track":
+            rows["effort"] = rng.normal(size=(envs, joints))
+            pid.track(**rows)
+        else:
+            params = draw()
+            pid.params = params
+        if disturb:
+            scribble(rows)
+            scribble(mask)
+    return np.array(efforts)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10, deadline=None)
+def test_the_functions_of_law_guard_and_actuators_keep_nothing(law, seed):
+    rng = np.random.default_rng(seed)
+    rows = [rng.normal(size=(3, 2)) for _ in range(3)]
+    params = bp.make_params(2, kp=3.0, ki=2.0, kd=0.5, **LAWS[law])
+    state = bp.init(params, rows[0])
+    guarded = bp.make_guard(2, rate=1.0, acceleration=5.0)
+    guard = bp.guard.init(guarded, rows[0])
+    real = bp.make_actuators(2, lag=0.1, command_delay=0.02, sensor_delay=0.01, backlash=0.1)
+    motor = bp.actuators.init(real, rows[0], 0.01)
+    state, effort = bp.step(params, state, *rows[:2], 0.01, feedforward=rows[2])
+    guard, _ = bp.guard.advance(guarded, guard, rows[0], 0.01)
+    motor, delivered = bp.actuators.deliver(real, motor, rows[0], rows[1], rows[2], 0.01)
+    motor, qpos, qvel = bp.actuators.measure(real, motor, rows[0], rows[1], 0.01)
+    state = bp.reset(params, state, rows[2], np.array([True, False, True]))
+    kept = (state, effort, guard, motor, delivered, qpos, qvel)
+    copies = [
+        np.array(leaf) for part in kept for leaf in (part if isinstance(part, tuple) else (part,)) if leaf is not None
+    ]
+    scribble(rows)
+    after = [leaf for part in kept for leaf in (part if isinstance(part, tuple) else (part,)) if leaf is not None]
+    for one, other in zip(copies, after, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+class Gain:
+    """Controller with an array of the caller's."""
+
+    def __init__(self):
+        self.stiffness = np.full(DOF, 20.0)
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, passive + self.stiffness * (setpoint - qpos) - qvel
+
+
+@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+def test_a_worker_that_is_replaced_gets_the_controller_as_it_was():
+    ends = []
+    for disturb in (False, True):
+        controller = Gain()
+        with Runner(ROBOT, 2, workers=1, control=controller, substeps=10) as runner:
+            runner.step(ROBOT.start)
+            if disturb:
+                scribble(controller)
+                os.kill(runner.pids[0], signal.SIGKILL)
+            ends.append(runner.step(ROBOT.start + 0.1))
+    assert_identical(*ends)
