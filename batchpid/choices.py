@@ -8,39 +8,52 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 
-class Everywhere(NamedTuple):
+class _Choice(NamedTuple):
+    """Choice, equal to those of its own type alone: as keys of a cache, empty tuples would be one and the same."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other)
+
+    def __ne__(self, other: object) -> bool:
+        return type(self) is not type(other)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+
+class Everywhere(_Choice):
     """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
 
 
-class IntegrateFirst(NamedTuple):
+class IntegrateFirst(_Choice):
     """The present error enters the integral before the effort is computed."""
 
 
-class DerivativeKick(NamedTuple):
+class DerivativeKick(_Choice):
     """The error before the first sample counts as 0, so that the first derivative is a kick."""
 
 
-class WeightFromStart(NamedTuple):
+class WeightFromStart(_Choice):
     """Setpoint weighting measures positions from the first measurement instead of from 0."""
 
 
-class ZeroEffort(NamedTuple):
+class ZeroEffort(_Choice):
     """A joint with a non-finite input gets effort 0."""
 
 
-class HoldEffort(NamedTuple):
+class HoldEffort(_Choice):
     """A joint with a non-finite input gets its last effort again."""
 
 
-class MeasuredRate(NamedTuple):
+class MeasuredRate(_Choice):
     """The derivative takes the measured velocity instead of the difference quotient of positions."""
 
 
-class PerInertia(NamedTuple):
+class PerInertia(_Choice):
     """Gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
 
 
-class PerMassMatrix(NamedTuple):
+class PerMassMatrix(_Choice):
     """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
 

@@ -5,7 +5,6 @@ Longer than 300 lines because every option is documented here.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import KW_ONLY, astuple, dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.computed_torque import check_gain_units
+from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import frozen
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
@@ -21,7 +21,7 @@ from sim.cluster import Ray
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
 from sim.randomization.randomization import Randomization
 from sim.robot.actuators import fit_actuators
-from sim.robot.guard import fingerprint, fit_guard
+from sim.robot.guard import fit_guard
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -304,10 +304,9 @@ class RunnerOptions:
 
     def about(self) -> dict[str, Any]:
         """Return the options that two runners must share to restore each other's snapshots, as plain values."""
-        robot, coupling = self.robot, self.robot.coupling
+        robot = self.robot
         return {
-            "robot": robot.name,
-            "urdf": hashlib.sha256(robot.urdf.encode()).hexdigest(),
+            **robot.about(),
             "joints": list(robot.joint_names),
             "num_envs": self.num_envs,
             "timestep": self.timestep,
@@ -316,14 +315,10 @@ class RunnerOptions:
             "dtype": self.dtype,
             "compensate": self.compensate,
             "physics": list(astuple(self.solver)),
-            "dissipation": robot.dissipation,
             "collisions": self.collisions,
             "ground": self.ground,
-            "ignored_pairs": hashlib.sha256(repr(robot.ignored_pairs).encode()).hexdigest(),
-            "fixed_base": robot.fixed_base,
-            "merge_fixed": robot.merge_fixed,
-            "guard": hashlib.sha256(fingerprint(self.guard).encode()).hexdigest(),
-            "coupling": None if coupling is None else [coupling.matrix.tolist(), coupling.offset.tolist()],
+            "ignored_pairs": digest(robot.ignored_pairs),
+            "guard": digest(self.guard),
             "randomization": None if self.randomization is None else self.randomization.to_dict(),
         }
 

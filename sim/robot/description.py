@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.coupling import Coupling
+from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError
 from sim.observation import RunInfo
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
 from sim.robot.guard import setpoint_guard
+from sim.robot.meshes import content_of
 from sim.robot.parts import Joint, Placement, Settings, Urdf
 from sim.robot.self_collision import SelfContact, Srdf
 
@@ -252,6 +254,24 @@ class RobotDescription(Urdf):
     def has_ground(self) -> bool:
         """True if scenes have a ground by default: unless the base is fixed so low that links dip into it at rest."""
         return not self.self_contact.reaches_ground
+
+    def about(self) -> dict[str, Any]:
+        """Return what makes up the simulated robot, as plain values: equal for robots of equal content.
+
+        Digests stand for the URDF after all repairs, with the content of its collision meshes, for the .srdf, and for
+        the settings of a bundled robot. The actuators are left out.
+        """
+        return {
+            "robot": self.name,
+            "urdf": self._urdf_digest,
+            "srdf": digest(self.srdf.disabled, self.srdf.enabled),
+            "settings": digest(self.settings),
+            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
+        }
+
+    @cached_property
+    def _urdf_digest(self) -> str:
+        return digest(content_of(self.urdf), self.all_joints, self.joints)
 
     def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
         """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""

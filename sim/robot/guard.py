@@ -72,10 +72,3 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
     check_guard(limits, num_envs, robot.joint_names)
     return frozen(limits)
-
-
-def fingerprint(guard: bool | bp.Guard) -> str:
-    """Return a text that two guards share if they are the same."""
-    if isinstance(guard, bool):
-        return str(guard)
-    return repr([None if leaf is None else leaf.tolist() for leaf in guard])

@@ -17,6 +17,8 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
+from batchpid.digest import digest
+from batchpid.errors import RobotError
 from sim.robot.xml import LARGEST
 
 SIZE_LIMIT = 2**27  # bytes of a mesh file
@@ -40,6 +42,25 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     else:
         candidates = [folder / relative for folder in (above[0], *package_dirs, *above[1:]) if relative]
     return next((each.absolute() for each in candidates if os.path.isfile(each)), None)
+
+
+def content_of(urdf: str) -> str:
+    """Return the text of a URDF in canonical form, with the digest of each mesh file in place of its path.
+
+    Raises RobotError for a file that cannot be read.
+    """
+    root = etree.fromstring(urdf.encode(), etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    digests: dict[str, str] = {}
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        try:
+            digests[name] = digests.get(name) or digest(Path(name).read_bytes())
+        except OSError as error:
+            raise RobotError(
+                f"{name}: cannot be read: {error.strerror}; restore the mesh, or load the robot again"
+            ) from None
+        mesh.set("filename", digests[name])
+    return etree.tostring(root, method="c14n", with_comments=False).decode()
 
 
 def mesh_problem(path: Path) -> str | None:

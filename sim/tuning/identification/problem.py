@@ -37,7 +37,7 @@ from sim.tuning.identification.logs import Log
 from sim.tuning.identification.regression import Motion
 from sim.tuning.identification.unknowns import Unknowns
 from sim.tuning.identification.wander import spread, whiten
-from sim.tuning.identification.windows import Window, cut, project, rows_of, simulate, whole
+from sim.tuning.identification.windows import Subject, Window, cut, project, rows_of, simulate, whole
 
 Float64 = NDArray[np.float64]
 CHUNK = 48
@@ -85,6 +85,7 @@ class Problem:
     """Numbers of the fitted rows in each stretch of each window."""
 
     def __post_init__(self) -> None:
+        self._subject = Subject.of(self.robot, self.joints, self.drive)
         divide = whole if self.drive.params is not None else cut
         self.windows = [
             window
@@ -206,7 +207,6 @@ class Problem:
         return found
 
     def _map(self, tasks: list[Any]) -> list[list[Float64]]:
-        about = (self.robot, self.joints, self.drive)
         if self.executor is None:
-            return [simulate(about, *task) for task in tasks]
-        return list(self.executor.map(simulate, [about] * len(tasks), *zip(*tasks, strict=True)))
+            return [simulate(self._subject, *task) for task in tasks]
+        return list(self.executor.map(simulate, [self._subject] * len(tasks), *zip(*tasks, strict=True)))

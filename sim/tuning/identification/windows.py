@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from threading import local
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.digest import digest
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.logs import Log
@@ -54,11 +56,34 @@ class Window(NamedTuple):
         return self.segment._replace(**{changed: getattr(self.segment, changed) + self.errors[draw - 1]})
 
 
-_plants: dict[int, Plant] = {}
+class Subject(NamedTuple):
+    """Robot of the logs, their joints and control."""
+
+    robot: Robot
+    joints: tuple[int, ...]
+    drive: Drive
+    key: str
+    """Digest of these."""
+
+    @classmethod
+    def of(cls, robot: Robot, joints: tuple[int, ...], drive: Drive) -> Subject:
+        """Return them with their digest."""
+        return cls(robot, joints, drive, digest(robot.about(), joints, drive))
+
+
+_kept = local()
+"""Last plant of each thread: a worker process has the tasks of one subject after the other."""
+
+
+def plant_of(subject: Subject) -> Plant:
+    """Return the plant of ``subject``, the same object for equal ones in a row."""
+    if getattr(_kept, "key", None) != subject.key:
+        _kept.plant, _kept.key = Plant(*subject[:-1]), subject.key
+    return _kept.plant
 
 
 def simulate(
-    about: tuple[Robot, tuple[int, ...], Drive],
+    subject: Subject,
     windows: list[Window],
     motors: Motors,
     states: Float64,
@@ -68,11 +93,6 @@ def simulate(
 
     ``states`` are added to the states at the start of a window; ``draws`` are the numbers of the candidates' noise.
     """
-    robot, joints, drive = about
-    key = hash((robot.urdf, joints, repr(drive)))
-    if key not in _plants:
-        _plants.clear()
-        _plants[key] = Plant(robot, joints, drive)
     segments = []
     for window in windows:
         drawn = {draw: window.drawn(draw) for draw in set(draws.tolist())}
@@ -81,7 +101,7 @@ def simulate(
             segments.append(Segment(qpos + shift[0], qvel + shift[1], *given))
     count = len(states)
     everyone = motors.take(np.tile(np.arange(count), len(windows)))
-    out = _plants[key].simulate(everyone, segments, windows[0].past)
+    out = plant_of(subject).simulate(everyone, segments, windows[0].past)
     found = []
     with np.errstate(invalid="ignore"):
         for number, window in enumerate(windows):

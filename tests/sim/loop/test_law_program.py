@@ -139,3 +139,15 @@ def test_a_trace_holds_what_its_results_need_and_no_more():
     assert len(noted.operations) == 5 * 4
     assert np.frombuffer(noted.results, np.int32).tolist() == [2, 1]
     assert noted.literals == ()
+
+
+@needs_extension
+@pytest.mark.parametrize("order", [("zero", "hold"), ("hold", "zero")])
+def test_laws_that_differ_in_a_choice_alone_have_programs_of_their_own(order):
+    for non_finite in order:
+        params = bp.make_params(2, kp=10.0, effort_rate_limit=1e6, non_finite=non_finite)
+        law, k = PIDLaw.of(params), bp.discretise(params, DT, 1)
+        program, state, setpoint = LawProgram(law, k), bp.init(params, np.zeros((1, 2))), np.ones((1, 2))
+        for qpos in (0.5, np.nan):
+            state, effort = program.advance(state, (setpoint, None), np.full((1, 2), qpos), None, None)[:2]
+        assert (effort == {"zero": 0.0, "hold": 5.0}[non_finite]).all()

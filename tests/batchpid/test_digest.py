@@ -1,0 +1,152 @@
+"""A digest is equal for equal content, and differs for content that differs in any part."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.choices import CHOICE_TYPES, HoldEffort, ZeroEffort
+from batchpid.digest import digest
+
+
+class Pair(NamedTuple):
+    first: Any
+    second: Any = None
+
+
+class Other(NamedTuple):
+    first: Any
+    second: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    first: Any
+    second: Any = None
+
+
+SCALARS = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary())
+VALUES = st.recursive(
+    SCALARS,
+    lambda parts: st.one_of(
+        st.lists(parts, max_size=3),
+        st.dictionaries(st.text(max_size=2), parts, max_size=3),
+        st.builds(Pair, parts, parts),
+        st.builds(Record, parts, parts),
+    ),
+    max_leaves=8,
+)
+GAINS = st.lists(st.integers(0, 5).map(float), min_size=3, max_size=3)
+PARAMS = st.fixed_dictionaries(
+    {"kp": GAINS},
+    optional={
+        "ki": GAINS,
+        "kd": GAINS,
+        "effort_limit": st.sampled_from([5.0, [5.0, 6.0, 7.0]]),
+        "effort_rate_limit": st.just(900.0),
+        "derivative_filter_time": st.just(0.01),
+        "setpoint_weight": st.just(0.7),
+        "deadband": st.just(0.3),
+        "anti_windup": st.sampled_from(["none", "conditional", ["none", "conditional", "none"]]),
+        "integration": st.just("integrate_first"),
+        "weight_origin": st.just("start"),
+        "non_finite": st.sampled_from(["zero", "hold"]),
+        "measurement_rate": st.just("measured"),
+        "gain_units": st.sampled_from(["inertia", "mass_matrix"]),
+        "continuous": st.sampled_from([True, [True, False, False]]),
+        "dtype": st.sampled_from(["float32", "float64"]),
+    },
+)
+
+
+def described(value: Any) -> str:
+    """Return a text that tells every value of these tests from every other."""
+    if isinstance(value, np.ndarray):
+        return f"array({value.dtype}, {value.shape}, {value.tolist()})"
+    if isinstance(value, dict):
+        return "{" + ", ".join(sorted(f"{key!r}: {described(part)}" for key, part in value.items())) + "}"
+    if isinstance(value, tuple | Record):
+        parts = value if isinstance(value, tuple) else (value.first, value.second)
+        return f"{type(value).__name__}({', '.join(map(described, parts))})"
+    return f"[{', '.join(map(described, value))}]" if isinstance(value, list) else repr(value)
+
+
+@given(VALUES, VALUES)
+def test_digests_are_equal_if_and_only_if_the_content_is(one, two):
+    assert (digest(one) == digest(two)) == (described(one) == described(two))
+
+
+@given(PARAMS, PARAMS)
+def test_params_that_differ_in_a_leaf_have_other_digests(one, two):
+    first, second = bp.make_params(3, **one), bp.make_params(3, **two)
+    assert (digest(first) == digest(second)) == (described(first) == described(second))
+    assert digest(first) == digest(bp.make_params(3, **one))
+
+
+@given(GAINS, st.permutations(range(3)))
+def test_permuted_gains_have_another_digest(gains, order):
+    permuted = [gains[at] for at in order]
+    assume(permuted != gains)
+    one, two = (bp.make_params(3, kp=kp, kd=1.0) for kp in (gains, permuted))
+    assert repr(one) == repr(two)  # prints ranges alone
+    assert digest(one) != digest(two)
+
+
+def test_memory_layout_and_byte_order_do_not_matter():
+    table = np.arange(12.0).reshape(3, 4)
+    apart = np.zeros((6, 8))
+    apart[::2, ::2] = table
+    same = [np.asfortranarray(table), apart[::2, ::2], table.astype(">f8"), table[::-1][::-1]]
+    assert {digest(each) for each in same} == {digest(table)}
+    different = [table.T, table.ravel(), table[None], table.astype(np.float32), table.astype(int), table.tolist()]
+    assert len({digest(each) for each in [table, *different]}) == 7
+
+
+def test_order_matters_in_sequences_alone():
+    assert digest({"a": 1, "b": 2}) == digest(OrderedDict(b=2, a=1))
+    assert digest({"a", "b"}) == digest(frozenset(("b", "a")))
+    assert digest([1, 2]) == digest((1, 2)) != digest([2, 1])
+
+
+def test_values_do_not_run_into_each_other():
+    texts = [("ab", "c"), ("a", "bc"), (["ab"], "c"), ([], "ab", "c"), ("ab", None, "c"), (b"ab", "c"), ({"ab": "c"},)]
+    parts = [(Pair("ab", "c"),), (Other("ab", "c"),), (Record("ab", "c"),)]
+    alike = [*texts, *parts, (1,), (1.0,), (True,), (0.0,), (-0.0,), (None,), ()]
+    assert len({digest(*values) for values in alike}) == len(alike)
+
+
+def test_digest_is_the_same_in_another_process():
+    make = (
+        "bp.make_params(2, kp=[3.0, 1.0], gain_units='inertia', non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
+    )
+    program = f"import batchpid as bp; from batchpid.digest import digest; print(digest({make}))"
+    environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
+    out = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == digest(*eval(f"({make})"))
+
+
+@pytest.mark.parametrize("value", [object(), len, np.array([object()]), np.zeros(2, "f8, f4"), np.longdouble(1), int])
+def test_what_may_hide_content_is_refused(value):
+    with pytest.raises(bp.InvalidArgumentError, match=r"values\[0\]\['k'\]\[1\].*no digest"):
+        digest({"k": [1, value]})
+
+
+def test_arrays_of_jax_have_the_digest_of_their_content():
+    jax = pytest.importorskip("jax")
+    assert digest(jax.numpy.arange(3)) == digest(np.asarray(jax.numpy.arange(3)))
+
+
+def test_choices_equal_those_of_their_type_alone():
+    """Empty tuples are equal to each other: a cache would take one choice for another."""
+    choices = [kind() for kind in CHOICE_TYPES]
+    assert len(set(choices)) == len({digest(each) for each in choices}) == len(choices)
+    assert ZeroEffort() == ZeroEffort() != HoldEffort() != ()
