@@ -49,8 +49,8 @@ def _digest(value: Any, where: str) -> bytes:
         return _of_bytes("bytes", value)
     if isinstance(value, np.ndarray | np.generic):
         return _of_array(value, where)
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return _of_fields(kind, value._asdict(), where)
+    if isinstance(value, tuple) and (names := getattr(kind, "_fields", None)) is not None:
+        return _of_fields(kind, dict(zip(names, value, strict=True)), where)
     if is_dataclass(value) and not isinstance(value, type):
         return _of_fields(kind, {each.name: getattr(value, each.name) for each in fields(value)}, where)
     if kind in (list, tuple):

@@ -71,9 +71,14 @@ SWEEPS = 2
 def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | PinocchioBatchDynamics:
     """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension was built."""
     moving = MovingJoints.of(robot, joints)
-    if native.batch_extension is not None and os.environ.get(native.SWITCH) != "0":
+    if is_native():
         return NativeBatchDynamics(robot, moving)
     return PinocchioBatchDynamics(robot, moving)
+
+
+def is_native() -> bool:
+    """Return whether the extension computes the dynamics; Pinocchio's differ in the last bits."""
+    return native.batch_extension is not None and os.environ.get(native.SWITCH) != "0"
 
 
 class MovingJoints(NamedTuple):

@@ -19,7 +19,6 @@ seed is given the costs in the history, and continues as if it had never stopped
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 import warnings
 from collections.abc import Callable
@@ -30,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.files import write_atomically
 from batchpid.validate import integer, number
 from batchpid.versions import package_versions
 from sim.cluster import Ray
@@ -44,6 +43,7 @@ from sim.runner import Runner
 from sim.tuning.candidates import HEADROOM, Candidates
 from sim.tuning.evaluation import SUBSTEPS
 from sim.tuning.first_candidates import first_gains, loop_delay
+from sim.tuning.history import HistoryFile
 from sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from sim.tuning.randomization import reseeded
 from sim.tuning.weights import Weights
@@ -156,22 +156,24 @@ def tune(
     # One iteration is enough where the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
     settings: dict[str, Any] = {
-        "robot": robot.name,
+        **robot.about(),
         "seed": seed,
         "population": population,
-        "actuators": None if robot.actuators is None else str(robot.actuators),
+        "actuators": None if robot.actuators is None else digest(robot.actuators),
         "gain_units": gain_units,
         "per_joint": per_joint,
         "moves": list(moves.names),
+        "moves_digest": digest(moves),
         "seconds": seconds,
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
         "randomization": None if randomization is None else randomization.to_dict(),
-        **{name: str(value) for name, value in runner_options.items()},
+        **{name: _plain(name, value, history is not None) for name, value in runner_options.items()},
         "search_physics": SEARCH_PHYSICS if is_free else None,
         "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
     }
-    record = _History(history, settings)
+    record = HistoryFile(history, "search", settings)
+    known = _known_costs(record, population)
     search = Candidates(
         robot, gain_units, per_joint, moves, seconds, weights, headroom=1.0 if is_varied else HEADROOM, varied=is_varied
     )
@@ -198,13 +200,14 @@ def tune(
             points += [optimizer.ask() for _ in range(population)]
             if generation == 0:
                 points[: len(firsts)] = firsts
-            if generation == len(record.costs):
-                record.append(search.costs(runner, np.array(points[-population:])))
+            if generation == len(known):
+                known.append(search.costs(runner, np.array(points[-population:])))
+                record.write(known)
             if generation == 0 and is_varied:
-                optimizer = optimizer_at(points[int(np.argmin(record.costs[0]))])
+                optimizer = optimizer_at(points[int(np.argmin(known[0]))])
             else:
-                optimizer.tell(list(zip(points[-population:], record.costs[generation], strict=True)))
-            costs = record.costs[: generation + 1]
+                optimizer.tell(list(zip(points[-population:], known[generation], strict=True)))
+            costs = known[: generation + 1]
             if hasattr(bar, "set_postfix"):
                 bar.set_postfix(cost=f"{np.min(costs):.4f}", designed=f"{costs[0][0]:.4f}")
             if time_limit is not None and time.monotonic() - began > time_limit:
@@ -228,31 +231,25 @@ def tune(
     )
 
 
-class _History:
-    """Costs of the generations of a search, kept in a file unless ``path`` is None; read from it if it exists."""
+def _plain(name: str, value: Any, resumes: bool) -> Any:
+    """Return an option of the runner as a plain value: itself, or its digest."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if not callable(value):
+        return digest(value)
+    if resumes:
+        problem = f"cannot tell whether {name} is the same function when the search resumes"
+        raise InvalidArgumentError("history", problem, remedy="leave history out")
+    return getattr(value, "__qualname__", type(value).__qualname__)
 
-    def __init__(self, path: Path | str | None, settings: dict[str, Any]) -> None:
-        self.costs: list[tuple[float, ...]] = []
-        self._path, self._settings = path, settings
-        if path is None or not Path(path).exists():
-            return
-        try:
-            document = json.loads(Path(path).read_text())
-            self.costs = [tuple(map(float, row)) for row in document["costs"]]
-            ours, theirs = json.loads(json.dumps(settings)), document["settings"]
-            different = sorted(key for key in {*ours, *theirs} if ours.get(key) != theirs.get(key))
-            if any(len(row) != settings["population"] for row in self.costs):
-                different.append("costs")
-            problem = f"is of another search ({', '.join(different)} differ)" if different else None
-        except (ValueError, KeyError, TypeError) as error:
-            problem = f"is no history of a search: {error}"
-        if problem is not None:
-            raise InvalidArgumentError(
-                "history", problem, value=str(path), remedy="use the same options, remove it, or name another file"
-            )
 
-    def append(self, costs: tuple[float, ...]) -> None:
-        """Append those of a generation, and write the file."""
-        self.costs.append(costs)
-        if self._path is not None:
-            write_atomically(self._path, json.dumps({"settings": self._settings, "costs": self.costs}))
+def _known_costs(record: HistoryFile, population: int) -> list[tuple[float, ...]]:
+    """Return the costs of the generations in a history."""
+    rows = record.read() or []
+    try:
+        costs = [tuple(float(cost) for cost in row) for row in rows]
+    except (ValueError, TypeError, OverflowError) as error:
+        raise record.damaged(str(error)) from None
+    if any(len(row) != population or np.isnan(row).any() for row in costs):
+        raise record.damaged(f"its generations do not have {population} costs each")
+    return costs

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.errors import InvalidArgumentError
-from batchpid.files import write_atomically
+from sim.tuning.history import HistoryFile
 from sim.tuning.identification.fit import Step
 
 
@@ -23,40 +22,41 @@ class State(NamedTuple):
 
 
 class History:
-    """State of a fit before each step, kept in a file unless ``path`` is None; read from it if it exists."""
+    """State of a fit before each step, kept in a file unless ``path`` is None.
 
-    def __init__(self, path: Path | str | None, settings: dict[str, Any]) -> None:
-        self.state: State | None = None
-        self._path, self._settings = path, json.loads(json.dumps(settings))
-        if path is None or not Path(path).exists():
-            return
+    Raises
+    ------
+    InvalidArgumentError
+        The file exists, and is damaged or of other settings.
+    """
+
+    def __init__(self, path: Path | str | None, settings: Mapping[str, Any]) -> None:
+        self._file = HistoryFile(path, "fit", settings)
+        self._found = self._file.read()
+
+    def state(self, unknowns: int, evaluations: int, problems: int) -> State | None:
+        """Return the state in the file, of a fit of so many of each; None if there was no file.
+
+        Raises InvalidArgumentError if no such fit can have it.
+        """
+        if (found := self._found) is None:
+            return None
         try:
-            document = json.loads(Path(path).read_text())
-            theirs = document["settings"]
-            theta, last = (np.array(document[name], float) for name in ("theta", "last"))
-            cost = np.inf if document["cost"] is None else float(document["cost"])
-            self.state = State(
-                Step(theta, int(document["left"]), last, cost),
-                tuple((int(number), theta) for number, theta in document["done"]),
-            )
-            different = sorted(k for k in {*theirs, *self._settings} if theirs.get(k) != self._settings.get(k))
-            problem = f"is of another fit ({', '.join(different)} differ)" if different else None
-        except (ValueError, KeyError, TypeError) as error:
-            problem = f"is no history of a fit: {error}"
-        if problem is not None:
-            remedy = "use the same options, remove it, or name another file"
-            raise InvalidArgumentError("history", problem, value=str(path), remedy=remedy)
+            theta, last = (np.array(found[name], float) for name in ("theta", "last"))
+            done = tuple((int(number), [float(value) for value in point]) for number, point in found["done"])
+            state = State(Step(theta, int(found["left"]), last, float(found["cost"])), done)
+        except (ValueError, LookupError, TypeError, OverflowError) as error:
+            raise self._file.damaged(str(error)) from None
+        points = [theta, last, *(np.array(point) for _, point in done)]
+        if not all(point.shape == (unknowns,) and np.isfinite(point).all() for point in points):
+            raise self._file.damaged(f"its points are not {unknowns} finite numbers")
+        if not 0 <= state.step.left <= evaluations or not all(0 <= number < problems for number, _ in done):
+            raise self._file.damaged("its counts are out of range")
+        return state
 
     def write(self, state: State) -> None:
         """Write the file."""
-        if self._path is not None:
-            theta, left, last, cost = state.step
-            document = {
-                "settings": self._settings,
-                "theta": theta.tolist(),
-                "left": left,
-                "last": last.tolist(),
-                "cost": cost if np.isfinite(cost) else None,
-                "done": state.done,
-            }
-            write_atomically(self._path, json.dumps(document))
+        theta, left, last, cost = state.step
+        self._file.write(
+            {"theta": theta.tolist(), "left": left, "last": last.tolist(), "cost": cost, "done": state.done}
+        )

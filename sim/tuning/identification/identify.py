@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -19,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.validate import choice, flag, instance, integer, number
 from batchpid.versions import package_versions
+from sim.engine.batch_dynamics import is_native
 from sim.options import Compensation
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
@@ -32,7 +32,7 @@ from sim.tuning.identification.plant import Motors, Plant
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import Motion, best_drive, smooth
 from sim.tuning.identification.result import Fit, Identification
-from sim.tuning.identification.search import Progress, search
+from sim.tuning.identification.search import NEIGHBOUR_EVALUATIONS, Progress, search
 from sim.tuning.identification.start import begin
 from sim.tuning.identification.statistics import uncertainty
 from sim.tuning.identification.unknowns import Unknowns
@@ -119,34 +119,34 @@ def identify(
     if params is not None:
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
-    drive = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
-    motions = [smooth(log, timestep) for log in found]
-    drive, regression = best_drive(robot, joints, drive, found, motions, payload)
-    unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
     settings = {
-        "robot": robot.name,
+        **robot.about(),
         "logs": [log.source for log in found],
+        "data": digest([replace(log, source="") for log in found]),
         "command": kind,
+        "params": None if params is None else digest(params),
         "compensate": compensate,
         "timestep": control,
         "sim_steps": sim_steps,
         "payload": payload,
         "evaluations": evaluations,
         "seed": seed,
-        "data": hashlib.sha256(
-            pickle.dumps([(m.command, log.qpos) for m, log in zip(motions, found, strict=True)])
-        ).hexdigest(),
+        "native": is_native(),
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)
+    drive = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
+    motions = [smooth(log, timestep) for log in found]
+    drive, regression = best_drive(robot, joints, drive, found, motions, payload)
+    unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
+    variants = _variants(drive, motions)
+    known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(variants))
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = ProcessPoolExecutor(processes, mp_context=get_context("spawn")) if processes > 1 else nullcontext()
     with pool as executor:
-        problems = [
-            Problem(robot, joints, each, found, motions, unknowns, executor) for each in _variants(drive, motions)
-        ]
+        problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in variants]
         ideal = _ideal(robot, joints)
-        state = record.state or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
+        state = known or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
         bar = Progress(len(problems), evaluations, progress)
         problem, best = search(problems, state, evaluations, record, bar)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]

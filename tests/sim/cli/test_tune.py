@@ -52,7 +52,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
     assert status == 130
     assert "interrupted" in complaint
     history = out.with_suffix(".search.json")
-    costs = json.loads(history.read_text())["costs"]
+    costs = json.loads(history.read_text())["state"]
     status, _, complaint = batchpid("tune", "panda", *SHORT, "--seed", 1, "--resume", "--out", out)
     assert status == 2
     assert "another search" in complaint

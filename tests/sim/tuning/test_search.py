@@ -11,8 +11,9 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from sim import Randomization, Runner, Uniform
+from sim import Physics, Randomization, Robot, Runner, Uniform
 from sim.cli.run import evaluate_sets
+from sim.robot.self_collision import Srdf
 from sim.tuning.evaluation import arm_joints
 from sim.tuning.first_candidates import first_gains
 from sim.tuning.gain_sets import GainSet
@@ -65,7 +66,7 @@ def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
     whole = tune(panda, generations=3, **options)
     history = tmp_path / "search.json"
     tune(panda, generations=2, history=history, **options)
-    assert len(json.loads(history.read_text())["costs"]) == 2
+    assert len(json.loads(history.read_text())["state"]) == 2
     resumed = tune(panda, generations=3, history=history, **options)
     assert resumed.history == whole.history
     assert resumed.params.kp.tobytes() == whole.params.kp.tobytes()
@@ -74,6 +75,36 @@ def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
     history.write_text("{}")
     with pytest.raises(InvalidArgumentError, match="no history"):
         tune(panda, generations=3, history=history, **options)
+
+
+def test_a_history_of_other_inputs_is_refused_by_their_names(panda, tmp_path):
+    moves, history = random_moves(panda, 1, 0), tmp_path / "search.json"
+    actuators = make_actuators(panda.dof, strength=np.linspace(0.9, 1.1, panda.dof))
+    options = {"moves": moves, "workers": 0, **SMALL, "generations": 1, "history": history}
+    options |= {"actuators": actuators, "physics": Physics("PGS", 3)}
+    tune(panda, **options)
+
+    def refused(names: str, robot: Robot = panda, **changed) -> None:
+        with pytest.raises(InvalidArgumentError, match=rf"another search \({names} differ\)"):
+            tune(robot, **{**options, **changed})
+
+    permuted = actuators._replace(strength=actuators.strength[:, ::-1])
+    assert repr(permuted) == repr(actuators)
+    refused("actuators", actuators=permuted)
+    refused("actuators", dataclasses.replace(panda, actuators=permuted), actuators=None)
+    refused("moves_digest", moves=moves._replace(target=moves.target + 1e-9))
+    heavier = panda.urdf.replace('mass value="', 'mass value="1')
+    refused("urdf", dataclasses.replace(panda, urdf=heavier))
+    refused("srdf", dataclasses.replace(panda, srdf=Srdf(enabled=frozenset([frozenset(["panda_link1"])]))))
+    refused("dissipation", dataclasses.replace(panda, dissipation="sapien"))
+    refused("physics", physics=Physics("PGS", 4))
+    refused("timestep", timestep=1 / 1000)
+    refused("speed_limit", speed_limit=np.full(panda.dof, 9.0))
+    refused("weights", weights=Weights(itae=2.0))
+    refused("seconds", seconds=0.25)
+    refused("randomization", randomization=Randomization(payload=Uniform(0, 1)))
+    with pytest.raises(InvalidArgumentError, match="whether build is the same"):
+        tune(panda, **options, build=lambda scene, env: None)
 
 
 def test_the_result_is_the_best_of_the_final_not_of_the_search(panda, monkeypatch):

@@ -1,6 +1,7 @@
 import json
 import os
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -229,9 +230,46 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
         resumed = identify(arm, log, **options, history=history)
         assert np.array_equal(resumed.estimate, whole.estimate)
         assert np.array_equal(resumed.uncertainty.deviation, whole.uncertainty.deviation)
-    assert json.loads(history.read_text())["done"]
+    assert json.loads(history.read_text())["state"]["done"]
     with pytest.raises(bp.InvalidArgumentError, match=r"another fit \(seed differ\)"):
         identify(arm, log, **options, seed=1, history=history)
+
+
+def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path):
+    _, setpoints, _ = runs
+    time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
+    gains, history = arm.designed("effort"), tmp_path / "fit.json"
+
+    def stop(steps):
+        raise KeyboardInterrupt
+        yield from steps
+
+    def resume(robot: Robot = arm, log: Log = log, **options) -> None:
+        fixed = {"params": gains, "workers": 0, "payload": False, "evaluations": 1, "history": history}
+        identify(robot, log, **{**fixed, **options}, progress=stop)
+
+    with pytest.raises(KeyboardInterrupt):
+        resume()
+
+    def refused(names: str, *robot: Robot, **options) -> None:
+        with pytest.raises(bp.InvalidArgumentError, match=rf"another fit \({names} differ\)"):
+            resume(*robot, **options)
+
+    refused("params", params=gains.replace(kp=gains.kp[:, ::-1]))  # their repr is the same
+    path = tmp_path / "arm.urdf"
+    for word, other, name in (('mass value="1"', 'mass value="1.5"', "urdf"), ("arm2", "arm", "robot, urdf")):
+        path.write_text(ARM.replace(word, other))
+        refused(name, Robot.load(path))
+    path.write_text(ARM)
+    with pytest.raises(KeyboardInterrupt):
+        resume(Robot.load(path))  # the same content under another path
+    refused("merge_fixed", Robot.load(path, merge_fixed=False))
+    refused("data", log=replace(log, qpos=qpos + 1e-12))
+    refused("data", log=replace(log, time=time * (1 + 1e-12)))
+    refused("data", log=replace(log, held=True))
+    refused("compensate", compensate="gravity")
+    refused("evaluations", evaluations=2)
 
 
 @pytest.mark.slow

@@ -1,0 +1,63 @@
+"""File from which a search or a fit resumes: its state, the inputs that it depends on, and a digest of both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from batchpid.digest import digest
+from batchpid.errors import InvalidArgumentError
+from batchpid.files import write_atomically
+from batchpid.validate import file_path
+
+
+class HistoryFile:
+    """File with the state of a ``kind`` of work, "search" or "fit", that depends on ``settings``, plain values.
+
+    Nothing is kept if ``path`` is None.
+    """
+
+    def __init__(self, path: Path | str | None, kind: str, settings: Mapping[str, Any]) -> None:
+        self._path, self._kind = None if path is None else file_path("history", path), kind
+        self._settings = json.loads(json.dumps(dict(settings)))
+
+    def read(self) -> Any:
+        """Return the state in the file, None if there is no file.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The file is damaged, or it is of other settings, which the message names.
+        """
+        if self._path is None or not self._path.exists():
+            return None
+        try:
+            document = json.loads(self._path.read_bytes())
+            theirs, state = document["settings"], document["state"]
+            if document["digest"] != digest(theirs, state):
+                raise ValueError("it was damaged or edited")
+            ours = self._settings
+            different = {*theirs} ^ {*ours} | {key for key in {*theirs} & {*ours} if theirs[key] != ours[key]}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+            reason = error if isinstance(error, OSError | ValueError) else type(error).__name__
+            raise self.damaged(str(reason)) from None
+        if different:
+            raise self._error(f"is of another {self._kind} ({', '.join(sorted(different))} differ)")
+        return state
+
+    def write(self, state: Any) -> None:
+        """Write the file with a ``state`` of plain values."""
+        if self._path is not None:
+            state = json.loads(json.dumps(state))
+            document = {"settings": self._settings, "state": state, "digest": digest(self._settings, state)}
+            write_atomically(self._path, json.dumps(document))
+
+    def damaged(self, problem: str) -> InvalidArgumentError:
+        """Return the error of a state that no work of these settings can have."""
+        return self._error(f"is no history of a {self._kind}: {problem}")
+
+    def _error(self, problem: str) -> InvalidArgumentError:
+        remedy = "use the same inputs, remove it, or name another file"
+        return InvalidArgumentError("history", problem, value=str(self._path), remedy=remedy)
