@@ -27,6 +27,8 @@ MEMORY = 1 << 30
 BLOCK = 1 << 23
 NOT_WRITTEN = -1
 """Checksum of a row that is not written yet."""
+LOG_QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
+"""Quantities of the columns of a log, QUANTITY:JOINT."""
 READ_ATTEMPTS = 24
 """Attempts at metadata that a writer is changing. HDF5 makes 100 and doubles its pause, from 1 ns, after each."""
 
@@ -36,9 +38,10 @@ def read_hdf5(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the datasets ``names`` of a file, where it has them, and its attributes.
 
-    Without ``names`` those of a log: "time", and all with a colon in their name.
+    Without ``names`` those of a log: "time", and the columns of :data:`LOG_QUANTITIES`.
 
-    Every n-th of the rows before the first one whose "checksum" is not written yet, or in older files its "time".
+    Every n-th of the rows before the first one whose "checksum" is not written yet, or in older files its "time"; of a
+    log every n-th of all.
 
     Raises
     ------
@@ -89,12 +92,14 @@ def _main() -> None:
     datasets: dict[str, h5py.Dataset] = {}
     try:
         file = _open(path)
-        if names is None:
-            names = [name for name in file if name == "time" or ":" in name]
+        is_log = names is None
+        if is_log:
+            columns = [name for name in file if ":" in name and name.partition(":")[0].strip() in LOG_QUANTITIES]
+            names = [*(name for name in file if name.strip() == "time"), *columns]
         datasets = {name: _open_dataset(file, name) for name in names if file.id.links.exists(name.encode())}
         if (total := sum(dataset.nbytes for dataset in datasets.values())) > max_bytes:
             raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")
-        count = _count_rows(datasets)
+        count = max(map(len, datasets.values()), default=0) if is_log else _count_rows(datasets)
         sliced = {name: slice(0, min(count, len(dataset)), every) for name, dataset in datasets.items()}
         shapes = {name: (len(range(len(d))[sliced[name]]), *d.shape[1:]) for name, d in datasets.items()}
         attributes = {name: np.asarray(value) for name, value in file.attrs.items()}

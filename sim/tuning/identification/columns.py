@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from sim.recording.files import RecordingError, load_h5py
+from sim.recording.hdf5 import LOG_QUANTITIES as QUANTITIES
 from sim.recording.hdf5 import read_hdf5
 
 Float64 = NDArray[np.float64]
-QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
 MAX_BYTES = 1 << 30
 """Most that the columns of an HDF5 file may take."""
 
@@ -80,6 +80,14 @@ def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
         arrays, _ = read_hdf5(path, None, 1, MAX_BYTES)
     except (OSError, ValueError) as bad:
         raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
-    if not any(name.startswith("qpos:") for name in arrays):
+    if not any(name.partition(":")[0].strip() == "qpos" for name in arrays):
         return None
-    return {name: array.astype(np.float64).reshape(-1) for name, array in arrays.items()}
+    columns = {}
+    for name, array in arrays.items():
+        if name.strip() in columns:
+            raise error(str(path), f"has the column {name.strip()!r} twice, but for blanks", "keep one of them")
+        if array.ndim > 1 or not len(array):
+            problem = f"has {name!r} of shape {array.shape}, which is no column"
+            raise error(str(path), problem, "give each dataset one number per row")
+        columns[name.strip()] = array.astype(np.float64)
+    return columns

@@ -27,7 +27,7 @@ from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.fit import Step
 from sim.tuning.identification.history import History, State
-from sim.tuning.identification.logs import Log, LogWarning, at_limits, read_logs
+from sim.tuning.identification.logs import Log, LogWarning, at_limits, checked, read_logs
 from sim.tuning.identification.plant import Motors, Plant
 from sim.tuning.identification.problem import Problem
 from sim.tuning.identification.regression import Motion, best_drive, smooth
@@ -183,7 +183,7 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
     found = [
         log
         for each in given
-        for log in ([each] if isinstance(each, Log) else read_logs(robot, [each], kind, hold=hold))
+        for log in (checked(robot, each) if isinstance(each, Log) else read_logs(robot, [each], kind, hold=hold))
     ]
     if not found:
         raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")

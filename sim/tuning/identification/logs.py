@@ -8,6 +8,9 @@ An HDF5 file has one dataset per column, of the same names. In a row stand the p
 command computed from it, which acts from then on. Columns may have any order, joints may be missing, and times need not
 be equidistant. Columns of other quantities are ignored.
 
+Where the times have a gap, such as between two recordings, each stretch without gap is a log
+(:mod:`sim.tuning.identification.gaps`).
+
 In a recording (:func:`sim.write_recording`) the command of a row acted in the tick that ends at its time, and each env
 is a log.
 """
@@ -16,9 +19,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,62 +31,23 @@ from sim.observation import Rollout
 from sim.recording.files import HDF5, read_recording
 from sim.robot.robot import Robot
 from sim.tuning.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
+from sim.tuning.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
+from sim.tuning.identification.log import CommandKind, Log, LogWarning
 
 Float64 = NDArray[np.float64]
-CommandKind = Literal["setpoint", "effort"]
+__all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs", "setpoint_csv"]
+
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
-MIN_ROWS, MIN_SECONDS = 50, 0.2
-"""Least number of rows and length [s] of a log."""
 AT_LIMIT = 1e-3
 """Distance to a joint limit at which a joint counts as stopped by it, over its range."""
 BEYOND = {"rad": 0.3, "m": 0.05}
 """Distance beyond a joint limit at which a position counts as given in another unit."""
 
 
-class LogWarning(UserWarning):
-    """A log holds what the model of the robot does not."""
-
-
-@dataclass(frozen=True, eq=False)
-class Log:
-    """Commands and measured positions of some joints of one robot."""
-
-    source: str
-    """File that it is from, and the env of a recording."""
-    joints: tuple[int, ...]
-    """Numbers of the joints that it holds, in the robot's order; followers are left out."""
-    kind: CommandKind
-    time: Float64
-    """Times of the measurements (rows,) [s], increasing."""
-    qpos: Float64
-    """Measured positions (rows, joints) [rad or m]."""
-    command_time: Float64
-    """Times from which the commands act (commands,) [s]."""
-    command: Float64
-    """Setpoints [rad or m] or efforts [N m or N] (commands, joints)."""
-    held: bool
-    """True if a command holds until the next one; False to interpolate between them."""
-    qvel: Float64 | None = None
-    """Measured velocities (rows, joints), if there are any."""
-
-    @property
-    def seconds(self) -> float:
-        """Length [s]."""
-        return float(self.time[-1] - self.time[0])
-
-    def commands_at(self, time: Float64) -> Float64:
-        """Return the commands that act at ``time`` (n,), as (n, joints); before the first one that is the first."""
-        if self.held:
-            index = np.searchsorted(self.command_time, time + 1e-9, side="right") - 1
-            return self.command[np.clip(index, 0, len(self.command) - 1)]
-        columns = [np.interp(time, self.command_time, column) for column in self.command.T]
-        return np.stack(columns, axis=1)
-
-
 def read_logs(
     robot: Robot, paths: Iterable[str | os.PathLike[str]], kind: CommandKind | None = None, *, hold: bool = False
 ) -> list[Log]:
-    """Return the logs in files.
+    """Return the logs in files, one for each stretch without gaps in time.
 
     Parameters
     ----------
@@ -121,11 +83,11 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool) -> lis
         raise FileNotFoundError(2, "there is no such file", str(path))
     if path.suffix.lower() in (".csv", ".txt"):
         columns, lines = read_csv(path)
-        return [_build(robot, str(path), columns, lines, kind, hold)]
+        return _build(robot, str(path), columns, lines, kind, hold)
     if path.suffix.lower() in HDF5:
         found = read_hdf5_columns(path)
         if found is not None:
-            return [_build(robot, str(path), found, None, kind, hold)]
+            return _build(robot, str(path), found, None, kind, hold)
     return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
 
 
@@ -156,7 +118,7 @@ def logs_of_rollout(
         }
         name = source if rollout.num_envs == 1 else f"{source}, env {env}"
         log = Log(name, joints, found, rollout.time, tables["qpos"], begin, tables["setpoint"], True, tables["qvel"])
-        logs.append(_checked(robot, log, None))
+        logs += checked(robot, log)
     return logs
 
 
@@ -167,17 +129,20 @@ def _build(
     lines: list[int] | None,
     kind: CommandKind | None,
     hold: bool,
-) -> Log:
-    """Return the log that the columns of a file hold."""
+) -> list[Log]:
+    """Return the logs that the columns of a file hold."""
     if "time" not in columns:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         raise error(source, problem, "begin the header with time, in seconds")
     by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
     for name, values in columns.items():
         quantity, colon, joint = name.partition(":")
-        if colon and quantity.strip() in by:
-            choice(f"{source}: column {name!r}: joint", joint.strip(), robot.joint_names)
-            by[quantity.strip()][joint.strip()] = values
+        quantity, joint = quantity.strip(), joint.strip()
+        if colon and quantity in by:
+            choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
+            if joint in by[quantity]:
+                raise error(source, f"has the column '{quantity}:{joint}' twice, but for blanks", "keep one of them")
+            by[quantity][joint] = values
     if not by["qpos"]:
         raise error(
             source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
@@ -197,19 +162,22 @@ def _build(
     names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free and name in names]
     if not names:
         raise error(source, "holds followers alone, which their leaders move", "give the columns of the leaders")
-    if len({len(columns["time"]), *(len(by[q][n]) for q in ("qpos", found) for n in names)}) > 1:
+    read = [values for q in ("qpos", "qvel", found) for name, values in by[q].items() if name in names]
+    if len({len(columns["time"]), *map(len, read)}) > 1:
         raise error(source, "has columns of different lengths", "give one value per row in each")
     tables = {q: np.stack([by[q][n] for n in names], axis=1) for q in ("qpos", found)}
-    whole = all(n in by["qvel"] and len(by["qvel"][n]) == len(columns["time"]) for n in names)
-    qvel = np.stack([by["qvel"][n] for n in names], axis=1) if whole else None
+    qvel = np.stack([by["qvel"][n] for n in names], axis=1) if by["qvel"].keys() >= {*names} else None
     joints = tuple(robot.joint_names.index(name) for name in names)
     time = columns["time"]
     log = Log(source, joints, found, time, tables["qpos"], time, tables[found], hold, qvel)
-    return _checked(robot, log, lines)
+    return checked(robot, log, lines)
 
 
-def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
-    """Return ``log`` if its times increase and its values are finite and in SI units."""
+def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[Log]:
+    """Return the stretches of ``log``, if its times increase and its values are finite and in SI units.
+
+    ``lines`` are the numbers of its rows in a file.
+    """
 
     def row(index: int) -> str:
         return f"row {index + 1}" if lines is None else f"line {lines[index]}"
@@ -223,13 +191,15 @@ def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
     if not np.isfinite(log.time).all():
         index = int(np.argmin(np.isfinite(log.time)))
         raise error(log.source, f"{row(index)}, column 'time' is empty or not finite", "remove the row")
-    if (np.diff(log.time) <= 0).any():
-        index = int(np.argmax(np.diff(log.time) <= 0)) + 1
+    if (log.time[1:] <= log.time[:-1]).any():
+        index = int(np.argmax(log.time[1:] <= log.time[:-1])) + 1
         raise error(log.source, f"{row(index)}: time does not increase", "sort the rows, and give each time once")
     if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
         problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
         raise error(log.source, problem, f"record {MIN_ROWS} rows and {MIN_SECONDS} s at least; time is in seconds")
-    if (period := float(np.median(np.diff(log.time)))) > 0.05:
+    with np.errstate(over="ignore"):
+        period = float(np.median(np.diff(log.time)))
+    if period > 0.05:
         remedy = "record at 100 Hz or more; time is in seconds"
         raise error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
     reach = np.array([BEYOND[robot.units[joint]] for joint in log.joints])
@@ -241,7 +211,7 @@ def _checked(robot: Robot, log: Log, lines: Sequence[int] | None) -> Log:
         problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
         remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
         raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
-    return log
+    return divided(log, row)
 
 
 def at_limits(robot: Robot, log: Log) -> list[str]:

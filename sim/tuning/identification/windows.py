@@ -22,6 +22,8 @@ SETTLE = 0.3
 """Time after the start of a log under the PID law in which the initial state is forgotten [s]: it is not fitted."""
 START, RESTS = 0.03, 0.05
 """Length of the part of a log that gives its initial state [s]; initial speed by prior, over its root mean square."""
+MOVES = 4.0
+"""Initial speed, over its standard deviation and that by prior, beyond which the robot does not rest at first."""
 HELD_OUT = 0.25
 """Share of each log, at its end, that is kept to judge."""
 
@@ -153,7 +155,7 @@ def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
     """Return position, velocity and its standard deviation (joints,) at the start of a log.
 
     The filter of ``motion`` is not to be trusted there: a parabola through the first rows is, with the prior that the
-    robot rests.
+    robot rests. A joint that moves too fast for that has no prior, as where a gap in time ended amid a motion.
     """
     time = log.time - log.time[0]
     count = max(4, int((time <= START).sum()))
@@ -162,9 +164,13 @@ def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
     rest = np.maximum(RESTS * np.sqrt((motion.qvel**2).mean(0)), 1e-9)
     noise = np.maximum(motion.sensor.size, 1e-9)
     found = []
-    for qpos, weight in zip(log.qpos[:count].T, (noise / (rest * end)) ** 2, strict=True):
-        inverse = np.linalg.inv(columns.T @ columns + np.diag([0.0, weight, 0.0]))
-        found.append([*(inverse @ columns.T @ (qpos - qpos[0]))[:2], np.sqrt(inverse[1, 1])])
+    for qpos, size, speed in zip(log.qpos[:count].T, noise, rest * end, strict=True):
+        for weight in (0.0, (size / speed) ** 2):
+            inverse = np.linalg.inv(columns.T @ columns + np.diag([0.0, weight, 0.0]))
+            position, velocity = (inverse @ columns.T @ (qpos - qpos[0]))[:2]
+            if velocity**2 > MOVES**2 * (size**2 * inverse[1, 1] + speed**2):
+                break
+        found.append([position, velocity, np.sqrt(inverse[1, 1])])
     position, velocity, deviation = np.array(found).T
     return log.qpos[0] + position, velocity / end, np.maximum(deviation * noise / end, 0.1 * rest)
 

@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import batchpid as bp
 from sim import Robot, Runner, write_recording
 from sim.tuning import identify
+from sim.tuning.identification.gaps import divided
 from sim.tuning.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
 
 ROWS = 60
@@ -176,3 +179,136 @@ def test_a_joint_at_its_limit_is_told(panda):
     assert line.startswith("free.csv: joint 'panda_joint4' is at its limit in 0.25 of the rows")
     with pytest.warns(LogWarning, match="'panda_joint4' is at its limit"):
         identify(panda, free, params=panda.designed("effort"), evaluations=1, workers=0, payload=False)
+
+
+def stretched(columns: dict, shifts: dict[int, float]) -> dict:
+    """Return columns whose times are later from some rows on."""
+    time = columns["time"].copy()
+    for row, shift in shifts.items():
+        time[row:] += shift
+    return {**columns, "time": time}
+
+
+@pytest.fixture
+def many(columns) -> dict:
+    rows = 300
+    time = np.arange(rows) / 200
+    return {name: time if name == "time" else 1.0 + 0.1 * np.sin(3 * time) for name in columns}
+
+
+def test_stretches_between_gaps_are_logs_of_their_own(panda, tmp_path, many):
+    (tmp_path / "log.csv").write_text(text(stretched(many, {100: 30.0, 200: 0.2})))
+    logs = read_logs(panda, [tmp_path / "log.csv"])
+    assert [len(log.time) for log in logs] == [100, 100, 100]
+    assert max(log.seconds for log in logs) < 0.5
+    for number, log in enumerate(logs):
+        own = slice(100 * number, 100 * (number + 1))
+        assert np.array_equal(log.qpos[:, 0], many["qpos:panda_joint2"][own])
+        assert np.array_equal(log.command[:, 0], many["setpoint:panda_joint2"][own])
+        assert np.array_equal(log.command_time, log.time)
+    assert logs[1].source.endswith("log.csv, line 102 to line 201")
+    (whole,) = read_logs(panda, [_written(tmp_path / "even.csv", stretched(many, {100: 0.09}))])
+    assert len(whole.time) == 300
+
+
+def _written(path, columns: dict):
+    path.write_text(text(columns))
+    return path
+
+
+def test_commands_that_act_across_a_gap_are_kept():
+    time = np.r_[np.arange(100), np.arange(1000, 1100)] / 100
+    command_time = np.array([-1.0, 0.5, 3.0, 10.4])  # sparse
+    for held in (True, False):
+        log = Log("log", (0,), "setpoint", time, np.zeros((200, 1)), command_time, np.arange(4.0)[:, None], held)
+        parts = divided(log, str)
+        assert [part.source for part in parts] == ["log, 0 to 99", "log, 100 to 199"]
+        for part in parts:
+            assert np.array_equal(part.commands_at(part.time), log.commands_at(part.time))
+
+
+@pytest.mark.parametrize(
+    ("shifts", "message"),
+    [
+        (
+            {1: 1.7e9},
+            r"line 3: time jumps by 1.7e\+09 s, to 1700000000.0.*the 1 row before.*correct the times",
+        ),
+        ({299: 1.7e9}, r"line 301: time jumps by 1.7e\+09 s.*and the 1 row from there on"),
+        ({20: 60.0}, r"line 22: time jumps by 60.01 s.*and the 20 rows before span 0.095 s"),
+        ({row: 0.5 for row in range(40, 300, 40)}, r"gaps of more than 0.1 s in time, the first at line 42; all"),
+        ({100: 1e18}, r"line 103: time does not increase"),
+    ],
+)
+def test_a_time_span_that_the_rows_cannot_fill_is_refused(panda, tmp_path, many, shifts, message):
+    with pytest.raises(bp.InvalidArgumentError, match=message):
+        read(panda, tmp_path, text(stretched(many, shifts)))
+
+
+def test_short_stretches_between_dropouts_are_left_out_and_named(panda, tmp_path, many):
+    with pytest.warns(LogWarning, match=r"1 stretches.*left out: line 102 to line 111"):
+        log = read(panda, tmp_path, text(stretched(many, {100: 0.5, 110: 0.5})))
+    assert len(log.time) == 100
+
+
+def test_identify_divides_logs_that_are_given_as_such(panda, many):
+    time = stretched(many, {1: 1.7e9})["time"]
+    table = np.ones((300, 1))
+    log = Log("mine", (1,), "setpoint", time, table, time, table, False)
+    with pytest.raises(bp.InvalidArgumentError, match="mine: row 2: time jumps"):
+        identify(panda, log, params=panda.designed("effort"), workers=0)
+
+
+def test_columns_that_differ_by_blanks_are_one_twice(panda, tmp_path, columns):
+    for other in ("qpos: panda_joint2", "qpos :panda_joint2"):
+        doubled = {**columns, other: columns["qpos:panda_joint2"] + 1.0}
+        with pytest.raises(bp.InvalidArgumentError, match=r"column 'qpos:panda_joint2' twice"):
+            read(panda, tmp_path, text(doubled))
+
+
+def _edited(rows: np.ndarray, row: int, value: float) -> np.ndarray:
+    return np.where(np.arange(len(rows)) == row, value, rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("time", lambda rows: rows[:0], r"'time' of shape \(0,\)"),
+        ("qpos:panda_joint2", lambda rows: rows[:0], r"'qpos:panda_joint2' of shape \(0,\)"),
+        ("setpoint:panda_joint6", lambda rows: rows.reshape(-1, 2), r"'setpoint:panda_joint6' of shape \(30, 2\)"),
+        ("qpos:panda_joint6", lambda rows: np.stack([rows, rows], 1), r"'qpos:panda_joint6' of shape \(60, 2\)"),
+        ("qvel:panda_joint2", lambda rows: rows[:-3], "different lengths"),
+        (
+            "qpos:panda_joint2",
+            lambda rows: np.array([b"x"] * len(rows)),
+            "qpos:panda_joint2 is not an array",
+        ),
+        ("time", lambda rows: rows[0], "time is not an array of numbers"),
+        ("time", lambda rows: _edited(rows, 9, np.nan), "row 10, column 'time' is empty or not finite"),
+        (
+            "qpos:panda_joint2",
+            lambda rows: _edited(rows, 9, np.inf),
+            "row 10, column 'qpos:panda_joint2' is empty",
+        ),
+    ],
+)
+def test_datasets_that_are_no_columns_are_named(panda, tmp_path, columns, name, change, message):
+    h5py = pytest.importorskip("h5py")
+    columns = {**columns, "qvel:panda_joint2": columns["time"], "qvel:panda_joint6": columns["time"]}
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for each, rows in columns.items():
+            file[each] = change(rows) if each == name else rows
+        file["mode:gripper"] = np.array([b"idle"])  # another quantity does not matter
+    with pytest.raises(bp.BatchPIDError, match=message):
+        read_logs(panda, [tmp_path / "log.h5"])
+
+
+TABLE = st.text('time,qpos:setpanda_joint2 ;\t\n#0123456789.-+eEnaif"\r\x00é', max_size=400)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(TABLE, st.booleans())
+def test_whatever_a_file_holds_the_error_is_one_of_ours(panda, tmp_path, content, with_header):
+    head = "time,setpoint:panda_joint2,qpos:panda_joint2\n" if with_header else ""
+    with pytest.raises(bp.InvalidArgumentError):
+        read(panda, tmp_path, head + content)

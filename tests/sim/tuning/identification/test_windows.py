@@ -14,8 +14,10 @@ from tiny_urdf import joint, link, robot, write
 import batchpid as bp
 from sim import Robot
 from sim.tuning.identification.drive import Drive
+from sim.tuning.identification.logs import Log
 from sim.tuning.identification.plant import Motors, Segment
-from sim.tuning.identification.windows import Subject, plant_of
+from sim.tuning.identification.regression import smooth
+from sim.tuning.identification.windows import Subject, plant_of, whole
 
 GAINS = st.lists(st.integers(0, 3).map(float), min_size=2, max_size=2)
 DRIVES = st.fixed_dictionaries(
@@ -80,3 +82,14 @@ def test_threads_do_not_share_plants(arm):
     thread.start()
     thread.join()
     assert found[1] is not plant_of(subject) is plant_of(subject)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.5, 1.2])
+def test_a_stretch_begins_with_the_velocity_that_its_rows_show(phase):
+    """At rest as most logs do, or amid a motion, where a gap ended."""
+    time = np.arange(1000) / 1000
+    noise = 1e-5 * np.random.default_rng(0).standard_normal((1000, 1))
+    qpos = 0.5 * (1 - np.cos(3 * time + phase))[:, None]
+    log = Log("log", (0,), "setpoint", time, qpos + noise, time, qpos, False)
+    (window,) = whole(0, log, smooth(log, 1 / 1000), 1 / 1000)
+    assert window.segment.qvel[0] == pytest.approx(1.5 * np.sin(phase), abs=0.02)

@@ -1,0 +1,52 @@
+"""Log of a robot in motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+CommandKind = Literal["setpoint", "effort"]
+
+
+class LogWarning(UserWarning):
+    """A log holds what the model of the robot does not, or stretches that are too short."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Commands and measured positions of some joints of one robot."""
+
+    source: str
+    """File that it is from, and the env of a recording."""
+    joints: tuple[int, ...]
+    """Numbers of the joints that it holds, in the robot's order; followers are left out."""
+    kind: CommandKind
+    time: Float64
+    """Times of the measurements (rows,) [s], increasing."""
+    qpos: Float64
+    """Measured positions (rows, joints) [rad or m]."""
+    command_time: Float64
+    """Times from which the commands act (commands,) [s]."""
+    command: Float64
+    """Setpoints [rad or m] or efforts [N m or N] (commands, joints)."""
+    held: bool
+    """True if a command holds until the next one; False to interpolate between them."""
+    qvel: Float64 | None = None
+    """Measured velocities (rows, joints), if there are any."""
+
+    @property
+    def seconds(self) -> float:
+        """Length [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    def commands_at(self, time: Float64) -> Float64:
+        """Return the commands that act at ``time`` (n,), as (n, joints); before the first one that is the first."""
+        if self.held:
+            index = np.searchsorted(self.command_time, time + 1e-9, side="right") - 1
+            return self.command[np.clip(index, 0, len(self.command) - 1)]
+        columns = [np.interp(time, self.command_time, column) for column in self.command.T]
+        return np.stack(columns, axis=1)
