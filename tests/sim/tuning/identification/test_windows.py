@@ -88,8 +88,8 @@ def test_threads_do_not_share_plants(arm):
 def test_a_stretch_begins_with_the_velocity_that_its_rows_show(phase):
     """At rest as most logs do, or amid a motion, where a gap ended."""
     time = np.arange(1000) / 1000
-    noise = 1e-5 * np.random.default_rng(0).standard_normal((1000, 1))
+    noise = 5e-4 * np.random.default_rng(0).standard_normal((1000, 1))
     qpos = 0.5 * (1 - np.cos(3 * time + phase))[:, None]
     log = Log("log", (0,), "setpoint", time, qpos + noise, time, qpos, False)
     (window,) = whole(0, log, smooth(log, 1 / 1000), 1 / 1000)
-    assert window.segment.qvel[0] == pytest.approx(1.5 * np.sin(phase), abs=0.02)
+    assert window.segment.qvel[0] == pytest.approx(1.5 * np.sin(phase), abs=0.15)
