@@ -4,7 +4,8 @@
 
 It needs the package ``mujoco``. Joints have reflected inertia, viscous and Coulomb friction; of the effort that the PID
 law asks for, a share arrives, late. MuJoCo compensates gravity and Coriolis forces, as robots do that are commanded
-without them.
+without them. The true values are printed, and written beside the log as an actuators file, to compare with those that
+``identify`` finds.
 """
 
 from __future__ import annotations
@@ -148,6 +149,30 @@ def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, 
     np.savetxt(path, table, delimiter=",", header=",".join(names), comments="", fmt="%.10g")
 
 
+def as_actuators(robot: Robot, truth: Truth) -> bp.Actuators:
+    """Return the actuators that an identification should find: friction is that beyond the robot's description."""
+    return bp.make_actuators(
+        robot.dof,
+        command_delay=truth.delay,
+        strength=truth.strength,
+        bias=truth.bias,
+        coulomb=np.maximum(truth.friction - robot.friction, 0.0),
+        viscous=np.maximum(truth.damping - robot.damping, 0.0),
+        armature=truth.armature,
+        joint_names=robot.joint_names,
+    )
+
+
+def table(robot: Robot, truth: Truth) -> str:
+    """Return the true values in the form in which ``batchpid identify`` prints its estimates."""
+    kinds = ("armature", "damping", "friction", "strength", "bias")
+    width = max(map(len, robot.joint_names))
+    lines = [" ".join([f"{'truth, SI units':{width}}", *(f"{kind:>10}" for kind in kinds)])]
+    for joint, name in enumerate(robot.joint_names):
+        lines.append(" ".join([f"{name:{width}}", *(f"{getattr(truth, kind)[joint]:10.4g}" for kind in kinds)]))
+    return "\n".join([*lines, f"delay of the commands: {1e3 * truth.delay:.4g} ms"])
+
+
 def main() -> None:
     """Run the example."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -157,12 +182,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/log.csv"))
     options = parser.parse_args()
     robot = Robot.load(options.robot)
-    params = robot.designed("effort")
-    log = simulate(robot, plausible(robot, options.seed), excite(robot, options.seconds), params, seed=options.seed)
+    params, truth = robot.designed("effort"), plausible(robot, options.seed)
+    log = simulate(robot, truth, excite(robot, options.seconds), params, seed=options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    gains, actuators = (options.out.with_suffix(suffix) for suffix in (".params.yaml", ".truth.yaml"))
     write(robot, log, options.out)
-    bp.save_params(options.out.with_suffix(".params.yaml"), params, robot.joint_names)
-    print(f"written: {options.out}, {options.out.with_suffix('.params.yaml')}")
+    bp.save_params(gains, params, robot.joint_names)
+    bp.save_actuators(actuators, as_actuators(robot, truth), robot.joint_names, {"truth_of": options.out.name})
+    print(table(robot, truth))
+    print(f"\nwritten: {options.out}, {gains}, {actuators}")
+    print(f"next: batchpid identify {options.robot} {options.out} --params {gains}")
 
 
 if __name__ == "__main__":

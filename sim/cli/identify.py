@@ -12,7 +12,7 @@ import tyro
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
 from sim.cli import flags
-from sim.cli.progress import bar
+from sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
     from sim.tuning.identification.result import Identification
@@ -62,7 +62,6 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Run the command."""
-        import batchpid as bp
         from batchpid.files import write_atomically
         from sim import plots
         from sim.tuning.identification.identify import identify
@@ -91,11 +90,10 @@ class IdentifyCommand:
             seed=self.seed,
             workers=self.workers,
             history=history,
-            progress=bar("identifying", unit="evaluation"),
+            progress=bar("identifying", bar_format=AT_MOST),
         )
         print(report(found))
-        about = {"identified_from": found.settings["logs"], "held_out_error": found.document()["held_out_error"]}
-        bp.save_actuators(out, found.actuators(), robot.joint_names, about)
+        found.save(out)
         print(f"\nwritten: {out}")
         if details is not None:
             details.parent.mkdir(parents=True, exist_ok=True)
@@ -145,6 +143,30 @@ def report(found: Identification) -> str:
         text.append(f"the robot compensates {found.drive.compensate} {way}")
     before, after = found.held_out_error
     text.append(f"position error on the part that was kept: {before:.3g} as described, {after:.3g} as identified")
-    if missing := found.not_identified:
-        text.append(f"NOT IDENTIFIABLE from these logs: {', '.join(missing)}")
-    return "\n".join(text)
+    return "\n".join(text + _not_identified(found))
+
+
+def _not_identified(found: Identification) -> list[str]:
+    """Return lines for the unknowns that the logs do not identify, by joint, each with the remedy."""
+    from sim.tuning.identification.unknowns import PER_JOINT
+
+    of_joints, others = found.missing()
+    if not of_joints and not others:
+        return []
+    lines = ["NOT IDENTIFIABLE from these logs, and ideal in the actuators file:"]
+    if not found.uncertainty.identified.any():
+        remedy = "check --params, --timestep and --compensate, or give more --evaluations"
+        return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]
+    for joint, kinds in of_joints.items():
+        if {*kinds} == {*PER_JOINT}:
+            remedy = "it hardly moves; move it more (batchpid excite)"
+        elif "strength" in kinds:
+            remedy = "only ratios to the strength show; record without compensation, or with more load"
+        else:
+            remedy = "too small beside its other efforts; move it faster or longer"
+        lines.append(f"  {joint}: {', '.join(kinds)}: {remedy}")
+    if "delay" in others:
+        lines.append("  delay: log every control step, and move faster")
+    if "payload" in others:
+        lines.append("  payload: none shows; move the arm against gravity if it carries one")
+    return lines

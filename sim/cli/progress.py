@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}{postfix}"
+"""Format of a bar whose work mostly ends long before its last step, so that no remaining time can be told."""
 _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 
 

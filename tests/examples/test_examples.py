@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import batchpid as bp
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -131,8 +133,15 @@ def test_the_trained_policy_reaches_nine_goals_of_ten(run, seed):
 
 def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path):
     pytest.importorskip("mujoco")
-    run("mujoco_log.py", "panda", "--seconds", "1", "--out", str(tmp_path / "log.csv"))
+    said = run("mujoco_log.py", "panda", "--seconds", "1", "--out", str(tmp_path / "log.csv"))
     header = (tmp_path / "log.csv").read_text().partition("\n")[0].split(",")
     assert header[0] == "time"
     assert {name.partition(":")[0] for name in header[1:]} == {"setpoint", "qpos"}
     assert (tmp_path / "log.params.yaml").is_file()
+    truth, names = bp.load_actuators(tmp_path / "log.truth.yaml")
+    rows = {row.split()[0]: row.split()[1:] for row in said.splitlines() if row.startswith("panda_")}
+    assert list(rows) == names
+    for joint, row in enumerate(rows.values()):
+        written = (getattr(truth, kind)[0, joint] for kind in ("armature", "viscous", "coulomb", "strength", "bias"))
+        assert [float(value) for value in row] == pytest.approx([*written], rel=1e-3)
+    assert f"delay of the commands: {1e3 * truth.command_delay[0, 0]:.4g} ms" in said

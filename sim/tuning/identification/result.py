@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.validate import choice, integer
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.statistics import INTERVAL, Uncertainty
@@ -54,7 +57,22 @@ class Identification(NamedTuple):
     """Errors along each stretch of the logs that was simulated."""
 
     def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
-        """Return estimate, lower and upper end of the 95 % interval, None for what the logs do not identify."""
+        """Return estimate, lower and upper end of the 95 % interval, None for what the logs do not identify.
+
+        ``kind`` is "armature", "damping", "friction", "strength" or "bias" of a ``joint``, by its number among
+        :attr:`joints`; or "delay", "stopping" or "payload", without joint.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The logs do not hold that joint, or there is no such unknown.
+        """
+        kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
+        if (kind in PER_JOINT) != (joint is not None):
+            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind in PER_JOINT else "leave it out"
+            raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
+        if joint is not None:
+            joint = integer("joint", joint, 0, len(self.joints) - 1)
         index = self.unknowns.names.index((kind, joint))
         if not self.uncertainty.identified[index]:
             return None
@@ -65,11 +83,32 @@ class Identification(NamedTuple):
     @property
     def not_identified(self) -> list[str]:
         """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
-        names = []
+        of_joints, others = self.missing()
+        return [f"{joint}: {kind}" for joint, kinds in of_joints.items() for kind in kinds] + others
+
+    def missing(self) -> tuple[dict[str, list[str]], list[str]]:
+        """Return the kinds of unknowns that the logs do not identify, by joint, and the others: delay and payload."""
+        of_joints: dict[str, list[str]] = {}
+        others = []
         for (kind, joint), known in zip(self.unknowns.names, self.uncertainty.identified, strict=True):
-            if not known and kind != "stopping":
-                names.append(kind if joint is None else f"{self.robot.joint_names[self.joints[joint]]}: {kind}")
-        return names
+            if not known and joint is not None:
+                of_joints.setdefault(self.robot.joint_names[self.joints[joint]], []).append(kind)
+            elif not known and kind != "stopping":
+                others.append(kind)
+        return of_joints, others
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write :meth:`actuators` to a .yaml or .json file, with where they are from and what was not identified."""
+        of_joints, others = self.missing()
+        logged = {self.robot.joint_names[number] for number in self.joints}
+        own = zip(self.robot.joint_names, self.robot.independent, strict=True)
+        about = {
+            "identified_from": self.settings["logs"],
+            "held_out_error": self.document()["held_out_error"],
+            "not_identified_hence_ideal": of_joints | ({"all joints": others} if others else {}),
+            "not_in_the_logs_hence_ideal": [name for name, free in own if free and name not in logged],
+        }
+        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values; what is not identified is [None, None, None]."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from tqdm import tqdm
 
 import batchpid as bp
 from sim import Robot, Runner, write_recording
@@ -60,3 +61,15 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
         assert status != 0
         assert message in error
+
+
+def test_progress_promises_no_remaining_time(batchpid, log, tmp_path, monkeypatch):
+    """A fit mostly ends long before its last evaluation."""
+    bars = []
+    monkeypatch.setattr("sim.cli.identify.bar", lambda label, **options: bars.append((label, options)) or (lambda x: x))
+    robot, recording, gains = log
+    options = ("--evaluations", 1, "--workers", 0, "--no-payload", "--out", tmp_path / "motors.yaml")
+    batchpid("identify", robot, recording, "--params", gains, *options)
+    ((label, options),) = bars
+    shown = tqdm.format_meter(8, 91, 63.0, prefix=label, postfix="error=0.1", **options)
+    assert shown == "identifying: 8 of at most 91 evaluations, 01:03, error=0.1"

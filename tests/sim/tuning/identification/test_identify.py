@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from robots import load_bundled
 
 import batchpid as bp
 from sim import Robot
+from sim.cli.identify import report
 from sim.tuning import identify
 from sim.tuning.identification.drive import Drive
 from sim.tuning.identification.excitation import excite
@@ -188,6 +190,24 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     assert "elbow: friction" not in found.not_identified
     assert document["joints"]["shoulder"]["damping"] == [None, None, None]
     assert found.actuators().strength[0, 0] == 1.0
+    found.save(tmp_path / "motors.yaml")
+    saved = yaml.safe_load((tmp_path / "motors.yaml").read_text())["about"]
+    of_joints, others = found.missing()
+    assert saved["not_identified_hence_ideal"] == of_joints | ({"all joints": others} if others else {})
+    assert saved["not_identified_hence_ideal"]["shoulder"] == list(PER_JOINT)
+    assert Robot.load(turret.path, actuators=tmp_path / "motors.yaml").actuators.armature[0, 0] == 0.0
+    lines = [line for line in report(found).splitlines() if line.startswith("  shoulder: ")]
+    assert lines == [f"  shoulder: {', '.join(PER_JOINT)}: it hardly moves; move it more (batchpid excite)"]
+    for kind, joint, message in (
+        ("strength", 2, "from 0 to 1"),
+        ("strength", -1, "from 0 to 1"),
+        ("mass", 0, "armature"),
+        ("strength", None, "0 to 1"),
+        ("delay", 0, "leave it out"),
+        ("payload", None, "delay"),
+    ):
+        with pytest.raises(bp.InvalidArgumentError, match=message):
+            found.interval(kind, joint)
     assert found.uncertainty.singular_values[-1] < 1e-3
 
 
