@@ -6,6 +6,7 @@ Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from sim.recording.recorder import Recorder
 from sim.robot.description import Dynamics, Engine, RobotDescription, register_engine
 from sim.robot.findings import Finding
 from sim.robot.limits import SetpointWarning
+from sim.robot.parts import LinkMass
 from sim.robot.robot import Robot
 from sim.robot.self_collision import SelfContact
 
@@ -87,4 +89,10 @@ def _self_contact(robot: RobotDescription) -> SelfContact:
     return self_contact(robot)
 
 
-register_engine(Engine(_dynamics, _self_contact))
+def _link_masses(robot: RobotDescription) -> Mapping[str, LinkMass]:
+    from sim.engine.link_masses import link_masses
+
+    return link_masses(robot)
+
+
+register_engine(Engine(_dynamics, _self_contact, _link_masses))

@@ -115,6 +115,8 @@ class RunInfo:
     """Solver settings: "accurate", "fast", "free", or the text of a :class:`sim.Physics`."""
     collisions: bool | None = None
     """False if the robots had no collision shapes."""
+    ground: bool | None = None
+    """True if the scenes had a ground at height 0."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     actuators: Actuators | None = None

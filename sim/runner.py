@@ -517,6 +517,7 @@ class Runner:
             compensate=self.options.compensate,
             physics=str(self.options.physics),
             collisions=self.options.collisions,
+            ground=self.options.ground,
             params=self.params,
             actuators=self.actuators,
             start=self.observe().qpos,

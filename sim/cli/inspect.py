@@ -1,27 +1,42 @@
-"""``batchpid inspect``: the joints of a robot and the findings of its preflight."""
+"""``batchpid inspect``: the findings of a robot's preflight, its joints and the masses of its links."""
 
 from __future__ import annotations
 
 import math
 import textwrap
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from batchpid.versions import package_versions
-from sim import Robot
+from sim import Finding, Robot
 from sim.cli import flags
+from sim.robot.findings import summary
+from sim.robot.inertia import DENSITY
+from sim.robot.parts import Joint
 from sim.tuning.gain_sets import gain_set
 
 HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
+SOURCES = {
+    "inertial": "<inertial>",
+    "repaired": "<inertial>, repaired",
+    "shapes": f"collision shapes at {DENSITY:g} kg/m^3",
+    "none": "-",
+}
+"""Words for the sources of masses."""
+LIGHT = 1e-4
+"""Share of the total mass up to which a link is light."""
+NO_GROUND = "No ground: links other than the fixed base reach it at the start pose."
 
 
 @dataclass(frozen=True)
 class InspectCommand:
-    """List the joints of a robot in the order of qpos, and what is odd about it and about gains."""
+    """List what is odd about a robot and about gains, its joints in the order of qpos, and the masses of its links."""
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
     all: flags.Switch = False
-    """List the fixed joints too."""
+    """List fixed joints, light links, and pairs of links that do not collide, too."""
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
     missing_meshes: flags.MissingMeshes = "skip"
@@ -33,19 +48,22 @@ class InspectCommand:
     def run(self) -> int:
         """Run the command and return its exit status."""
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
-        print(f"{robot.name}: {robot.dof} degrees of freedom, {len(robot.links)} links, {robot.path}\n")
-        print(joint_table(robot, fixed_too=self.all) + "\n")
-        print(disabled_pairs(robot) + "\n")
+        mass = sum(link.mass for link in robot.link_masses.values())
+        size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"
+        print(f"{robot.name}: {size}, {robot.path}\n")
         setpoint = None if robot.settings is None else robot.settings.target
         findings = robot.check(setpoint=setpoint, control="drive")  # without gains
-        print("\n".join(map(str, findings)) or "Nothing odd about it.")
+        print(sentences(findings) or "Nothing odd about it.")
         if self.gains is not None or robot.has_tuned:  # designed gains keep the stability bound
             gains = gain_set(robot, self.gains)
             with_gains = robot.check(params=gains.params, setpoint=setpoint, control=gains.control)
             of_gains = [finding for finding in with_gains if finding not in findings]
             print(f"\nUnder gains {gains.name}:")
-            print("\n".join(map(str, of_gains)) or "Nothing odd.")
+            print(sentences(of_gains) or "Nothing odd.")
             findings += of_gains
+        print("\n" + joint_table(robot, fixed_too=self.all))
+        print("\n" + mass_table(robot, light_too=self.all))
+        print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
             from sim.engine.native import status
 
@@ -62,9 +80,9 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
             str(index),
             joint.name,
             joint.type,
-            f"{_bound(joint.lower)} to {_bound(joint.upper)} {joint.unit}",
-            f"{_bound(joint.effort_limit)} {joint.effort_unit}",
-            f"{_bound(joint.velocity_limit)} {joint.unit}/s",
+            _range(joint),
+            _bound(joint.effort_limit, f" {joint.effort_unit}"),
+            _bound(joint.velocity_limit, f" {joint.unit}/s"),
             f"{joint.damping:g}",
             f"{joint.friction:g}",
             f"{joint.parent_link} > {joint.child_link}",
@@ -79,15 +97,62 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
     return table(rows, HEADERS, "lllrrrrrl")
 
 
-def disabled_pairs(robot: Robot) -> str:
-    """Return the pairs of links that do not collide, by reason, and whether the robot's scenes have a ground."""
+def mass_table(robot: Robot, *, light_too: bool) -> str:
+    """Return a table of the links' masses with their sources, but for links that are light, and the total."""
+    from sim.cli.report import table
+
+    masses = robot.link_masses
+    total = sum(link.mass for link in masses.values())
+    shown = {name: link for name, link in masses.items() if light_too or link.mass > LIGHT * total}
+    rows = [
+        [name, f"{link.mass:.4g} kg" if link.mass else "none", SOURCES[link.source]] for name, link in shown.items()
+    ]
+    counts = Counter(link.source for link in masses.values() if link.mass)
+    parts = [f"{_count(count, 'link')} with the mass from {SOURCES[source]}" for source, count in counts.items()]
+    if hidden := len(masses) - len(shown):
+        parts.append(f"{_count(hidden, 'link')} with little mass or none not shown (--all)")
+    return table(rows, ("link", "mass", "from"), "lrl") + "\n" + _fill(f"Total {total:.4g} kg: {', '.join(parts)}.")
+
+
+def contact_lines(robot: Robot, *, pairs_too: bool) -> str:
+    """Return whether the robot's scenes have a ground, and the pairs of links that do not collide, by reason."""
     contact = robot.self_contact
-    lines = [] if robot.has_ground else ["No ground: links other than the fixed base reach it at the start pose."]
-    for reason in dict.fromkeys(pair.reason for pair in contact.pairs):
-        pairs = ", ".join(f"{pair.first} - {pair.second}" for pair in contact.pairs if pair.reason == reason)
-        lines.append(textwrap.fill(f"Do not collide, {reason!r}: {pairs}", 120, subsequent_indent="  "))
-    return "\n".join(lines) or "All links collide."
+    ground = "Ground at height 0." if robot.has_ground else NO_GROUND
+    if not contact.pairs:
+        return f"{ground} All links collide."
+    reasons = Counter(pair.reason for pair in contact.pairs)
+    counts = ", ".join(f"{count} {reason!r}" for reason, count in reasons.items())
+    count = _count(len(contact.pairs), "pair")
+    lines = [_fill(f"{ground} {count} of links excluded from collision: {counts}{'' if pairs_too else ' (--all)'}.")]
+    if not pairs_too:
+        return lines[0]
+    for title, pairs in (
+        *((f"Do not collide, {reason!r}", [p for p in contact.pairs if p.reason == reason]) for reason in reasons),
+        ("Collide, since PhysX's filter cannot hold them", contact.left_over),
+    ):
+        if pairs:
+            lines.append(_fill(f"{title}: {', '.join(f'{pair.first} - {pair.second}' for pair in pairs)}"))
+    return "\n".join(lines)
 
 
-def _bound(value: float) -> str:
-    return f"{value:.5g}" if math.isfinite(value) else "none"
+def sentences(findings: Sequence[Finding]) -> str:
+    """Return one sentence for each cause."""
+    return "\n".join(map(_fill, summary(findings)))
+
+
+def _fill(text: str) -> str:
+    options = {"subsequent_indent": "  ", "break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(text.replace("N m", "N\xa0m"), 120, **options).replace("\xa0", " ")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _range(joint: Joint) -> str:
+    limits = joint.lower, joint.upper
+    return f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}" if any(map(math.isfinite, limits)) else "none"
+
+
+def _bound(value: float, unit: str = "") -> str:
+    return f"{value:.5g}{unit}" if math.isfinite(value) else "none"

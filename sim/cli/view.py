@@ -65,6 +65,8 @@ class ViewCommand:
                 print(f"batchpid: warning: {warning}", file=sys.stderr)
             if view.port != port:
                 print(f"port {port} is in use; the page is at {view.port}")
+            for finding in view.findings:
+                print(f"batchpid: {finding}", file=sys.stderr)
             print(f"Open in a browser: {view.url}  (Ctrl-C ends it)", flush=True)
             with suppress(KeyboardInterrupt):
                 view.run(self.time_limit)

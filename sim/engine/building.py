@@ -80,12 +80,17 @@ def merged(spec: SceneSpec) -> Merged:
 
     @cache
     def unmerged() -> dict[str, Any]:
-        return {link.name: link for link in _load(spec.urdf, spec.fixed_base).link_builders}
+        return unmerged_links(spec.urdf, spec.fixed_base)
 
     def inertia_of_shapes(link: str) -> SpatialInertia:
         return link_inertia(unmerged()[link].build_physx_component())
 
     return merge_fixed_links(spec.urdf, inertia_of_shapes)
+
+
+def unmerged_links(urdf: str, fixed_base: bool) -> dict[str, Any]:
+    """Return SAPIEN's builder of every link of a sanitised URDF, by name, fixed joints not merged."""
+    return {link.name: link for link in _load(urdf, fixed_base).link_builders}
 
 
 def center_of_mass(spec: SceneSpec, link: str) -> tuple[str, NDArray[np.float64]]:

@@ -165,11 +165,15 @@ class Dynamics:
         pairs = touching_pairs(self._robot, self._spec.ground)
         return ContactPredictor(link_extents(self._robot), pairs, self._robot.dof, self._spec.timestep)
 
-    def height(self, qpos: NDArray[Any]) -> float:
-        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""
+    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
+
+        With ``base_too`` the links that are fixed to the base count as well.
+        """
         self._robot.set_qpos(qpos.astype(np.float32))
-        moving = (link for link in self._links if self._bodies[self._links[link]] != self._bodies[WORLD])
-        boxes = (link.compute_global_aabb_tight() for link in moving if link.collision_shapes)
+        base = self._bodies[WORLD]
+        links = (link for link, number in self._links.items() if base_too or self._bodies[number] != base)
+        boxes = (link.compute_global_aabb_tight() for link in links if link.collision_shapes)
         return min((float(box[0, 2]) for box in boxes), default=np.inf)
 
     def link_poses(self, qpos: NDArray[Any]) -> Float64:

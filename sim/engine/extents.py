@@ -51,20 +51,23 @@ def touching_pairs(robot: Any, ground: bool) -> list[tuple[int, int]]:
     return pairs + [(number, WORLD) for number in range(len(links)) if ground and words[number]]
 
 
-def _balls(shape: Any) -> Float64:
-    """Return balls that cover a shape (balls, 4), center and radius [m] in the link's frame: one for each slice."""
-    center, axis = np.zeros(3), 0
+def shape_box(shape: Any) -> tuple[Float64, Float64]:
+    """Return the center (3,) and the half size (3,) [m] of the box around a shape, in the frame of the shape."""
     if hasattr(shape, "radius"):  # a sphere, a capsule or a cylinder, along x; a capsule's ends are round
         ends = 0.0 if isinstance(shape, physx.PhysxCollisionShapeCylinder) else shape.radius
-        half = np.array([getattr(shape, "half_length", 0.0) + ends, shape.radius, 0.0])
-    else:
-        if hasattr(shape, "half_size"):
-            half = np.asarray(shape.half_size, float)
-        else:
-            vertices = np.asarray(shape.vertices, float) * np.asarray(shape.scale, float)
-            center, half = (vertices.max(0) + vertices.min(0)) / 2, np.ptp(vertices, axis=0) / 2
-        axis = int(half.argmax())
-    across = float(np.linalg.norm(np.delete(half, axis)))
+        return np.zeros(3), np.array([getattr(shape, "half_length", 0.0) + ends, shape.radius, shape.radius])
+    if hasattr(shape, "half_size"):
+        return np.zeros(3), np.asarray(shape.half_size, float)
+    vertices = np.asarray(shape.vertices, float) * np.asarray(shape.scale, float)
+    return (vertices.max(0) + vertices.min(0)) / 2, np.ptp(vertices, axis=0) / 2
+
+
+def _balls(shape: Any) -> Float64:
+    """Return balls that cover a shape (balls, 4), center and radius [m] in the link's frame: one for each slice."""
+    center, half = shape_box(shape)
+    round_ = hasattr(shape, "radius")
+    axis = 0 if round_ else int(half.argmax())
+    across = float(half[1] if round_ else np.linalg.norm(np.delete(half, axis)))
     slices = int(np.clip(np.ceil(half[axis] / max(across, 1e-6)), 1, MAX_BALLS))
     at = np.tile(center, (slices, 1))
     at[:, axis] += half[axis] * ((2 * np.arange(slices) + 1) / slices - 1)

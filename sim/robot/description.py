@@ -21,7 +21,7 @@ from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
 from sim.robot.guard import setpoint_guard
 from sim.robot.meshes import content_of
-from sim.robot.parts import Joint, Placement, Settings, Urdf
+from sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
 from sim.robot.self_collision import SelfContact, Srdf
 
 Float64 = NDArray[np.float64]
@@ -51,13 +51,14 @@ class Engine(NamedTuple):
 
     dynamics: Callable[[RobotDescription, bool | None], Dynamics]
     self_contact: Callable[[RobotDescription], SelfContact]
+    link_masses: Callable[[RobotDescription], Mapping[str, LinkMass]]
 
 
 _engine: list[Engine] = []
 
 
 def register_engine(engine: Engine) -> None:
-    """Set what :meth:`RobotDescription.dynamics` and :attr:`RobotDescription.self_contact` call."""
+    """Set the functions by which a :class:`RobotDescription` reaches the engine."""
     _engine[:] = [engine]
 
 
@@ -68,7 +69,8 @@ class RobotDescription(Urdf):
     ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
     among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
     that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled. ``actuators`` are its motors and sensors, None for ideal ones.
+    unless the robot is bundled. ``package_dirs`` are the
+    folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -81,12 +83,16 @@ class RobotDescription(Urdf):
     bodies: Mapping[str, Placement]
     settings: Settings | None
     coupling: Coupling | None = None
+    package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
-        mass = sum(link.mass or 0.0 for link in self.links)
+        given = sum(link.mass or 0.0 for link in self.links)
+        shaped = sum(not link.inertial and link.collisions > 0 for link in self.links)  # their mass needs SAPIEN
+        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [f"{shaped} links with the mass of shapes"] * (shaped > 0)
+        mass = " and ".join(masses)
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass:.4g} kg, path={str(self.path)!r},"
+        head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
 
     @property
@@ -244,6 +250,11 @@ class RobotDescription(Urdf):
     def self_contact(self) -> SelfContact:
         """Pairs of links that do not collide, and contact with the ground. Loads SAPIEN at the first use."""
         return _engine[0].self_contact(self)
+
+    @cached_property
+    def link_masses(self) -> Mapping[str, LinkMass]:
+        """Mass of every link of the URDF as it is simulated, by name. Loads SAPIEN at the first use."""
+        return _engine[0].link_masses(self)
 
     @property
     def ignored_pairs(self) -> tuple[tuple[str, str], ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,8 @@ SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
 class Finding:
     """Oddity of a joint, a link or the robot, and the remedy.
 
-    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs.
+    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs. ``text`` and ``remedy``
+    are the same for all joints with one cause; ``detail`` has the figures of this joint or link.
     """
 
     severity: str
@@ -27,31 +29,59 @@ class Finding:
     remedy: str
     joint: str | None = None
     link: str | None = None
+    detail: str = ""
 
     @property
     def where(self) -> str:
         """``"joint 'x'"``, ``"link 'x'"`` or ``"robot"``."""
-        if self.joint is not None:
-            return f"joint {self.joint!r}"
-        return "robot" if self.link is None else f"link {self.link!r}"
+        return f"{self._kind} {self._name}".strip()
 
     def __str__(self) -> str:
-        return f"{self.severity}: {self.where}: {self.text}; {self.remedy}"
+        return summary([self])[0]
+
+    @property
+    def _kind(self) -> str:
+        return "joint" if self.joint is not None else "robot" if self.link is None else "link"
+
+    @property
+    def _name(self) -> str:
+        name = self.link if self.joint is None else self.joint
+        return "" if name is None else repr(name)
 
 
-def finding_of(element: etree._Element, severity: str, code: str, text: str, remedy: str) -> Finding:
+def summary(findings: Iterable[Finding]) -> list[str]:
+    """Return one sentence for each cause, with all joints or links that have it, in the order of ``findings``."""
+    causes: dict[tuple[str, ...], list[Finding]] = defaultdict(list)
+    for each in findings:
+        causes[each.severity, each.code, each._kind, each.text, each.remedy].append(each)
+    return [_sentence(same) for same in causes.values()]
+
+
+def _sentence(same: Sequence[Finding]) -> str:
+    """Return the sentence of findings that differ in joint or link, and detail, alone."""
+    first = same[0]
+    names = list(dict.fromkeys(f"{each._name} ({each.detail})" if each.detail else each._name for each in same))
+    if len(names) == 1:
+        return f"{first.severity}: {f'{first._kind} {names[0]}'.strip()}: {first.text}; {first.remedy}"
+    return f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s: {', '.join(names)}"
+
+
+def finding_of(
+    element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = ""
+) -> Finding:
     """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the robot."""
     owner: etree._Element | None = element
     while owner is not None and owner.tag not in ("joint", "link"):
         owner = owner.getparent()
     joint, link = (None if owner is None or owner.tag != tag else owner.get("name") for tag in ("joint", "link"))
-    return Finding(severity, code, text, remedy, joint, link)
+    return Finding(severity, code, text, remedy, joint, link, detail)
 
 
 def refuse(path: Path, repairs: Sequence[Finding]) -> None:
     """Raise a RobotError that lists the ``repairs`` of the URDF at ``path``, if there are any."""
     if repairs:
-        listed = "".join(f"\n  {each.where}: {each.text}; {each.remedy}" for each in repairs[:MOST_LISTED])
-        listed += "\n  ..." if len(repairs) > MOST_LISTED else ""
+        sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
+        listed = "".join(f"\n  {sentence}" for sentence in sentences[:MOST_LISTED])
+        listed += "\n  ..." if len(sentences) > MOST_LISTED else ""
         count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
         raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")

@@ -12,6 +12,10 @@ from sim.robot.parts import MOVING_TYPES
 from sim.robot.xml import readable
 
 
+GIVE_RANGE = "give <limit lower= upper=>"
+"""Remedy for position limits that are missing or unreadable."""
+
+
 def repair(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
     """Repair a joint of the robot ``root``, but for its mimic."""
     yield from _type(joint, root)
@@ -43,7 +47,7 @@ def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
     severity, remedy = "warning", "use revolute, continuous or prismatic joints"
     if at_root:
         severity, remedy = "note", "load with fixed_base=False for a robot that is free to move"
-    text = f"joints of type {kind!r} cannot be simulated by SAPIEN: it is fixed"
+    text = f"joints of type {kind!r} cannot be simulated by SAPIEN: fixed instead"
     yield finding_of(joint, severity, "joint-type", text, remedy)
 
 
@@ -58,7 +62,7 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
     direction = readable(axis, "xyz", "1 0 0")
     length = 0.0 if direction is None else math.hypot(*direction)
     if direction is None or length < 1e-12:
-        text = f"<axis xyz={axis.get('xyz')!r}> has no direction: it is the x axis, which is the URDF's default"
+        text = f"<axis xyz={axis.get('xyz')!r}> has no direction: the x axis is used, the URDF's default"
         yield finding_of(joint, "warning", "axis", text, "correct the axis")
         joint.remove(axis)
     elif length < 1e-3:  # SAPIEN's bound, below which it takes another axis
@@ -77,16 +81,16 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
             continue
         text = limit.attrib.pop(key)
         if values is None:
-            problem = f"<limit {key}={text!r}> is no number: the joint has no {key} limit"
+            problem = f"<limit {key}={text!r}> is no number: no {key} limit"
             yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
         elif values[0] < 0:
             limit.set(key, repr(-values[0]))
-            problem = f"{key} limit {text}: its magnitude is used"
-            yield finding_of(joint, "warning", "limits", problem, "make it positive")
+            problem = f"{key} limit is negative: its magnitude is used"
+            yield finding_of(joint, "warning", "limits", problem, "make it positive", text)
         else:
             placeholders.append(f"{key}={text!r}")
     if placeholders:
-        problem = f"<limit {' '.join(placeholders)}>, a placeholder, counts as not given: there is no such limit"
+        problem = f"<limit {' '.join(placeholders)}> is a placeholder and counts as not given"
         yield finding_of(joint, "warning", "placeholder", problem, "give <limit effort= velocity=> of the motor")
     if kind in ("revolute", "prismatic"):
         yield from _range(joint, limit)
@@ -94,25 +98,24 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
 
 def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
     """Repair the position limits of a revolute or prismatic joint, and write them out."""
-    remedy = "give <limit lower= upper=>"
     given = {key: limit.get(key) for key in ("lower", "upper")}
     low, high = (readable(limit, key, "0", limit=True) for key in given)
     for key, values in zip(given, (low, high), strict=True):
         if values is None:
-            text = f"<limit {key}={given[key]!r}> is no number: the joint has no {key} limit"
-            yield finding_of(joint, "warning", "limits", text, remedy)
+            text = f"<limit {key}={given[key]!r}> is no number: no {key} limit"
+            yield finding_of(joint, "warning", "limits", text, GIVE_RANGE)
     lower, upper = (-math.inf if low is None else low[0]), (math.inf if high is None else high[0])
     efforts = [limit.get(key) for key in ("effort", "velocity")]
     if lower == upper == 0 and (None in given.values() or efforts == [None, None]):
-        text = "it has no position limits" if None in given.values() else "its limits are all 0, placeholders"
-        yield finding_of(joint, "warning", "limits", f"{text}: it can move without end", remedy)
+        text = "no position limits" if None in given.values() else "position limits of 0, placeholders"
+        yield finding_of(joint, "warning", "limits", f"{text}: motion without end", GIVE_RANGE)
         lower, upper = -math.inf, math.inf
     elif lower > upper and None in given.values():
         missing = "lower" if given["lower"] is None else "upper"
-        yield finding_of(joint, "warning", "limits", f"it has no {missing} limit: it has no end there", remedy)
+        yield finding_of(joint, "warning", "limits", f"no {missing} limit: no end there", GIVE_RANGE)
         lower, upper = (-math.inf, upper) if missing == "lower" else (lower, math.inf)
     elif lower > upper:
-        yield finding_of(joint, "warning", "limits", f"its limits [{lower:g}, {upper:g}] are swapped", "swap them")
+        yield finding_of(joint, "warning", "limits", "limits are swapped", "swap them", f"{lower:g}, {upper:g}")
         lower, upper = upper, lower
     limit.set("lower", repr(lower))
     limit.set("upper", repr(upper))
@@ -124,7 +127,7 @@ def _dynamics(joint: etree._Element) -> Iterator[Finding]:
     for key in ("damping", "friction") if dynamics is not None else ():
         values = readable(dynamics, key, "0")
         if values is None or values[0] < 0:
-            text = f"<dynamics {key}={dynamics.get(key)!r}> must be a number >= 0: it is 0"
+            text = f"<dynamics {key}={dynamics.get(key)!r}> must be a number >= 0: 0 is used"
             yield finding_of(joint, "warning", "dynamics", text, "correct the URDF")
             dynamics.set(key, "0")
 
@@ -173,7 +176,7 @@ def _independent(joint: etree._Element, problem: str) -> Finding:
     mimic = joint.find("mimic")
     joint.remove(mimic)
     if joint.get("type") == "fixed":
-        text = f"it is fixed, so it does not mimic {mimic.get('joint')!r}"
+        text = f"a fixed joint does not mimic {mimic.get('joint')!r}"
         return finding_of(joint, "note", "mimic", text, "remove <mimic>")
-    text = f"it mimics {mimic.get('joint')!r}, which {problem}: it moves independently"
+    text = f"mimics {mimic.get('joint')!r}, which {problem}: moves independently"
     return finding_of(joint, "warning", "mimic", text, "correct <mimic joint=>, or remove it")

@@ -36,8 +36,8 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
         return
     origin, mass, inertia = map(inertial.find, ("origin", "mass", "inertia"))
     if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
-        text = f"the centre of mass {dict(origin.attrib)} is no position: it is that of the link's frame"
-        yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>")
+        text = "the centre of mass is no position: the origin of the link is used"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>", str(dict(origin.attrib)))
         inertial.remove(origin)
     value = readable(mass, "value", "0")
     if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
@@ -54,15 +54,15 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
         changed = tensor
     else:
         changed = nearest_physical(tensor) if moments[2] >= SMALLEST else np.zeros((3, 3))
-        done = "replaced by the nearest that a body has"
+        done = "the nearest that a body has is used"
         if changed.max() < SMALLEST:
             changed = ball(value[0])
-            done = f"replaced by that of a ball of its {value[0]:g} kg at {DENSITY:g} kg/m^3"
+            done = f"that of a ball of its mass at {DENSITY:g} kg/m^3 is used"
         before, after = (
             " ".join(f"{moment:.3g}" for moment in each) for each in (moments, np.linalg.eigvalsh(changed))
         )
-        text = f"no body has an inertia tensor of the principal moments {before} kg m^2: {done}, {after}"
-        yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
+        text, detail = f"no body has such an inertia tensor: {done}", f"moments {before} kg m^2, used {after}"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertia>", detail)
     if inertia is None:
         inertia = etree.SubElement(inertial, "inertia")
     for key, moment in zip(MOMENTS, changed[np.triu_indices(3)].tolist(), strict=True):

@@ -88,6 +88,20 @@ class Link:
     triangle_excess: float = 0.0
 
 
+class LinkMass(NamedTuple):
+    """Mass of a link of the URDF as it is simulated.
+
+    ``mass`` [kg]; ``source``: "inertial", "repaired", "shapes" (the collision shapes, at SAPIEN's density) or "none";
+    ``gyration``: largest radius of gyration about the center of mass [m], sqrt(I/m); ``size``: diagonal [m] of the box
+    around its collision shapes, 0 without.
+    """
+
+    mass: float
+    source: str
+    gyration: float
+    size: float
+
+
 class Placement(NamedTuple):
     """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz`` (4,)."""
 

@@ -19,7 +19,10 @@ from sim.robot.description import RobotDescription
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES
 from sim.robot.findings import SEVERITIES, Finding
+from sim.robot.inertia import DENSITY
+from sim.robot.joint_repair import GIVE_RANGE
 from sim.robot.parts import Joint
+from sim.robot.plausibility import implausible_figures
 from sim.robot.stability import stability_report
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
@@ -40,6 +43,7 @@ def check(
     names = robot.joint_names
     start = robot.start if qpos is None else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
     findings = [
+        *implausible_figures(robot),
         *robot.repairs,
         *robot.srdf.findings,
         *_links(robot),
@@ -72,30 +76,26 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             loaded.add(bodies[joint.parent_link])
     for link in robot.links:
         if link.triangle_excess > EXCESS:
-            percent = f"{100 * link.triangle_excess:.0f} %"
-            text = (
-                f"no body has its inertia tensor: a principal moment exceeds the sum of the others by {percent} of it"
-            )
-            yield Finding("note", "inertia", f"{text}; it is simulated as given", "correct <inertia>", link=link.name)
+            text = "no body has such an inertia tensor, a moment above the sum of the others: simulated as given"
+            detail = f"by {100 * link.triangle_excess:.0f} %"
+            yield Finding("note", "inertia", text, "correct <inertia>", link=link.name, detail=detail)
         if link.inertial or (robot.fixed_base and bodies[link.name] not in carriers):
             continue
         if not link.collisions and (link.name != bodies[link.name] or link.name in solid):
             continue  # adds nothing to its body
         fixed = link.name in carriers and not carriers[link.name].moves
         if link.collisions:
-            effect = "SAPIEN takes its mass from the collision shapes, at 1000 kg/m^3"
+            effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
         elif fixed:
-            effect = "SAPIEN makes it a link of 1e-6 kg, which costs time in every step"
+            effect = "SAPIEN makes a link of 1e-6 kg, which costs time in every step"
         elif bodies[link.name] in loaded:
-            effect = "SAPIEN makes it a link of 1e-6 kg; the mass is in what it carries"
+            effect = "SAPIEN makes a link of 1e-6 kg; only the links that it carries have mass"
         else:
-            effect = (
-                "SAPIEN makes it a link of 1e-6 kg, and it carries none: gains per unit of effort cannot control it"
-            )
+            effect = "SAPIEN makes a link of 1e-6 kg, without load: gains per unit of effort cannot control it"
         light = not link.collisions and bodies[link.name] in loaded
-        severity, text = "note" if fixed or light else "warning", f"no mass and inertia; {effect}"
-        remedy = "add <inertial> with mass and inertia, or merge it into its parent"
-        yield Finding(severity, "no-inertia", text, remedy, link=link.name)
+        severity, text = "note" if fixed or light else "warning", f"no <inertial>: {effect}"
+        detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.collisions else ""
+        yield Finding(severity, "no-inertia", text, "add <inertial> with mass and inertia", link=link.name, detail=detail)
 
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
@@ -103,8 +103,7 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
         text = "SAPIEN's passive force does not compensate gravity on a floating base"
         yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
     if left_over := robot.self_contact.left_over:
-        names = ", ".join(f"{pair.first} - {pair.second}" for pair in left_over)
-        text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all: {names}"
+        text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
     if robot.dynamics().in_contact(start[None])[0]:
         text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
@@ -113,42 +112,48 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
 
 
 def _poses(robot: RobotDescription, what: str, qpos: NDArray[np.float64]) -> Iterator[Finding]:
-    effect = "SAPIEN snaps it back" if what == "start pose" else "the joint cannot reach it"
+    effect = "SAPIEN snaps it back" if what == "start pose" else "out of reach"
     for _, index, value in robot.limit_violations(qpos):
         joint = robot.joints[index]
-        text = f"{what} {value:g} {joint.unit} is outside [{joint.lower:g}, {joint.upper:g}]: {effect}"
-        yield Finding("warning", "out-of-limits", text, "move it inside", joint.name)
+        text, detail = f"{what} outside the limits: {effect}", f"{value:g} {joint.unit}, limits {_range(joint)}"
+        yield Finding("warning", "out-of-limits", text, "move it inside", joint.name, detail=detail)
 
 
 def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
-    def found(severity: str, code: str, text: str, remedy: str) -> Finding:
-        return Finding(severity, code, text, remedy, joint.name)
+    def found(severity: str, code: str, text: str, remedy: str, detail: str = "") -> Finding:
+        return Finding(severity, code, text, remedy, joint.name, detail=detail)
 
     dissipation = DISSIPATION[robot.dissipation]
-    friction = f"friction {joint.friction:g}"
+    friction = f"{joint.friction:g} {joint.effort_unit}"
     if dissipation.modelled and joint.friction >= joint.effort_limit > 0:
-        text = f"{friction} {joint.effort_unit} is not below its effort limit of {joint.effort_limit:g}: it cannot move"
-        yield found("warning", "friction", text, "correct <dynamics friction=> or <limit effort=>")
+        text, detail = "friction is not below the effort limit: no motion", f"{friction}, limit {joint.effort_limit:g}"
+        yield found("warning", "friction", text, "correct <dynamics friction=> or <limit effort=>", detail)
     if not dissipation.modelled and joint.friction != dissipation.joint_friction:
-        text = f"{friction} of the URDF is replaced by SAPIEN's default {dissipation.joint_friction:g}"
-        yield found("note", "friction", text, "load with dissipation='urdf' to keep it")
-    if joint.mimic is not None:
-        law = f"mimics {joint.mimic.joint!r} (multiplier {joint.mimic.multiplier:g}, offset {joint.mimic.offset:g})"
-        text = f"{law}: it follows, one degree of freedom with its leader; its setpoints and gains have no effect"
-        yield found("note", "mimic", text, f"command {joint.mimic.joint!r}")
+        text = f"friction of the URDF is replaced by SAPIEN's default {dissipation.joint_friction:g}"
+        yield found("note", "friction", text, "load with dissipation='urdf' to keep it", friction)
+    if (mimic := joint.mimic) is not None:
+        text = "mimics another, one degree of freedom with it: own setpoints and gains have no effect"
+        offset = f" {mimic.offset:+g} {joint.unit}" if mimic.offset else ""
+        yield found("note", "mimic", text, "command the leader", f"{mimic.multiplier:g} x {mimic.joint!r}{offset}")
     if joint.continuous:
         remedy = "build params with robot.params(), which takes errors and rates the short way round"
-        yield found("note", "continuous", "its position wraps: qpos jumps by whole turns", remedy)
+        yield found("note", "continuous", "position wraps: qpos jumps by whole turns", remedy)
     if joint.lower == joint.upper:
-        text = f"its limits are [{joint.lower:g}, {joint.upper:g}] {joint.unit}: it cannot move"
-        yield found("warning", "no-range", text, "give <limit lower= upper=>, or make it fixed")
+        remedy = "give <limit lower= upper=>, or make it fixed"
+        yield found("warning", "no-range", "limits without range: no motion", remedy, _range(joint))
     elif not joint.continuous and math.isinf(joint.upper - joint.lower):
-        remedy = "give <limit lower= upper=>, so that setpoints can be checked"
-        yield found("note", "no-limits", "it has no position limits", remedy)
+        repaired = any(each.joint == joint.name and each.remedy == GIVE_RANGE for each in robot.repairs)
+        if not repaired:  # which says the same
+            yield found("note", "no-limits", "no position limits", f"{GIVE_RANGE}, so that setpoints can be checked")
     if math.isinf(joint.effort_limit) and joint.mimic is None:
         limit = f"{robot.design_effort_limit[robot.joints.index(joint)]:.3g} {joint.effort_unit}"
-        text = f"it has no effort limit: designed and tuned gains stay within {limit}, from gravity and inertia"
-        yield found("note", "no-effort-limit", text, "give <limit effort=>, or pass effort_limit= to robot.params()")
+        text = "no effort limit: designed and tuned gains stay within these, from gravity and inertia"
+        remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
+        yield found("note", "no-effort-limit", text, remedy, limit)
+
+
+def _range(joint: Joint) -> str:
+    return f"[{joint.lower:g}, {joint.upper:g}]"
 
 
 def _strength(robot: RobotDescription) -> Iterator[Finding]:
@@ -159,12 +164,11 @@ def _strength(robot: RobotDescription) -> Iterator[Finding]:
         share = float(np.mean(needed[:, index] >= limit))
         if share == 0 or limit <= robot.friction[index]:
             continue
-        friction = f" and friction of {joint.friction:g}" if robot.friction[index] else ""
-        text = (
-            f"its effort limit of {limit:g} {joint.effort_unit} does not overcome gravity of up to "
-            f"{load[:, index].max():.3g}{friction} in {100 * share:.0f} % of its poses: it cannot hold or leave them"
-        )
-        yield Finding("warning", "weak", text, "expect no moves there, or correct <limit effort=>", joint.name)
+        friction = f", friction {joint.friction:g}" if robot.friction[index] else ""
+        gravity = f"gravity up to {load[:, index].max():.3g}{friction}, {100 * share:.0f} % of poses"
+        text = "effort limit does not overcome gravity and friction in every pose: some cannot be held or left"
+        remedy, detail = "expect no moves there, or correct <limit effort=>", f"{limit:g} {joint.effort_unit}, {gravity}"
+        yield Finding("warning", "weak", text, remedy, joint.name, detail=detail)
 
 
 def _stability(
@@ -197,12 +201,12 @@ def _params(robot: RobotDescription, params: bp.PIDParams, control: str) -> Iter
     dead = any_env(None if params.ki is None else np.asarray(params.ki) * (np.asarray(params.kp) == 0))
     for joint, wraps, no_effect in zip(robot.joints, any_env(params.continuous), dead, strict=True):
         if joint.continuous and not wraps and control == "pid":
-            text = "params do not say that it is continuous: the error jumps by a turn where qpos wraps"
+            text = "continuous, which params do not say: the error jumps by a turn where qpos wraps"
             remedy = "pass continuous= to make_params, or use robot.params()"
             yield Finding("warning", "continuous", text, remedy, joint.name)
         if wraps and not joint.continuous:
-            text = "params call it continuous, the URDF does not: the short way round may lie beyond its limits"
+            text = "continuous in params, not in the URDF: the short way round may lie beyond the limits"
             yield Finding("warning", "continuous", text, "leave it out of continuous=", joint.name)
         if no_effect and control == "drive":
             text = "ki has no effect under control 'drive' where kp is 0: the integral moves the target of a stiffness"
-            yield Finding("warning", "drive-integral", text, "give it a kp > 0, or use control='pid'", joint.name)
+            yield Finding("warning", "drive-integral", text, "give a kp > 0, or use control='pid'", joint.name)

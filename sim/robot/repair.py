@@ -115,7 +115,7 @@ def _links(root: etree._Element) -> Iterator[Finding]:
     for link in root.findall("link"):
         if (name := link.get("name")) in seen:
             text = "no joint can refer to a link without name" if name is None else "this name is used twice"
-            kept = "it is left out" if name is None else "the first link is kept, the other left out"
+            kept = "left out" if name is None else "the first link is kept, the other left out"
             yield finding_of(link, "warning", "repeated-name", f"{text}: {kept}", "give every link a name to itself")
             root.remove(link)
         seen.add(name)
@@ -128,7 +128,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
         name, ends = joint.get("name"), ends_of(joint)
         if name is not None and seen.get(name) == ends:
             yield finding_of(
-                joint, "warning", "repeated-name", "it is given twice: the first is kept", "remove the copy"
+                joint, "warning", "repeated-name", "given twice: the first is kept", "remove the copy"
             )
             root.remove(joint)
             continue
@@ -138,9 +138,9 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
             new, number = f"{base}_{number}", number + 1
         if new != name:
             joint.set("name", new)
-            problem = "it had no name" if name is None else f"the name {name!r} is used twice"
+            problem = "no name" if name is None else f"the name {name!r} is used twice"
             yield finding_of(
-                joint, "warning", "repeated-name", f"{problem}: it is called {new!r}", "name it in the URDF"
+                joint, "warning", "repeated-name", f"{problem}: called {new!r}", "name it in the URDF"
             )
         seen[new] = ends
 
@@ -152,12 +152,12 @@ def _tree(root: etree._Element) -> Iterator[Finding]:
     for name in dict.fromkeys(end for pair in ends for end in pair if end is not None):
         if name not in links:
             links[name] = etree.SubElement(root, "link", name=name)
-            text = "joints name this link, but it is not in the file: it is added, without mass and shape"
+            text = "named by joints, but not in the file: added, without mass and shape"
             yield Finding("warning", "missing-link", text, "correct the name, or add the link", link=name)
     joined = {end for pair in ends for end in pair}
     for name, link in links.items():
         if joined and name not in joined:
             yield finding_of(
-                link, "warning", "loose-link", "no joint holds it: it is left out", "join it, or remove it"
+                link, "warning", "loose-link", "held by no joint: left out", "join it, or remove it"
             )
             root.remove(link)

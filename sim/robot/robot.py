@@ -119,6 +119,7 @@ class Robot(RobotDescription):
             dissipation=dissipation,
             fixed_base=fixed_base,
             merge_fixed=merge_fixed,
+            package_dirs=folders,
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
         )

@@ -1,14 +1,14 @@
 """Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for a view that has no SAPIEN renderer.
 
 A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
-collision shapes. The triangles are made, or read from mesh files, by ``trimesh`` (extra "view").
+collision shapes. Unreadable files are reported. The triangles are made, or read from mesh files, by ``trimesh`` (extra "view").
 """
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import zlib
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
 from sim.robot.description import RobotDescription
-from sim.robot.meshes import find_mesh
+from sim.robot.findings import Finding
+from sim.robot.meshes import find_mesh, mesh_problem
 from sim.robot.rotations import from_rpy, rotate
 from sim.robot.xml import numbers, parse_xml
 
@@ -38,8 +39,12 @@ class Surface(NamedTuple):
     faces: NDArray[np.int64]
 
 
-def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surface]:
+def surfaces(
+    robot: RobotDescription, deviation: float = DEVIATION, findings: list[Finding] | None = None
+) -> list[Surface]:
     """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] is that of :func:`segments_of`.
+
+    A mesh that cannot be read is appended to ``findings``.
 
     Vertices are not shared across sharp edges, so that averaged normals shade correctly.
 
@@ -70,12 +75,20 @@ def surfaces(robot: RobotDescription, deviation: float = DEVIATION) -> list[Surf
         undrawn.remove(name)
         where = f"{robot.path}: link {name!r}"
         parts: dict[Rgba, list[Any]] = {}
+        unreadable: list[_UnreadableMesh] = []
         for elements in (link.findall("visual"), collisions.get(name, [])):
-            meshes = [_mesh(element, robot.path, deviation, where) for element in elements]
+            try:
+                meshes = [_mesh(element, robot, deviation, where) for element in elements]
+            except _UnreadableMesh as error:
+                unreadable.append(error)
+                continue
             if meshes and all(mesh is not None for mesh in meshes):
                 for element, mesh in zip(elements, meshes, strict=True):
                     parts.setdefault(_colour(element, colours, name, where), []).append(mesh)
                 break
+        if findings is not None:
+            shown = "collision shapes are drawn instead" if parts else "nothing is drawn"
+            findings += [error.finding(name, shown) for error in unreadable]
         for rgba, same in parts.items():
             joined: Any = concatenate(same)
             result.append(Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces)))
@@ -92,22 +105,54 @@ def segments_of(radius: float, deviation: float) -> int:
     return min(MOST, max(FEWEST, math.ceil(math.pi / math.acos(1 - deviation / radius))))
 
 
-def _mesh(element: etree._Element, urdf: Path, deviation: float, where: str) -> Any:
-    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None without a readable mesh."""
-    from trimesh import Trimesh, creation, load
+class _UnreadableMesh(Exception):
+    """Mesh file that is not found or cannot be read: its name, the reason, and the remedy."""
+
+    def __init__(self, name: str, reason: str, remedy: str) -> None:
+        super().__init__(name, reason, remedy)
+        self.name, self.reason, self.remedy = name, reason, remedy
+
+    def finding(self, link: str, shown: str) -> Finding:
+        """Return the finding of a ``link`` in whose place ``shown`` is drawn."""
+        text = f"mesh {self.reason}: {shown}"
+        return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=self.name)
+
+
+def _read_mesh(name: str, robot: RobotDescription) -> Any:
+    """Return what ``trimesh`` reads from a mesh file, in metres. Raises _UnreadableMesh."""
+    from trimesh import load
+
+    path = find_mesh(name, robot.path, robot.package_dirs)
+    if path is None:
+        remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load"
+        raise _UnreadableMesh(name, "not found", remedy)
+    try:
+        loaded: Any = load(path, force="mesh", process=False)
+    except Exception as error:  # trimesh has an error of its own for each fault of a file
+        if path.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
+            reason, remedy = "in COLLADA needs the package pycollada", "pip install 'batchpid[view]'"
+            raise _UnreadableMesh(name, reason, remedy) from error
+        reason = mesh_problem(path) or f"{type(error).__name__}: {error}"
+        raise _UnreadableMesh(name, f"cannot be read ({reason})", "repair the file") from error
+    if not len(loaded.faces):
+        raise _UnreadableMesh(name, "has no triangles", "repair the file")
+    factor, _, unit = str(loaded.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
+    if unit == "meters":
+        loaded.apply_scale(float(factor))
+    return loaded
+
+
+def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, where: str) -> Any:
+    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None for one without shape.
+
+    Raises _UnreadableMesh.
+    """
+    from trimesh import Trimesh, creation
 
     shape = element.find("geometry/*")
     kind = None if shape is None else shape.tag
     if kind == "mesh":
-        path = find_mesh(shape.get("filename", ""), urdf, ())
-        if path is None:
-            return None
-        try:
-            loaded: Any = load(path, force="mesh", process=False)
-        except Exception:  # trimesh has an error of its own for each fault of a file
-            return None
-        if not len(loaded.faces):
-            return None
+        loaded = _read_mesh(shape.get("filename", ""), robot)
         mesh: Any = Trimesh(loaded.vertices, loaded.faces, process=False)
         mesh.apply_scale(numbers(shape, "scale", "1 1 1", where))
     elif kind == "box":

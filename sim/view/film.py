@@ -24,8 +24,8 @@ from sim.observation import Rollout
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 from sim.robot.rotations import from_rpy
-from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, arrange_robots
-from sim.view.playback import rows_at
+from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotLayout, arrange_robots
+from sim.view.playback import had_ground, rows_at
 
 FORMATS = (".mp4", ".gif")
 _ENCODERS = {
@@ -33,6 +33,8 @@ _ENCODERS = {
     ".gif": ("-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse", "-loop", "0"),
 }
 """ffmpeg's options for each format."""
+_LINE = 4e-3
+"""Half the width of a line of the grid [m]."""
 _CLOSER = 0.72
 """Distance of the camera as a share of that in the browser, where panels cover the sides of the picture."""
 
@@ -220,12 +222,28 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     viewer.close()
 
 
+def add_floor(scene: Any, layout: RobotLayout, ground: bool, material: Any) -> None:
+    """Add a floor to a SAPIEN scene: a plane for the ``ground`` of physics, otherwise a grid of lines."""
+    if ground:
+        scene.add_ground(layout.floor, render_material=material, render_half_size=[20, 20])
+        return
+    builder, (low, high) = scene.create_actor_builder(), layout.corners
+    center, half = (low + high) / 2, (high - low) / 2
+    for axis in (0, 1):
+        for at in np.arange(low[axis], high[axis] + TILE / 2, TILE):
+            position, size = np.array([*center, layout.floor]), np.array([*half, _LINE])
+            position[axis], size[axis] = at, _LINE
+            builder.add_box_visual(sapien.Pose(position), size, material)
+    builder.build_kinematic(name="grid")
+
+
 class _RenderScene:
     """Lit SAPIEN scene with the robots of a run, which are placed and not simulated."""
 
     def __init__(self, rollout: Rollout, robot: Robot | None) -> None:
         robot = Robot.load(rollout.info.robot) if robot is None else robot
-        layout = arrange_robots(Kinematics(robot), robot, 1, rollout.num_envs)
+        ground = had_ground(rollout, robot)
+        layout = arrange_robots(Kinematics(robot), robot, 1, rollout.num_envs, ground)
         eye = layout.target + _CLOSER * (layout.camera - layout.target)
         x, y, z = layout.target - eye  # a camera looks along its x axis
         self.camera_pose = sapien.Pose(eye, from_rpy([0.0, math.atan2(-z, math.hypot(x, y)), math.atan2(y, x)]))
@@ -233,7 +251,7 @@ class _RenderScene:
         self.scene.set_ambient_light([0.38, 0.4, 0.45])
         self.scene.add_directional_light([0.4, 0.5, -1.0], [1.5, 1.45, 1.35], shadow=True, shadow_scale=8.0)
         material = sapien.render.RenderMaterial(base_color=[0.62, 0.66, 0.72, 1.0], roughness=0.9)
-        self.scene.add_ground(0.0, render_material=material, render_half_size=[20, 20])
+        add_floor(self.scene, layout, ground, material)
         loader = self.scene.create_urdf_loader()
         self._articulations = [loader.load(str(robot.path)) for _ in layout.positions]
         for articulation, position in zip(self._articulations, layout.positions, strict=True):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.engine.dynamics import robot_dynamics
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 
@@ -17,6 +18,8 @@ MAX_ROBOTS = 64
 """Largest number of robots on a page or in a film."""
 FIELD_OF_VIEW = math.radians(42)
 """Vertical field of view of the camera [rad]."""
+TILE = 0.5
+"""Edge of a tile or of a cell of the floor [m]."""
 _PITCH = 1.3
 """Distance between neighbours, in reaches: two robots overlap only when both stretch out."""
 _GAP = 0.6
@@ -25,16 +28,31 @@ _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.8
 
 
 class RobotLayout(NamedTuple):
-    """Positions of the robots (robots, 3), group by group, of the camera and its target (3,); a robot's reach. In m."""
+    """Positions of the robots (robots, 3), group by group, of the camera and its target (3,); a robot's reach; the
+    height of the floor. In m.
+    """
 
     positions: Float64
     camera: Float64
     target: Float64
     reach: float
+    floor: float
+
+    @property
+    def corners(self) -> tuple[Float64, Float64]:
+        """Lowest and highest x and y (2,) of a floor under all robots, in whole tiles [m]."""
+        low = np.floor((self.positions.min(0)[:2] - 2.0 * self.reach) / TILE)
+        high = np.ceil((self.positions.max(0)[:2] + 2.0 * self.reach) / TILE)
+        return TILE * low, TILE * high
 
 
-def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group: int) -> RobotLayout:
-    """Return a layout of ``groups`` adjacent blocks of ``per_group`` robots around the origin, roughly square."""
+def arrange_robots(
+    kinematics: Kinematics, robot: Robot, groups: int, per_group: int, ground: bool
+) -> RobotLayout:
+    """Return a layout of ``groups`` adjacent blocks of ``per_group`` robots around the origin, roughly square.
+
+    ``ground`` says whether physics has one, which is the floor; otherwise the floor is at the lowest link.
+    """
     # The 95th percentile over seeded poses: a single stretched pose should not push all robots apart.
     distance = np.linalg.norm(kinematics.poses(robot.sample(200, seed=0)).position[..., :2], axis=-1).max(1)
     reach = max(0.3, float(np.quantile(distance, 0.95)))
@@ -43,4 +61,12 @@ def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group:
     grid = np.stack([index % columns + group * (columns + _GAP), index // columns, 0 * index], axis=1)
     positions = _PITCH * reach * (grid - (grid.min(0) + grid.max(0)) / 2)
     size = float(np.hypot(*np.ptp(positions, axis=0)[:2])) + 2.0 * reach
-    return RobotLayout(positions, 1.16 * size * _CAMERA_DIRECTION, np.array([0.0, 0.0, 0.35 * reach]), reach)
+    floor = 0.0 if ground else lowest_point(kinematics, robot)
+    camera = 1.16 * size * _CAMERA_DIRECTION + [0.0, 0.0, floor]
+    return RobotLayout(positions, camera, np.array([0.0, 0.0, floor + 0.35 * reach]), reach, floor)
+
+
+def lowest_point(kinematics: Kinematics, robot: Robot) -> float:
+    """Return the height [m] of the lowest collision shape or link frame at the start pose."""
+    frames = kinematics.poses(robot.start).position[:, 2].min()
+    return min(float(frames), robot_dynamics(robot).height(robot.start, base_too=True))

@@ -13,6 +13,7 @@ from typing import Any
 
 from batchpid.errors import MissingDependencyError
 from sim.observation import Rollout
+from sim.robot.findings import summary
 from sim.view.charts import Charts
 from sim.view.data import ViewData
 from sim.view.panel import Panel
@@ -60,8 +61,10 @@ class View(AbstractContextManager["View"]):
         """Frames per second of wall time, and real-time factor."""
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
-        self._scene = RobotScene(self._server, data.robot, data.groups, data.per_group)
-        self.panel = Panel(self._server, data, self._problems.append)
+        self._scene = RobotScene(self._server, data.robot, data.groups, data.per_group, data.ground)
+        self.findings = summary(self._scene.findings)
+        """Sentences on meshes that cannot be read, which the page shows as well."""
+        self.panel = Panel(self._server, data, self._problems.append, self.findings)
         self._scene.on_click(self.panel.select)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)

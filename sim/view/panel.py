@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,14 +21,20 @@ from sim.view.playback import Playback
 from sim.view.simulation import LiveSimulation
 
 _DIRECTIONS = dict(zip(("+x", "+y", "up", "-x", "-y", "down"), np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
+_FINDING_STYLE = "margin: 0.5em 1em; font-size: 0.8em; color: #b45309; overflow-wrap: anywhere"
 _MILLISECONDS = {"derivative_filter_time": 1e3}
 """Factor from a gain to the number on its slider, where that is not 1."""
 
 
 class Panel:
-    """Controls of ``data`` on a viser ``server``. ``refuse`` is called with the reason for every request that fails."""
+    """Controls of ``data`` on a viser ``server``, under the sentences in ``findings``.
 
-    def __init__(self, server: Any, data: ViewData, refuse: Callable[[str], object]) -> None:
+    ``refuse`` is called with the reason for every request that fails.
+    """
+
+    def __init__(
+        self, server: Any, data: ViewData, refuse: Callable[[str], object], findings: Sequence[str] = ()
+    ) -> None:
         self._gui, self._data = server.gui, data
         self._requests = Requests(refuse)
         self.frames_left = math.inf
@@ -35,6 +42,8 @@ class Panel:
         self._names = short_names(data.robot)
         gui = self._gui
         self._status = gui.add_markdown("starting ...")
+        for finding in findings:  # names from files are text, not markup
+            gui.add_html(f'<p style="{_FINDING_STYLE}">{html.escape(finding)}</p>')
         motion = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
         self._control(motion).on_change(self._control_motion)
         self._speed = self._control(gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0))

@@ -39,6 +39,8 @@ class Playback:
             )
         self.robot, self.per_group = robot, rollout.num_envs
         self.groups = ("recorded",)
+        self.ground = had_ground(rollout, robot)
+        """True if the run had a ground at height 0."""
         self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
         self.duration = float(self._rollout.time[-1])
         """Time from the first row to the last [s]."""
@@ -79,6 +81,11 @@ class Playback:
         part = self._rollout.for_ticks(slice(first, last + 1))
         finite = (np.nan_to_num(array, posinf=0.0, neginf=0.0) for array in part.observation)
         return replace(part, observation=Observation._make(finite))
+
+
+def had_ground(rollout: Rollout, robot: Robot) -> bool:
+    """Return whether the scenes of ``rollout`` had a ground; an older recording does not say, and counts as default."""
+    return robot.has_ground if rollout.info.ground is None else rollout.info.ground
 
 
 def rows_at(rollout: Rollout, seconds: float | NDArray[np.float64]) -> NDArray[np.int64]:

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.observation import Rollout
+from sim.robot.findings import Finding
 from sim.robot.kinematics import Kinematics, Poses
 from sim.robot.robot import Robot
 from sim.robot.shapes import Surface, surfaces
-from sim.view.layout import FIELD_OF_VIEW, arrange_robots
+from sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
 
 Float64 = NDArray[np.float64]
 
@@ -24,26 +25,30 @@ _DIVERGED_COLOUR = np.array([200, 40, 40], np.uint8)
 _TINT, _TINT_SHARE = np.array([255, 150, 40]), 0.5
 """Colour mixed into that of the second group's robots, and its share."""
 _FLOOR_COLOURS = np.array([[189, 198, 211], [203, 211, 222]], np.uint8)
-_TILE, _TILE_PIXELS = 0.5, 16
-"""Edge of a floor tile [m], and in pixels of the floor's picture, in which tiles blend over one pixel."""
+_TILE_PIXELS = 16
+"""Edge of a tile in the floor's picture, in which tiles blend over one pixel."""
 _NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
 _SETPOINT_STYLE = {"batched_colors": _SETPOINT_COLOUR, "opacity": 0.22, **_NO_SHADOW}
 
 
 class RobotScene:
-    """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``."""
+    """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``: a tiled one for the ``ground`` of
+    physics, otherwise a grid at the lowest link.
+    """
 
-    def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int) -> None:
+    def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:
         self._server, self._kinematics = server, Kinematics(robot)
-        self._layout = arrange_robots(self._kinematics, robot, len(groups), per_group)
+        self._layout = arrange_robots(self._kinematics, robot, len(groups), per_group, ground)
         count = len(self._layout.positions)
+        self.findings: list[Finding] = []
+        """Meshes that cannot be read, whose links are drawn by their collision shapes or not at all."""
         self._robots: list[Any] = []
         self._setpoints: list[Any] = []
         self._links: list[int] = []
         self._colours: list[NDArray[np.uint8]] = []
         # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
         deviation = 5e-4 if count <= 4 else 1.5e-3 if count < 16 else 3e-3 if count < 48 else 6e-3  # [m]
-        for index, surface in enumerate(surfaces(robot, deviation)):
+        for index, surface in enumerate(surfaces(robot, deviation, self.findings)):
             colours = _group_colours(surface.rgba, len(groups), per_group)
             opacity = surface.rgba[3] if surface.rgba[3] < 1 else None
             node = self._add_surface(f"/robots/{index}", surface, count, batched_colors=colours, opacity=opacity)
@@ -53,7 +58,7 @@ class RobotScene:
             self._colours.append(colours)
         self._shown_setpoint: tuple[Any, ...] | None = None
         self._ok = np.ones(count, bool)
-        self._add_surroundings(groups)
+        self._add_surroundings(groups, ground)
 
     def update(self, frame: Rollout, selected: int, show_setpoint: bool) -> None:
         """Place every robot, the ring under the selected one, and its setpoint if that is shown."""
@@ -67,7 +72,7 @@ class RobotScene:
             setpoint = frame.setpoint[0, selected]
             if (shown := (selected, show_setpoint, setpoint.tobytes())) != self._shown_setpoint:
                 self._shown_setpoint = shown
-                self._ring.position = (*positions[selected][:2], 0.004)
+                self._ring.position = (*positions[selected][:2], self._layout.floor + 0.004)
                 for node in self._setpoints:
                     node.visible = show_setpoint
                 if show_setpoint:
@@ -100,7 +105,7 @@ class RobotScene:
             node.batched_positions = np.ascontiguousarray(position[:, link])
             node.batched_wxyzs = np.ascontiguousarray(wxyz[:, link])
 
-    def _add_surroundings(self, groups: tuple[str, ...]) -> None:
+    def _add_surroundings(self, groups: tuple[str, ...], ground: bool) -> None:
         """Add floor, lights, the ring under the selected robot, labels of the groups, and set the camera."""
         import trimesh  # installed with viser
 
@@ -110,28 +115,30 @@ class RobotScene:
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=True, cast_shadow=False)
         scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
-        # An image is not lit and costs a third of tiles made of triangles.
-        image, size, center = _floor(layout.positions, layout.reach)
-        scene.add_image("/floor", image, *size, format="png", position=(*center, 0.0), **_NO_SHADOW)
+        low, high = layout.corners
+        place: dict[str, Any] = {"position": (*(low + high) / 2, layout.floor)}
+        if ground:  # an image is not lit and costs a third of tiles made of triangles
+            scene.add_image("/floor", _tiles(layout), *(high - low), format="png", **place, **_NO_SHADOW)
+        else:
+            scene.add_grid("/floor", *(high - low), cell_size=TILE, section_size=2 * TILE, shadow_opacity=0.0, **place)
         ring = trimesh.creation.annulus(0.30 * layout.reach, 0.335 * layout.reach, height=1e-3, sections=48)
         self._ring = scene.add_mesh_simple("/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW)
         if len(groups) > 1:
             for group, positions in zip(groups, np.split(layout.positions, len(groups)), strict=True):
                 x, y, _ = positions.mean(0)
-                scene.add_label(f"/groups/{group}", group, position=(x, y, 1.9 * layout.reach))
+                scene.add_label(f"/groups/{group}", group, position=(x, y, layout.floor + 1.9 * layout.reach))
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(layout.camera), tuple(layout.target)
         camera.fov = FIELD_OF_VIEW
 
 
-def _floor(positions: Float64, reach: float) -> tuple[NDArray[np.uint8], Float64, Float64]:
-    """Return the picture of a tiled floor under all robots, its size (2,) and its center (2,) [m]."""
-    low = np.floor((positions.min(0)[:2] - 2.0 * reach) / _TILE)
-    high = np.ceil((positions.max(0)[:2] + 2.0 * reach) / _TILE)
-    columns, rows = (high - low).astype(int)
+def _tiles(layout: RobotLayout) -> NDArray[np.uint8]:
+    """Return the picture of a tiled floor under all robots."""
+    low, high = layout.corners
+    columns, rows = np.rint((high - low) / TILE).astype(int)
     tiles = (np.indices((rows, columns)).sum(0) + 1) % 2
     pixels = np.kron(tiles, np.ones((_TILE_PIXELS, _TILE_PIXELS), int))
-    return _FLOOR_COLOURS[pixels], _TILE * (high - low), _TILE * (high + low) / 2
+    return _FLOOR_COLOURS[pixels]
 
 
 def _group_colours(rgba: tuple[float, ...], groups: int, per_group: int) -> NDArray[np.uint8]:

@@ -78,7 +78,6 @@ class LiveSimulation:
         substeps = max(1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep))
         self.period = substeps * timestep
         self.kinematics = Kinematics(robot)
-        self._info = robot.run_info()
         self._random = np.random.default_rng(seed)
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
         self.start = np.clip(robot.start + offsets, robot.lower, robot.upper)
@@ -103,6 +102,9 @@ class LiveSimulation:
                 for control, gains in self.gains.items()
             ]
             self._resources = stack.pop_all()
+        self.ground = bool(self._runners[0].options.ground)
+        """True if the scenes have a ground at height 0."""
+        self._info = robot.run_info(ground=self.ground)
         self.reset()
 
     def reset(self) -> None:

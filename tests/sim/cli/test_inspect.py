@@ -1,8 +1,9 @@
-"""batchpid inspect: the joints in the order of qpos, then the findings."""
+"""batchpid inspect: the findings, the joints in the order of qpos, the masses of the links."""
 
 from __future__ import annotations
 
 import pytest
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from sim import Robot
 
@@ -29,11 +30,11 @@ def odd(tmp_path):
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_lists_the_joints_in_order(name, batchpid):
     status, out, _ = batchpid("inspect", name)
-    robot = Robot.load(name)
+    bundled = Robot.load(name)
     assert status == 0
     rows = [line.split() for line in out.splitlines() if line[:1].isdigit()]
-    assert [(int(row[0]), row[1]) for row in rows] == list(enumerate(robot.joint_names))
-    assert f"{robot.dof} degrees of freedom" in out
+    assert [(int(row[0]), row[1]) for row in rows] == list(enumerate(bundled.joint_names))
+    assert f"{bundled.dof} degrees of freedom" in out
 
 
 def test_fixed_joints_on_request(batchpid):
@@ -41,17 +42,65 @@ def test_fixed_joints_on_request(batchpid):
     assert "panda_hand_joint" in batchpid("inspect", "panda", "--all")[1]
 
 
-def test_lists_the_findings(batchpid, odd):
+def flat(text):
+    """Return ``text`` with its lines joined."""
+    return " ".join(text.split())
+
+
+def test_lists_the_findings_first(batchpid, odd):
     status, out, _ = batchpid("inspect", odd)
     assert status == 0
-    row = next(line for line in out.splitlines() if "hinge" in line)
+    row = next(line for line in out.splitlines() if line.startswith("0 "))
     assert "continuous" in row
-    assert "none to none rad" in row
     assert "0.25" in row
+    assert row.split()[3:6] == ["none", "none", "none"]  # without units
     findings = Robot.load(odd).check()
     assert findings
     for finding in findings:
-        assert str(finding) in out
+        assert str(finding) in flat(out[: out.index(row)])
+
+
+def test_one_cause_is_one_sentence(batchpid, tmp_path):
+    """Joints with the same cause are listed after one sentence, their figures after their names."""
+    unlimited = '<limit lower="-1" upper="1" effort="0" velocity="2"/>'
+    joints = [joint(f"j{k}", f"l{k}", f"l{k + 1}", inner=unlimited) for k in range(4)]
+    path = write(tmp_path, robot(*(link(f"l{k}") for k in range(5)), *joints))
+    out = batchpid("inspect", path)[1]
+    assert out.count("is a placeholder") == 1
+    assert "motor. 4 joints: 'j0', 'j1', 'j2', 'j3' note:" in flat(out)
+    assert out.count("no effort limit") == 1
+    limits = Robot.load(path).design_effort_limit
+    assert f"4 joints: 'j0' ({limits[0]:.3g} N m), 'j1' ({limits[1]:.3g} N m), " in flat(out)
+
+
+def test_pairs_that_do_not_collide_are_counted_and_listed_on_request(batchpid):
+    out = batchpid("inspect", "panda")[1]
+    assert "Ground at height 0. 12 pairs of links excluded from collision: 12 'Adjacent' (--all)." in out
+    assert "panda_link0 - panda_link1" not in out
+    assert "Do not collide, 'Adjacent': panda_link0 - panda_link1, " in batchpid("inspect", "panda", "--all")[1]
+
+
+def test_masses_and_their_sources(batchpid, tmp_path):
+    """Of <inertial>, repaired, of the shapes at SAPIEN's density, or none; light links on request."""
+    box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
+    repaired = INERTIAL.replace('ixx="0.1"', 'ixx="0"')
+    speck = INERTIAL.replace('value="1"', 'value="1e-6"')
+    parts = link("base"), link("arm", box), link("hand", repaired), link("frame", ""), link("speck", speck)
+    ends = [("base", "arm"), ("arm", "hand"), ("hand", "frame"), ("hand", "speck")]
+    joints = [joint(f"j{k}", *pair, *(("fixed", "") if k > 1 else ())) for k, pair in enumerate(ends)]
+    path = write(tmp_path, robot(*parts, *joints))
+    out = batchpid("inspect", path)[1]
+    assert "5 links, 8 kg, " in out
+    rows = {line.split()[0]: line.split(maxsplit=3)[1:] for line in out.splitlines() if " kg  " in line}
+    assert rows == {
+        "base": ["1", "kg", "<inertial>"],
+        "arm": ["6", "kg", "collision shapes at 1000 kg/m^3"],
+        "hand": ["1", "kg", "<inertial>, repaired"],
+    }
+    assert "Total 8 kg: 2 links with the mass from <inertial>, 1 link with the mass from collision shapes" in out
+    assert "2 links with little mass or none not shown (--all)" in flat(out)
+    every = batchpid("inspect", path, "--all")[1]
+    assert {"frame", "speck"} <= {line.split(" ")[0] for line in every.splitlines()}
 
 
 def test_strict_fails_on_findings_worse_than_notes(batchpid, odd):

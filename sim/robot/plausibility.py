@@ -1,0 +1,110 @@
+"""Figures that no robot has: meshes in millimetres, masses in grams, inertia tensors in kg mm^2, ...
+
+Every figure is compared with the reach of the robot: the length L [m] of its longest chain of joints, which is seldom
+wrong, because the robot would be drawn apart. The limits are far from sound robots. Of 64 published ones, and the
+bundled ones, the farthest are in brackets:
+
+- the shapes of a link are larger than 20 L (3.2 L), or all are smaller than L/200 (L/3);
+- a link with a mass of its own has less than 0.1 (0.6) or more than 30,000 (1100) kg per cubic metre of its size, the
+  diagonal of its shapes or the distance to the next joint;
+- its radius of gyration exceeds 2 L and 2 of its sizes (1.3 L);
+- a joint bears as much as 1000 L^3 kg at the distance L (8 L^3), by gravity or by inertia.
+
+Links with less than a hundredth of the mass are not judged by it, nor is a fixed base: sensors, frames and stands are
+often given any figures.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+
+from sim.robot.description import RobotDescription
+from sim.robot.effort import POSES
+from sim.robot.findings import Finding
+
+GRAVITY = 9.81
+LARGEST, SMALLEST = 20.0, 1 / 200
+"""Bounds of the size of shapes over the reach."""
+SPARSEST, DENSEST = 0.1, 30_000.0
+"""Bounds of the mass of a link per cubic size [kg/m^3]."""
+GYRATION = 2.0
+"""Bound of a radius of gyration over the reach, and over the size of the link."""
+LOAD = 1000.0
+"""Bound of the mass at the end of the reach that a joint bears, over the cubic reach [kg/m^3]."""
+SHORT = 0.3
+"""Reach [m] of robots with less, e.g. with all joints at one point."""
+JUDGED = 0.01
+"""Share of the mass that a link must have to be judged by its mass."""
+
+_UNITS = "scale the mesh to metres: <mesh scale='0.001 0.001 0.001'> if it is in millimetres"
+
+
+def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
+    """Yield the sizes, masses, inertias and loads that no robot has."""
+    masses, (reach, next_joint, fixed) = robot.link_masses, _distances(robot)
+    length = max(reach, SHORT)
+    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
+    by_shapes = [name for name, mass in masses.items() if mass.source == "shapes"]
+    total = sum(mass.mass for mass in masses.values())
+    of_reach = f"the robot's chain of joints is {reach:.3g} m long"
+    for name, size in sizes.items():
+        if size > LARGEST * length:
+            text = f"no robot has such large collision shapes: {of_reach}"
+            yield Finding("warning", "scale", text, _UNITS, link=name, detail=f"{size:.3g} m")
+    if sizes and max(sizes.values()) < SMALLEST * reach:
+        text = f"no robot has such small collision shapes, at most {max(sizes.values()):.2g} m: {of_reach}"
+        yield Finding("warning", "scale", text, "correct <mesh scale=>; the meshes may be in metres already")
+    for name, mass in masses.items():
+        size, at_rest = max(mass.size, next_joint[name]), robot.fixed_base and name in fixed
+        if mass.source in ("shapes", "none") or mass.mass < JUDGED * total or at_rest:
+            continue
+        if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
+            kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
+            remedy = "give <mass> in kg and <collision> in metres"
+            detail = f"{mass.mass:.3g} kg over {size:.3g} m"
+            yield Finding("warning", "mass", f"no link of such a size is so {kind}", remedy, link=name, detail=detail)
+        if mass.gyration > GYRATION * max(length, size):
+            text = f"no link has so much inertia for its mass: its radius of gyration exceeds the robot, {of_reach}"
+            remedy, detail = "give <inertia> in kg m^2, about the centre of mass", f"{mass.gyration:.3g} m"
+            yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
+    yield from _loads(robot, max(reach, 1.0), bool(by_shapes))
+
+
+def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[Finding]:
+    """Yield the joints that bear more than a robot of this ``length`` [m] can weigh."""
+    poses = robot.sample(POSES, seed=0)
+    gravity = np.abs(robot.holding_efforts(poses)).max(0)
+    inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
+    for joint, force, moved in zip(robot.joints, gravity, inertia, strict=True):
+        arm = 1.0 if joint.type == "prismatic" else length
+        if max(force / (GRAVITY * arm), moved / arm**2) <= LOAD * length**3:
+            continue
+        unit = "kg" if joint.type == "prismatic" else "kg m^2"
+        text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"
+        remedy = "correct <mass> and <inertia>"
+        if by_shapes:
+            text += ", here from the size of collision shapes"
+            remedy = f"add <inertial> to the links without, or {_UNITS}"
+        detail = f"gravity {force:.3g} {joint.effort_unit}, inertia {moved:.3g} {unit}"
+        yield Finding("warning", "load", text, remedy, joint.name, detail=detail)
+
+
+def _distances(robot: RobotDescription) -> tuple[float, dict[str, float], set[str]]:
+    """Return the length [m] of the longest chain of joints, slides extended; of each link the distance [m] to its
+    farthest joint; and the links that are fixed to the root.
+    """
+    depth: dict[str, float] = defaultdict(float)
+    farthest: dict[str, float] = defaultdict(float)
+    fixed = {link.name for link in robot.links} - {joint.child_link for joint in robot.all_joints}
+    for joint in robot.all_joints:  # parents first
+        if joint.parent_link in fixed and not joint.moves:
+            fixed.add(joint.child_link)
+        offset = float(np.linalg.norm(joint.origin))
+        ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
+        travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
+        depth[joint.child_link] = depth[joint.parent_link] + offset + travel
+        farthest[joint.parent_link] = max(farthest[joint.parent_link], offset)
+    return max(depth.values(), default=0.0), farthest, fixed
