@@ -141,8 +141,8 @@ def sentences(findings: Sequence[Finding]) -> str:
 
 
 def _fill(text: str) -> str:
-    options = {"subsequent_indent": "  ", "break_long_words": False, "break_on_hyphens": False}
-    return textwrap.fill(text.replace("N m", "N\xa0m"), 120, **options).replace("\xa0", " ")
+    wrapper = textwrap.TextWrapper(120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(text.replace("N m", "N\xa0m")).replace("\xa0", " ")
 
 
 def _count(number: int, what: str) -> str:

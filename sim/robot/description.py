@@ -89,7 +89,9 @@ class RobotDescription(Urdf):
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
         shaped = sum(not link.inertial and link.collisions > 0 for link in self.links)  # their mass needs SAPIEN
-        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [f"{shaped} links with the mass of shapes"] * (shaped > 0)
+        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [f"{shaped} links with the mass of shapes"] * (
+            shaped > 0
+        )
         mass = " and ".join(masses)
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"

@@ -66,9 +66,7 @@ def _sentence(same: Sequence[Finding]) -> str:
     return f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s: {', '.join(names)}"
 
 
-def finding_of(
-    element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = ""
-) -> Finding:
+def finding_of(element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = "") -> Finding:
     """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the robot."""
     owner: etree._Element | None = element
     while owner is not None and owner.tag not in ("joint", "link"):

@@ -11,7 +11,6 @@ from sim.robot.findings import Finding, finding_of
 from sim.robot.parts import MOVING_TYPES
 from sim.robot.xml import readable
 
-
 GIVE_RANGE = "give <limit lower= upper=>"
 """Remedy for position limits that are missing or unreadable."""
 

@@ -95,7 +95,9 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
         light = not link.collisions and bodies[link.name] in loaded
         severity, text = "note" if fixed or light else "warning", f"no <inertial>: {effect}"
         detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.collisions else ""
-        yield Finding(severity, "no-inertia", text, "add <inertial> with mass and inertia", link=link.name, detail=detail)
+        yield Finding(
+            severity, "no-inertia", text, "add <inertial> with mass and inertia", link=link.name, detail=detail
+        )
 
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
@@ -167,7 +169,10 @@ def _strength(robot: RobotDescription) -> Iterator[Finding]:
         friction = f", friction {joint.friction:g}" if robot.friction[index] else ""
         gravity = f"gravity up to {load[:, index].max():.3g}{friction}, {100 * share:.0f} % of poses"
         text = "effort limit does not overcome gravity and friction in every pose: some cannot be held or left"
-        remedy, detail = "expect no moves there, or correct <limit effort=>", f"{limit:g} {joint.effort_unit}, {gravity}"
+        remedy, detail = (
+            "expect no moves there, or correct <limit effort=>",
+            f"{limit:g} {joint.effort_unit}, {gravity}",
+        )
         yield Finding("warning", "weak", text, remedy, joint.name, detail=detail)
 
 

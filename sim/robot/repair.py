@@ -127,9 +127,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
     for joint in root.findall("joint"):
         name, ends = joint.get("name"), ends_of(joint)
         if name is not None and seen.get(name) == ends:
-            yield finding_of(
-                joint, "warning", "repeated-name", "given twice: the first is kept", "remove the copy"
-            )
+            yield finding_of(joint, "warning", "repeated-name", "given twice: the first is kept", "remove the copy")
             root.remove(joint)
             continue
         base = new = name or "{}_to_{}".format(*ends)
@@ -139,9 +137,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
         if new != name:
             joint.set("name", new)
             problem = "no name" if name is None else f"the name {name!r} is used twice"
-            yield finding_of(
-                joint, "warning", "repeated-name", f"{problem}: called {new!r}", "name it in the URDF"
-            )
+            yield finding_of(joint, "warning", "repeated-name", f"{problem}: called {new!r}", "name it in the URDF")
         seen[new] = ends
 
 
@@ -157,7 +153,5 @@ def _tree(root: etree._Element) -> Iterator[Finding]:
     joined = {end for pair in ends for end in pair}
     for name, link in links.items():
         if joined and name not in joined:
-            yield finding_of(
-                link, "warning", "loose-link", "held by no joint: left out", "join it, or remove it"
-            )
+            yield finding_of(link, "warning", "loose-link", "held by no joint: left out", "join it, or remove it")
             root.remove(link)

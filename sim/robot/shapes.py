@@ -1,7 +1,8 @@
 """Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for a view that has no SAPIEN renderer.
 
 A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
-collision shapes. Unreadable files are reported. The triangles are made, or read from mesh files, by ``trimesh`` (extra "view").
+collision shapes. Unreadable files are reported. The triangles are made, or read from mesh files, by ``trimesh`` (extra
+"view").
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class _UnreadableMesh(Exception):
     def finding(self, link: str, shown: str) -> Finding:
         """Return the finding of a ``link`` in whose place ``shown`` is drawn."""
         text = f"mesh {self.reason}: {shown}"
-        return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=self.name)
+        return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=repr(self.name))
 
 
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
@@ -126,16 +127,16 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
     if path is None:
         remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load"
         raise _UnreadableMesh(name, "not found", remedy)
+    problem = "no triangles"
     try:
         loaded: Any = load(path, force="mesh", process=False)
     except Exception as error:  # trimesh has an error of its own for each fault of a file
+        loaded, problem = None, f"{type(error).__name__}: {error}"
         if path.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
             reason, remedy = "in COLLADA needs the package pycollada", "pip install 'batchpid[view]'"
             raise _UnreadableMesh(name, reason, remedy) from error
-        reason = mesh_problem(path) or f"{type(error).__name__}: {error}"
-        raise _UnreadableMesh(name, f"cannot be read ({reason})", "repair the file") from error
-    if not len(loaded.faces):
-        raise _UnreadableMesh(name, "has no triangles", "repair the file")
+    if loaded is None or not len(loaded.faces):
+        raise _UnreadableMesh(name, f"cannot be read ({mesh_problem(path) or problem})", "repair the file")
     factor, _, unit = str(loaded.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
     if unit == "meters":
         loaded.apply_scale(float(factor))

@@ -46,9 +46,7 @@ class RobotLayout(NamedTuple):
         return TILE * low, TILE * high
 
 
-def arrange_robots(
-    kinematics: Kinematics, robot: Robot, groups: int, per_group: int, ground: bool
-) -> RobotLayout:
+def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group: int, ground: bool) -> RobotLayout:
     """Return a layout of ``groups`` adjacent blocks of ``per_group`` robots around the origin, roughly square.
 
     ``ground`` says whether physics has one, which is the floor; otherwise the floor is at the lowest link.

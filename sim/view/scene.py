@@ -32,8 +32,9 @@ _SETPOINT_STYLE = {"batched_colors": _SETPOINT_COLOUR, "opacity": 0.22, **_NO_SH
 
 
 class RobotScene:
-    """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``: a tiled one for the ``ground`` of
-    physics, otherwise a grid at the lowest link.
+    """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``.
+
+    The floor is tiled where physics has a ``ground``, otherwise a grid at the lowest link.
     """
 
     def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from robots import load_bundled
+from tiny_urdf import INERTIAL, joint, link, robot
+from tiny_urdf import write as write_urdf
 
 import batchpid as bp
-from sim import Observation, Rollout, write_recording
+from sim import Observation, Robot, Rollout, write_recording
 from sim.view.address import listen
 
 pytest.importorskip("viser")
@@ -66,6 +68,33 @@ def test_bad_flags_are_named(flags, message, batchpid):
     status, said, err = batchpid("view", *flags)
     assert (status, said) == (2, "")
     assert err.startswith(f"batchpid: {message}")
+
+
+def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(batchpid, tmp_path, monkeypatch):
+    """And a robot without ground, drawn by the real server, over a grid."""
+    texts = []
+    monkeypatch.setattr("viser.GuiApi.add_html", lambda self, content, **_: texts.append(content))
+    (tmp_path / "<b>.stl").write_text("version https://git-lfs.github.com/spec/v1")
+    seen = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in ("no.stl", "&lt;b>.stl")]
+    box = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+    parts = (
+        link("base", INERTIAL + seen[0]),
+        link("arm", INERTIAL + seen[1] + box),
+        joint("j", "base", "arm", origin="0 0 0"),
+    )
+    path = write_urdf(tmp_path, robot(*parts))
+    assert not Robot.load(path).has_ground
+    status, _, err = batchpid("view", path, *SHORT, "--time-limit", 0.1)
+    assert status == 0
+    assert err.splitlines() == [
+        "batchpid: warning: link 'base' ('no.stl'): mesh not found: nothing is drawn; put the file next to the URDF, "
+        "or pass package_dirs=[...] to Robot.load",
+        "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
+        "git lfs pull): collision shapes are drawn instead; repair the file",
+    ]
+    assert len(texts) == 2
+    assert "mesh not found" in texts[0]
+    assert "&lt;b&gt;.stl" in texts[1]
 
 
 def test_a_port_in_use_is_named_with_the_next(batchpid):

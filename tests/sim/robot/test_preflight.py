@@ -27,7 +27,12 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
 @pytest.mark.parametrize(
     ("text", "code", "severity", "message"),
     [
-        (one_joint(arm=COLLISION), "no-inertia", "warning", "link 'arm' .1 kg.: no <inertial>.*collision shapes, at 1000"),
+        (
+            one_joint(arm=COLLISION),
+            "no-inertia",
+            "warning",
+            "link 'arm' .1 kg.: no <inertial>.*collision shapes, at 1000",
+        ),
         (one_joint(arm=""), "no-inertia", "warning", "link 'arm': .*1e-6 kg, without load"),
         (
             robot(link("b"), link("m", ""), link("a"), joint("h", "b", "m"), joint("k", "m", "a")),

@@ -90,8 +90,16 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "velocity of 0": (one_joint(LIMIT.replace('"2"', '"0"')), "placeholder", "'hinge': .*placeholder"),
     "NaN effort": (one_joint(LIMIT.replace('"10"', '"nan"')), "limits", "'hinge': .*'nan'> is no number"),
     "digits of another script": (one_joint(LIMIT.replace('"10"', '"1_0"')), "limits", "'1_0'> is no number"),
-    "negative effort": (one_joint(LIMIT.replace('"10"', '"-9"')), "limits", "'hinge' .-9.: effort limit is negative: its magnitude"),
-    "negative damping": (one_joint(LIMIT + '<dynamics damping="-1"/>'), "dynamics", "'hinge': .*damping='-1'.*0 is used"),
+    "negative effort": (
+        one_joint(LIMIT.replace('"10"', '"-9"')),
+        "limits",
+        "'hinge' .-9.: effort limit is negative: its magnitude",
+    ),
+    "negative damping": (
+        one_joint(LIMIT + '<dynamics damping="-1"/>'),
+        "dynamics",
+        "'hinge': .*damping='-1'.*0 is used",
+    ),
     "infinite friction": (one_joint(LIMIT + '<dynamics friction="inf"/>'), "dynamics", "'hinge': .*friction='inf'"),
     "mimic of nothing": (moved('<mimic joint="ghost"/>'), "mimic", "'tip_joint': .*'ghost'.*not in the file.*independ"),
     "mimic without joint": (moved('<mimic multiplier="2"/>'), "mimic", "'tip_joint': mimics None"),
@@ -109,7 +117,11 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
         "mimic",
         "'k': mimics 'f', which does not move",
     ),
-    "fixed joint that mimics": (moved('<mimic joint="hinge"/>', "fixed"), "mimic", "'tip_joint': a fixed joint does not"),
+    "fixed joint that mimics": (
+        moved('<mimic joint="hinge"/>', "fixed"),
+        "mimic",
+        "'tip_joint': a fixed joint does not",
+    ),
     "mimics in a circle": (
         moved('<mimic joint="hinge"/>').replace("</joint>", '<mimic joint="tip_joint"/></joint>', 1),
         "mimic",

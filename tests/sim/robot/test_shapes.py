@@ -1,5 +1,6 @@
 """Surfaces of a robot: closed, facing out, of the right size and colour, with the collision shapes as fallback."""
 
+import re
 import sys
 
 import numpy as np
@@ -114,6 +115,43 @@ def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
     (cube,) = surfaces(load(tmp_path, b=visual(f'<mesh filename="cube.stl" scale="0.1 {0.2 * mirror} 0.3"/>')))
     assert cube.link == "b"
     assert volume(cube.vertices, cube.faces) == pytest.approx(0.006)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("", 1.0), ('<unit name="millimeter" meter="0.001"/>', 1e-3)])
+def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
+    pytest.importorskip("collada")
+    text = trimesh.creation.box((1, 2, 3)).export(file_type="dae").decode()
+    (tmp_path / "box.dae").write_text(text.replace("<up_axis>", f"{unit}<up_axis>"))
+    findings = []
+    (drawn,) = surfaces(load(tmp_path, b=visual('<mesh filename="box.dae"/>')), findings=findings)
+    assert findings == []
+    np.testing.assert_allclose(np.ptp(drawn.vertices, axis=0), np.array([3, 2, 1]) * factor, rtol=1e-6)
+
+
+def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "collada", None)
+    (tmp_path / "empty.stl").write_text("")
+    (tmp_path / "box.dae").write_text("<COLLADA/>")
+    for name, reason, remedy in (
+        ("lost.stl", "not found", "package_dirs"),
+        ("empty.stl", r"cannot be read \(empty\)", "repair the file"),
+        ("box.dae", "needs the package pycollada", r"pip install 'batchpid\[view\]'"),
+    ):
+        for shape, shown in (("", "nothing is drawn"), (visual(BOX, kind="collision"), "collision shapes are drawn")):
+            findings = []
+            surfaces(load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings)
+            (finding,) = findings
+            assert (finding.code, finding.link, finding.detail) == ("visual-mesh", "b", repr(name))
+            assert re.search(f"{reason}.*: {shown}.*; .*{remedy}", str(finding)), str(finding)
+
+
+def test_visuals_are_looked_up_in_package_dirs(tmp_path):
+    (tmp_path / "elsewhere" / "pack").mkdir(parents=True)
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "elsewhere" / "pack" / "cube.stl")
+    seen = link("b", INERTIAL + visual('<mesh filename="package://pack/cube.stl"/>'))
+    path = write(tmp_path, robot(link("a"), seen, joint("j", "a", "b")))
+    assert surfaces(Robot.load(path)) == []
+    assert len(surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))) == 1
 
 
 def test_a_malformed_visual_is_an_error_that_names_it(tmp_path):
