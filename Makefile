@@ -8,7 +8,8 @@
 # make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
 # make soak     the minutes-long tests
 #
-# Each builds .venv if it is missing or older than pyproject.toml. Another Python: make PYTHON=/path/to/python3.12
+# Each builds .venv if it is missing or older than pyproject.toml, and the extensions if they are older than their
+# sources. Another Python: make PYTHON=/path/to/python3.12
 
 # The first Python that is new enough; evaluated only when .venv is built.
 PYTHON ?= $(or $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -17,6 +18,10 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
+
+# Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
+NATIVE := setup.py sim/engine/native/interface.py $(wildcard sim/engine/native/*.cpp sim/engine/native/*.h)
+BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
 .PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak clean
 .DELETE_ON_ERROR:
@@ -84,16 +89,25 @@ soak: $(VENV)/.dev
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
 
-# Stamp files: .base for what the product needs, .dev for what its development needs as well.
-$(VENV)/.base: pyproject.toml | $(RUN)
+# Stamp files: .base for what the product needs, .dev for what its development needs as well, .python and .tools for the
+# installed packages of each.
+$(VENV)/.base: $(VENV)/.python $(NATIVE)
+	@$(BUILD)
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.tools $(NATIVE)
+	@$(BUILD)
+	@touch $@
+
+$(VENV)/.python: pyproject.toml | $(RUN)
 	@echo "installing batchpid into $(VENV) (once)"
 	@$(PIP) --editable .
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml | $(RUN)
+$(VENV)/.tools: pyproject.toml | $(RUN)
 	@echo "installing batchpid and its development tools into $(VENV) (once; a minute or two)"
 	@$(PIP) --editable '.[dev]'
-	@touch $(VENV)/.base $@
+	@touch $(VENV)/.python $@
 
 $(RUN):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

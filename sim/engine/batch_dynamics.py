@@ -26,18 +26,21 @@ limits.
 
 from __future__ import annotations
 
-import os
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import native
 from sim.engine.building import SceneSpec
-from sim.engine.dynamics import loaded_dynamics, robot_dynamics
+from sim.engine.dynamics import Dynamics, loaded_dynamics, robot_dynamics
+from sim.engine.native.interface import DYNAMICS, STEP
 from sim.robot.description import RobotDescription
 
 Float64 = NDArray[np.float64]
+Models = Callable[[float], Dynamics]
+"""Model of a robot with a payload [kg]."""
 _MOST_PAYLOADS = 64
 """Most models of robots with a payload that are kept."""
 
@@ -69,16 +72,16 @@ SWEEPS = 2
 
 
 def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | PinocchioBatchDynamics:
-    """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension was built."""
+    """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension is used."""
     moving = MovingJoints.of(robot, joints)
-    if is_native():
-        return NativeBatchDynamics(robot, moving)
-    return PinocchioBatchDynamics(robot, moving)
+    if native.status().active:
+        return NativeBatchDynamics(models_of(robot), moving)
+    return PinocchioBatchDynamics(models_of(robot), moving)
 
 
-def is_native() -> bool:
-    """Return whether the extension computes the dynamics; Pinocchio's differ in the last bits."""
-    return native.batch_extension is not None and os.environ.get(native.SWITCH) != "0"
+def models_of(robot: RobotDescription) -> Models:
+    """Return the models of ``robot`` on a fixed base."""
+    return lambda payload: loaded_dynamics(robot, payload) if payload else robot_dynamics(robot, ground=False)
 
 
 class MovingJoints(NamedTuple):
@@ -120,13 +123,14 @@ class MovingJoints(NamedTuple):
 class NativeBatchDynamics:
     """Dynamics by the extension: those of :class:`PinocchioBatchDynamics`."""
 
-    def __init__(self, robot: RobotDescription, joints: MovingJoints) -> None:
-        bodies, loaded = robot_dynamics(robot, ground=False).bodies, loaded_dynamics(robot, 1.0).bodies
+    def __init__(self, models: Models, joints: MovingJoints) -> None:
+        bodies, loaded = models(0.0).bodies, models(1.0).bodies
         gained = loaded.mass - bodies.mass
         carrier = int(np.argmax(gained))
         moment = loaded.mass[carrier] * loaded.center[carrier] - bodies.mass[carrier] * bodies.center[carrier]
         self._joints, self._carries = joints, float(gained[carrier] > 0.5)  # 0 where the tool is part of the base
-        self._tree = native.batch_extension.tree(
+        self._native = native.extension("_batch_dynamics")
+        self._tree = self._native.tree(
             bodies.tree,
             bodies.table(),
             joints.leader,
@@ -143,9 +147,9 @@ class NativeBatchDynamics:
         """See :meth:`PinocchioBatchDynamics.at`."""
         count, joints = qpos.shape
         found = Passive(np.empty((count, joints, joints)), np.empty((count, joints)), np.empty((count, joints)))
-        native.batch_extension.dynamics(
-            self._tree, *map(np.ascontiguousarray, (qpos, qvel, self._carries * payload)), *found
-        )
+        inputs = {"qpos": qpos, "qvel": qvel, "payload": self._carries * payload}
+        arrays = {name: np.ascontiguousarray(rows) for name, rows in inputs.items()} | found._asdict()
+        self._native.dynamics(self._tree, *(arrays[name] for name in DYNAMICS))
         return found
 
     def step(
@@ -159,19 +163,19 @@ class NativeBatchDynamics:
     ) -> tuple[Float64, Float64, Float64]:
         """See :meth:`PinocchioBatchDynamics.step`."""
         q, v, f = (leaf.copy() for leaf in state)
-        native.batch_extension.step(
-            q, v, f, matrix, effort, added, *friction, self._joints.low, self._joints.high, dt, SWEEPS
-        )
+        arrays = {"qpos": q, "qvel": v, "friction": f, "matrix": matrix, "effort": effort, "added": added}
+        arrays |= friction._asdict() | {"low": self._joints.low, "high": self._joints.high}
+        self._native.step(*(arrays[name] for name in STEP), dt, SWEEPS)
         return q, v, f
 
 
 class PinocchioBatchDynamics:
     """Dynamics of the joints that move, of many robots: by Pinocchio, and steps by NumPy."""
 
-    def __init__(self, robot: RobotDescription, joints: MovingJoints) -> None:
-        self._robot, self._joints, self._spread = robot, joints, joints.matrix
-        self._empty = robot_dynamics(robot, ground=False)
-        self._loaded: dict[float, Any] = {}
+    def __init__(self, models: Models, joints: MovingJoints) -> None:
+        self._models, self._joints, self._spread = models, joints, joints.matrix
+        self._empty = models(0.0)
+        self._loaded: dict[float, Dynamics] = {}
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
         """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
@@ -186,13 +190,13 @@ class PinocchioBatchDynamics:
                 loaded[rows] = model.inverse_dynamics(q[rows], v[rows], still[rows]) - force[rows]
         return Passive(self._spread.T @ matrix @ self._spread, force @ self._spread, loaded @ self._spread)
 
-    def _model(self, payload: float) -> Any:
+    def _model(self, payload: float) -> Dynamics:
         if not payload:
             return self._empty
         if payload not in self._loaded:
             if len(self._loaded) >= _MOST_PAYLOADS:
                 self._loaded.clear()
-            self._loaded[payload] = loaded_dynamics(self._robot, payload)
+            self._loaded[payload] = self._models(payload)
         return self._loaded[payload]
 
     def step(

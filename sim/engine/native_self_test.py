@@ -1,16 +1,30 @@
-"""Self-test of the native calls, in a process to itself: bit-identical results to Python's, or an exit status."""
+"""Self-test of the native extensions, in a process to itself: the results of Python, or an exit status.
+
+Calls into SAPIEN, sim steps and programs are compared bit by bit. Pinocchio, with which the dynamics of many robots are
+compared, rounds otherwise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid as bp
+from sim.engine.array_program import ArrayProgram, trace
+from sim.engine.batch_dynamics import (
+    Friction,
+    MovingJoints,
+    NativeBatchDynamics,
+    PinocchioBatchDynamics,
+)
 from sim.engine.building import SceneSpec, build_scene, new_system
 from sim.engine.calls import PythonCalls
-from sim.engine.native import NativeCalls, assumed, python_calls
+from sim.engine.dynamics import Dynamics
+from sim.engine.native import NativeCalls, python_calls
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS
 from sim.engine.sim_step import NativeStep
@@ -27,16 +41,114 @@ _URDF = f"""<robot name="test"><link name="base"/><link name="arm">{_BODY}</link
 <limit lower="-1" upper="1" effort="100" velocity="9"/></joint></robot>"""
 
 
+Float64 = NDArray[np.float64]
+
+
 def main() -> None:
-    """Compare native and Python calls on four robots in two systems; raise what is found."""
+    """Compare the results of the extensions with those of Python; raise what is found.
+
+    The process takes the extensions: their fingerprint is in its environment.
+    """
+    _compare_programs()
     _compare_calls()
     _compare_steps()
+    _compare_dynamics()
+
+
+def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
+    """Return the results of all operations of programs on arrays (rows, columns) and a matrix for each row."""
+    xp = a.__array_namespace__()
+    masks = a > b, a < b, a != b, xp.isfinite(a), (a > b) & (b < c)
+    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.maximum(a, b), xp.minimum(a, b)
+    least = a.min(axis=-1, keepdims=True)
+    product = (matrix * b[:, None, :]).sum(axis=-1)
+    return [*numbers, xp.where(a > b, b, c), xp.zeros_like(a) + least, product, *masks]
+
+
+def _compare_programs() -> None:
+    """Compare programs of all operations, and of the law, with NumPy; some numbers are zero, infinite or NaN."""
+    rng, shape = np.random.default_rng(0), (5, 9)
+    a, b, c = 10.0 * rng.normal(size=(3, *shape))
+    a.flat[:6], b.flat[4:8] = (0.0, np.inf, -np.inf, np.nan, 2.5, 1.0), (2.5, 1.0, np.nan, np.inf)
+    inputs = (a, b, c, rng.normal(size=(*shape, shape[1])))
+    with np.errstate(all="ignore"):
+        expected = every_operation(*inputs)
+    masks = sum(rows.dtype == bool for rows in expected)
+    _assert_identical(ArrayProgram(trace(every_operation, 0, 4), (), 4, shape)(*inputs, masks=masks), expected)
+
+    options: dict[str, Any] = {
+        "effort_limit": 5.0,
+        "derivative_filter_time": 0.01,
+        "anti_windup": "back_calculation",
+        "deadband": 0.1,
+    }
+    params = bp.make_params(shape[1], 40.0, ki=50.0, kd=2.0, setpoint_weight=0.7, continuous=True, **options)
+    k, state = bp.discretise(params, 1e-3, shape[0]), bp.init(params, b)
+    leaves = [[leaf for leaf in group if isinstance(leaf, np.ndarray)] for group in (k, state)]
+
+    def law(*arrays: Any) -> list[Any]:
+        rest = iter(arrays)
+        mine, before = (
+            [next(rest) if isinstance(leaf, np.ndarray) else leaf for leaf in group] for group in (k, state)
+        )
+        new, effort = bp.advance(type(k)(*mine), bp.PIDState(*before), *rest)
+        return [effort, *(leaf for leaf in new if leaf is not None)]
+
+    setpoint, measurement = 0.1 * rng.normal(size=(2, *shape))
+    program = ArrayProgram(trace(law, len(leaves[0]), len(leaves[1]) + 2), leaves[0], len(leaves[1]) + 2, shape)
+    with np.errstate(all="ignore"):
+        _assert_identical(
+            program(*leaves[1], setpoint, measurement), law(*leaves[0], *leaves[1], setpoint, measurement)
+        )
+
+
+def _assert_identical(ours: list[Any], theirs: list[Any]) -> None:
+    for number, (mine, expected) in enumerate(zip(ours, theirs, strict=True)):
+        same = np.broadcast_to(expected, mine.shape)
+        # The sign of a NaN means nothing.
+        nan = np.isnan(mine) & np.isnan(same)
+        if mine.dtype != same.dtype or np.where(nan, 0, mine).tobytes() != np.where(nan, 0, same).tobytes():
+            raise AssertionError(f"result {number} of a native program is not NumPy's")
+
+
+def _compare_dynamics() -> None:
+    """Compare the dynamics and a step of robots with payloads with Pinocchio's, and with those of each robot alone."""
+    spec = replace(_spec(), ground=False)
+
+    def models(payload: float) -> Dynamics:
+        return Dynamics(spec, payload, "hand" if payload else None)
+
+    limit = np.array([np.inf, 1.0])
+    joints = MovingJoints(np.array([0, 1], np.int32), np.ones(2), np.zeros(2), -limit, limit)
+    rng, count = np.random.default_rng(0), 6
+    qpos, qvel, effort = rng.uniform(-0.9, 0.9, (3, count, 2))
+    payload, added = np.linspace(0.0, 2.0, count)[:, None], np.full((count, 2), 0.1)
+    friction = Friction(np.full((count, 2), 0.3), np.full((count, 1), 0.01), np.full((count, 2), 0.02))
+    results = []
+    ours = NativeBatchDynamics(models, joints)
+    for model, groups in (
+        (ours, [slice(0, count)]),
+        (ours, [slice(row, row + 1) for row in range(count)]),
+        (PinocchioBatchDynamics(models, joints), [slice(0, count)]),
+    ):
+        parts = []
+        for rows in groups:
+            found = model.at(qpos[rows], qvel[rows], payload[rows])
+            state = (qpos[rows], qvel[rows], np.zeros_like(qpos[rows]))
+            friction_rows = Friction(*(leaf[rows] for leaf in friction))
+            step = model.step(state, found.matrix, effort[rows], added[rows], friction_rows, 1e-2)
+            parts.append([*found, *step])
+        results.append([np.concatenate(leaves) for leaves in zip(*parts, strict=True)])
+    for mine, alone, theirs in zip(*results, strict=True):
+        if mine.tobytes() != alone.tobytes():
+            raise AssertionError("the native dynamics of a robot depend on the others")
+        if not np.allclose(mine, theirs, rtol=1e-6, atol=1e-6):
+            raise AssertionError("native dynamics and Pinocchio's give different results")
 
 
 def _compare_steps() -> None:
     """Compare the native sim step with Python's, in two packs of robots that approach the ground."""
-    with assumed():
-        ours = Pack(_spec(), 4, system_size=2)
+    ours = Pack(_spec(), 4, system_size=2)
     with python_calls():
         theirs = Pack(_spec(), 4, system_size=2)
     table, looks = np.zeros((3, 4, 2)), 0
@@ -50,8 +162,7 @@ def _compare_steps() -> None:
         if step(effort, *table):
             looks += 1
             ours.look(step.left())
-            with assumed():
-                step = NativeStep(ours, True, True, True, None)
+            step = NativeStep(ours, True, True, True, None)
         reads = theirs.read_qpos(), theirs.read_qvel(), theirs.passive_force(True, True)
         if np.array(reads).tobytes() != table.tobytes() or (ours.isolated != theirs.isolated).any():
             raise AssertionError("native and Python sim steps give different results")

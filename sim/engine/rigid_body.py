@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine.native import xla
+from sim.engine.native.interface import BODY
 from sim.robot.rotations import from_rpy, rotate
 from sim.robot.spatial_inertia import SpatialInertia, total
 
@@ -44,7 +45,7 @@ class RigidBodies(NamedTuple):
 
     def table(self) -> Float64:
         """Return all but the tree, a row for each body (dof, 25)."""
-        return np.hstack([leaf.reshape(len(self.tree), -1) for leaf in self[1:]])
+        return np.hstack([getattr(self, name).reshape(-1, numbers) for name, numbers in BODY.items()])
 
 
 def bodies_of(robot: Any) -> RigidBodies:

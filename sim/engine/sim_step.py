@@ -9,27 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import native
+from sim.engine.native.interface import STATUS, Group
 from sim.engine.pack import Pack
 
-LEFT_REGION, CONTACTS, NOT_FINITE, TOO_FAST, FAILED = (1 << bit for bit in range(5))
-"""Bits of the status of a sim step: reasons for which a loop over sim steps has to stop, as in sim_step.h."""
-
-
-class _Group(ctypes.Structure):
-    """The type of this name in sim_step.h."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "system_of", "contacts", "watched")),
-        *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
-        *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
-        ("pairs", ctypes.c_int64),
-        ("bodies_size", ctypes.c_int64),
-        ("gravity", ctypes.c_int32),
-        ("coriolis", ctypes.c_int32),
-        ("velocities", ctypes.c_int32),
-        ("unused", ctypes.c_int32),
-        ("message", ctypes.c_char * 256),
-    ]
+FAILED = 1 << STATUS.index("failed")
+"""Bit of the status of a sim step in which SAPIEN raised an exception."""
 
 
 class NativeStep:
@@ -80,7 +64,7 @@ class NativeStep:
             "used": np.zeros(pairs),
             "outside": self._outside,
         } | ({} if limit is None else {"speed_limit": limit})
-        self._group = _Group(
+        self._group = Group(
             gateway=native.gateway_address(calls.gateway),
             pairs=pairs,
             bodies_size=len(bodies),

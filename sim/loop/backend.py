@@ -5,7 +5,6 @@ from __future__ import annotations
 import batchpid as bp
 from sim.engine import native
 from sim.engine.native import xla
-from sim.loop import law_program
 from sim.options import RunnerOptions
 
 
@@ -26,7 +25,7 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return the library of the law, and the kind of the calls into the engine, with reasons."""
     if options.backend == "numpy":
-        compiled = options.control == "pid" and law_program.extension is not None and native.status().active
+        compiled = options.control == "pid" and native.status().active
         return f"law {'as a native program' if compiled else 'in NumPy'}, {native.status()}"
     if options.control == "drive":
         return f"law in PhysX (control 'drive'), {native.status()}"

@@ -13,8 +13,8 @@ import numpy as np
 
 from batchpid.actuators import STAGES, Coefficients, Stages
 from sim.engine import native
-from sim.loop import law_program
-from sim.loop.law_program import trace
+from sim.engine.array_program import ArrayProgram, trace
+from sim.engine.native.interface import OPERATION
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""
@@ -25,7 +25,7 @@ def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
 
     ``shape`` is (envs, joints).
     """
-    if law_program.extension is None or not native.status().active:
+    if not native.status().active:
         return STAGES
     return Stages(*(_compiled(stage, k, shape) for stage in STAGES))
 
@@ -40,21 +40,15 @@ def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]
             programs[none] = _program(stage, k, shape, none)
         if (program := programs[none]) is None or given is not k:
             return stage(given, *inputs)
-        arrays = tuple([each for each in inputs if each is not None])
-        outputs = tuple([np.empty(shape) for _ in range(program[1])])
-        try:
-            law_program.extension.run(program[0], arrays, outputs)
-        except ValueError:  # one is not contiguous
-            law_program.extension.run(program[0], tuple(map(np.ascontiguousarray, arrays)), outputs)
-        return outputs
+        return tuple(program(*[each for each in inputs if each is not None]))
 
     return run
 
 
 def _program(
     stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int], none: tuple[bool, ...]
-) -> tuple[Any, int] | None:
-    """Return the program of ``stage`` and the number of its results; None if NumPy is to do it."""
+) -> ArrayProgram | None:
+    """Return the program of ``stage``; None if NumPy is to do it."""
     constants: list[Any] = []
     numbers = _numbered(k, shape, constants)
 
@@ -66,11 +60,9 @@ def _program(
         found = trace(function, len(constants), none.count(False))
     except (TypeError, AttributeError, AssertionError):  # it has tables, or no limits
         return None
-    if len(found.operations) < LEAST_OPERATIONS * 5 * np.int32().itemsize:
+    if len(found.operations) < LEAST_OPERATIONS * len(OPERATION) * np.int32().itemsize:
         return None
-    given = (*map(np.ascontiguousarray, constants), *map(np.array, found.literals))
-    program = law_program.extension.program(*found[:3], none.count(False), given, *shape)
-    return program, len(found.results) // np.int32().itemsize
+    return ArrayProgram(found, constants, none.count(False), shape)
 
 
 class _Place(int):

@@ -5,6 +5,7 @@
 #include <memory>
 
 #include "buffer.h"
+#include "extension.h"
 #include "rigid_body.h"
 
 using namespace batchpid;
@@ -177,7 +178,7 @@ FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, doub
   }
 }
 
-// dynamics(tree, qpos, qvel, payload, matrix, force, payload_force)
+// dynamics(tree, qpos, qvel, payload, matrix, force, payload_force): DYNAMICS in interface.py
 PyObject *dynamics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
   if (tree == nullptr) return nullptr;
@@ -223,7 +224,7 @@ void invert(std::int64_t n, std::vector<Lanes> &matrix, std::vector<Lanes> &fact
   }
 }
 
-// Arrays of `step`, in this order.
+// Arrays of `step`: STEP in interface.py.
 enum Leaf { QPOS, QVEL, FRICTION, MATRIX, EFFORT, ADDED, LIMIT, KEEP, CREEP, LOW, HIGH, LEAVES };
 
 // Step rows of robots: QPOS, QVEL and FRICTION are changed.
@@ -305,4 +306,4 @@ PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_batch_dynamics", nullptr, -1, MET
 
 }  // namespace
 
-PyMODINIT_FUNC PyInit__batch_dynamics() { return PyModule_Create(&MODULE); }
+PyMODINIT_FUNC PyInit__batch_dynamics() { return batchpid::make_module(MODULE); }

@@ -5,6 +5,7 @@
 
 #include "gateway.h"
 
+#include "extension.h"
 #include "sim_step.h"
 #include "xla_call.h"
 
@@ -194,4 +195,4 @@ PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_gateway", nullptr, -1, METHODS, n
 
 }  // namespace
 
-PyMODINIT_FUNC PyInit__gateway() { return PyModule_Create(&MODULE); }
+PyMODINIT_FUNC PyInit__gateway() { return batchpid::make_module(MODULE); }

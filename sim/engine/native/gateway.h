@@ -33,7 +33,7 @@ struct VectorXf {
   ~VectorXf() { std::free(data); }
 };
 
-// Exported functions, in the order in which Python passes their addresses.
+// Exported functions: SYMBOLS in interface.py.
 struct Functions {
   VectorXf (*get_qpos)(Articulation *);
   VectorXf (*get_qvel)(Articulation *);

@@ -35,7 +35,7 @@ Vector<N> cross(Vector<N> a, Vector<N> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// Constants of one body and its joint, a row of 25 numbers.
+// Constants of one body and its joint, a row of 25 numbers: BODY in interface.py.
 template <class T>
 struct BodyRow {
   T rotation[3][3], position[3], mass, center[3], tensor[3][3];

@@ -13,13 +13,13 @@
 
 namespace batchpid {
 
-// Reasons for which a loop over sim steps has to stop, as bits.
+// Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
 enum Status : std::int32_t { LEFT_REGION = 1, CONTACTS = 2, NOT_FINITE = 4, TOO_FAST = 8, FAILED = 16 };
 
 // Layout of the map in which SAPIEN keeps the contacts of a system, by the pair of shapes; a contact begins with its bodies.
 using Contacts = std::map<std::pair<void *, void *>, Body *const *>;
 
-// Group of robots; Python fills in the fields (sim/engine/sim_step.py, in this order) and owns what they point to.
+// Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
 struct Group {
   Gateway *gateway;
   float *qf;                         // (robots, dof)

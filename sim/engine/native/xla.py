@@ -16,9 +16,7 @@ def _registered() -> str:
     """Make the functions known to JAX; return what is in the way, or nothing."""
     import jax
 
-    if not hasattr(native.extension, "xla_functions"):
-        return "the extension is of an older version: install batchpid again"
-    for name, address in native.extension.xla_functions().items():
+    for name, address in native.extension("_gateway").xla_functions().items():
         try:
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu")
         except Exception as error:  # JAX promises no type

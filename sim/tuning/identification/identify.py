@@ -21,7 +21,7 @@ from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.validate import choice, flag, instance, integer, number
 from batchpid.versions import package_versions
-from sim.engine.batch_dynamics import is_native
+from sim.engine import native
 from sim.options import Compensation
 from sim.robot.robot import Robot
 from sim.tuning.identification.drive import Drive
@@ -131,7 +131,7 @@ def identify(
         "payload": payload,
         "evaluations": evaluations,
         "seed": seed,
-        "native": is_native(),
+        "native": native.status().active,
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)

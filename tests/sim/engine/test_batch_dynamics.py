@@ -15,10 +15,11 @@ from sim.engine.batch_dynamics import (
     NativeBatchDynamics,
     PinocchioBatchDynamics,
     batch_dynamics,
+    models_of,
 )
 
 DT = 5e-4
-needs_extension = pytest.mark.skipif(native.batch_extension is None, reason="the extension was not built")
+needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
 
 
 def load(name, folder):
@@ -49,7 +50,7 @@ def test_the_extension_gives_what_pinocchio_gives(name, joints, tmp_path):
     arm = load(name, tmp_path)
     joints = tuple(np.flatnonzero(arm.independent)) if joints is None else tuple(joints)
     moving = MovingJoints.of(arm, joints)
-    fast, slow = NativeBatchDynamics(arm, moving), PinocchioBatchDynamics(arm, moving)
+    fast, slow = NativeBatchDynamics(models_of(arm), moving), PinocchioBatchDynamics(models_of(arm), moving)
     qpos, qvel, payload = state_of(arm, joints)
     found, expected = fast.at(qpos, qvel, payload), slow.at(qpos, qvel, payload)
     for leaf, wanted in zip(found, expected, strict=True):
@@ -68,10 +69,10 @@ def test_the_extension_gives_what_pinocchio_gives(name, joints, tmp_path):
 
 @pytest.mark.parametrize("kind", [NativeBatchDynamics, PinocchioBatchDynamics])
 def test_a_row_does_not_depend_on_the_others(kind, panda):
-    if kind is NativeBatchDynamics and native.batch_extension is None:
+    if kind is NativeBatchDynamics and not native.status().active:
         pytest.skip("the extension was not built")
     joints = tuple(range(7))
-    batch = kind(panda, MovingJoints.of(panda, joints))
+    batch = kind(models_of(panda), MovingJoints.of(panda, joints))
     qpos, qvel, payload = state_of(panda, joints)
     whole, friction = batch.at(qpos, qvel, payload), friction_of(qpos.shape)
     stepped = batch.step((qpos, qvel, 0 * qpos), whole.matrix, qvel, 0 * qpos + 0.1, friction, DT)
@@ -97,7 +98,7 @@ def test_a_tool_that_is_part_of_the_base_weighs_nothing(tmp_path):
     moving = MovingJoints.of(arm, (0, 1))
     qpos, kg = np.full((3, 2), 0.05), np.array([[0.0], [0.5], [1.0]])
     found, expected = (
-        kind(arm, moving).at(qpos, 0 * qpos, kg) for kind in (NativeBatchDynamics, PinocchioBatchDynamics)
+        kind(models_of(arm), moving).at(qpos, 0 * qpos, kg) for kind in (NativeBatchDynamics, PinocchioBatchDynamics)
     )
     for leaf, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(leaf, wanted, atol=1e-7)

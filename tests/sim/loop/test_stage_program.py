@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 import batchpid as bp
 from batchpid.actuators import STAGES, discretise
 from sim.engine import native
-from sim.loop import law_program, stage_program
+from sim.loop import stage_program
 from sim.loop.actuators import JointActuators
 from sim.loop.stage_program import compiled_stages
 
 DT, SHAPE = 1 / 2000, (3, 4)
-needs_extension = pytest.mark.skipif(
-    law_program.extension is None or not native.status().active, reason="there are no native calls"
-)
+needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
 EFFECTS = {
     "command_delay": 0.0033,
     "sensor_delay": 0.0021,
@@ -87,6 +85,6 @@ def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
 
 
 def test_without_the_extension_stages_are_numpys(monkeypatch):
-    monkeypatch.setattr(law_program, "extension", None)
+    monkeypatch.setenv(native.SWITCH, "0")
     k = JointActuators(bp.make_actuators(SHAPE[1], strength=0.5), np.zeros(SHAPE), DT, 0)._coefficients
     assert compiled_stages(k, SHAPE) is STAGES

@@ -1,11 +1,5 @@
 // Programs of operations on arrays (rows, columns) of double, such as the control law of a group of envs: traced in
-// Python (sim/loop/law_program.py), run here in one call. Every operation is rounded as NumPy's.
-
-#define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
-#define Py_LIMITED_API 0x030B0000
-#endif
-#include <Python.h>
+// Python (sim/engine/array_program.py), run here in one call. Every operation is rounded as NumPy's.
 
 #include <algorithm>
 #include <cmath>
@@ -15,9 +9,11 @@
 #include <memory>
 #include <vector>
 
+#include "extension.h"
+
 namespace {
 
-// In the order of OPERATIONS in Python.
+// OPERATIONS in interface.py.
 enum Code : std::int32_t {
   ADD, SUBTRACT, MULTIPLY, DIVIDE, MAXIMUM, MINIMUM, GREATER, LESS, NOT_EQUAL, AND,
   NEGATIVE, ABSOLUTE, RINT, FINITE, WHERE, ROW_MINIMUM, MATRIX_VECTOR,
@@ -212,4 +208,4 @@ PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_law_program", nullptr, -1, METHOD
 
 }  // namespace
 
-PyMODINIT_FUNC PyInit__law_program() { return PyModule_Create(&MODULE); }
+PyMODINIT_FUNC PyInit__law_program() { return batchpid::make_module(MODULE); }

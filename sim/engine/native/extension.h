@@ -1,0 +1,32 @@
+// Module of an extension, with the digests of what it was built from; see sim/engine/native/interface.py.
+
+#pragma once
+
+#define PY_SSIZE_T_CLEAN
+#ifndef Py_LIMITED_API
+#define Py_LIMITED_API 0x030B0000
+#endif
+#include <Python.h>
+
+#if !defined(BATCHPID_TABLES) || !defined(BATCHPID_SOURCES)
+#error "the digests of the tables and of the sources are missing: build with setup.py"
+#endif
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+inline PyObject *make_module(PyModuleDef &definition) {
+  PyObject *module = PyModule_Create(&definition);
+  if (module == nullptr) return nullptr;
+  if (PyModule_AddStringConstant(module, "tables", BATCHPID_TABLES) != 0 ||
+      PyModule_AddStringConstant(module, "sources", BATCHPID_SOURCES) != 0) {
+    Py_DECREF(module);
+    return nullptr;
+  }
+  return module;
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop

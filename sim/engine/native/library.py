@@ -1,0 +1,35 @@
+"""Functions of SAPIEN's shared library that the gateway calls."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+
+from sim.engine.native.interface import SYMBOLS
+
+_CALLBACK = "_ZTVN6sapien5physx20DefaultEventCallbackE"
+
+
+@cache
+def sapien_library() -> Path:
+    """Return the path of SAPIEN's shared library, which is loaded with its Python package."""
+    import sapien  # noqa: F401
+
+    with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
+        paths = {line.split(maxsplit=5)[-1].strip() for line in maps if "libsapien" in line}
+    if len(paths) != 1:
+        raise OSError("SAPIEN's shared library is not loaded, or more than once")
+    return Path(paths.pop())
+
+
+@cache
+def functions() -> tuple[int, ...]:
+    """Return the addresses of the exported functions; AttributeError names one that is missing."""
+    library = ctypes.CDLL(str(sapien_library()))
+    return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS)
+
+
+def callback_table() -> int:
+    """Return the address of the virtual table of SAPIEN's callback for contacts."""
+    return ctypes.addressof(ctypes.c_char.in_dll(ctypes.CDLL(str(sapien_library())), _CALLBACK))
