@@ -9,6 +9,7 @@ import numpy as np
 from batchpid import law
 from batchpid.coefficients import discretise
 from batchpid.errors import MissingDependencyError
+from batchpid.jax_settings import own_settings
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
@@ -54,6 +55,7 @@ class JAXBackend:
         from batchpid import blocks
 
         self.jax, self.terms = jax, terms
+        self.dtype: Any = None
         self._compiled: dict[Any, Any] = {}
         self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
@@ -84,29 +86,36 @@ class JAXBackend:
         jnp = self.jax.numpy
         leaves, tree = self.jax.tree.flatten(params)
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
-        shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
-        own = [jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one]
-        stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
-        self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
+        with own_settings(self.dtype):
+            shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
+            own = [jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one]
+            stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
+            self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
         self.dtype, self._spare = self.packed[1].dtype, None
 
     def array(self, value: Any) -> Any:
         """Return ``value`` as an array of this backend."""
-        fits = isinstance(value, self.jax.Array) and value.dtype == self.dtype
-        return value if fits else np.asarray(value, dtype=self.dtype)
+        if isinstance(value, np.ndarray) or not isinstance(value, self.jax.Array):
+            return np.asarray(value, dtype=self.dtype)
+        if value.dtype == self.dtype:
+            return value
+        with own_settings():
+            return np.asarray(value, dtype=self.dtype)
 
     def call(self, function: Any, *inputs: Any, **named: Any) -> PIDState:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         if function not in self._compiled:
             self._compiled[function] = self._compile(function)
-        return self._compiled[function](*self.packed, *inputs, **named)
+        with own_settings(self.dtype):
+            return self._compiled[function](*self.packed, *inputs, **named)
 
     def step(self, state: PIDState, r: Any, y: Any, *rates: Any) -> tuple[PIDState, Any, Terms | None]:
         """Return the new state, the effort, and the terms if they are kept."""
-        if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
-            return self._step(*self.packed, state, r, y, *rates)
-        spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
-        new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
+        with own_settings(self.dtype):
+            if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
+                return self._step(*self.packed, state, r, y, *rates)
+            spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
+            new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
         self._spare = state
         return new, effort, None
 

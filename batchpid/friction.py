@@ -106,11 +106,12 @@ def refresh(
     rubs = xp.zeros_like(state.effort) + friction.coulomb > 0
     implicit = (0.0 if friction.viscous is None else friction.viscous) + damping + dt * stiffness
     implicit = xp.zeros_like(state.effort) + implicit
-    inverse = xp.linalg.inv(mass_matrix + dt * implicit[:, :, None] * xp.eye(implicit.shape[-1]))
+    diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
+    inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
     mobility = xp.einsum("ejj->ej", inverse)
     scale = xp.sqrt(mobility)
     correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
-    shared = (correlation * rubs[:, None, :]).sum(-1)
+    shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
     k = xp.where(rubs, SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)), 0.0)
     w = 1 - dt * implicit * mobility
     return state._replace(gain=k * (1 + w - dt**2 * stiffness * mobility), memory=k * w)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from batchpid.coefficients import Coefficients
 from batchpid.friction import Friction, FrictionState
+from batchpid.jax_settings import own_settings
 from sim.engine.dynamics import scene_dynamics
 from sim.engine.pack import Pack
 from sim.engine.sim_step import FAILED, NativeStep
@@ -19,7 +20,7 @@ from sim.loop.backend import obstacle
 from sim.loop.control import Control, EffortControl, PIDControl
 from sim.loop.custom import CustomControl, controller_errors
 from sim.loop.friction import JointFriction
-from sim.loop.jitted import padded, precision, program_rows, put, shared_call
+from sim.loop.jitted import padded, program_rows, put, shared_call
 from sim.loop.program import Carry, Constants, Layout, compiled
 from sim.loop.snapshot import AGE
 from sim.options import RunnerOptions
@@ -66,7 +67,7 @@ class CompiledTick:
                 self._carry = self._carry._replace(**self._read())
         native = self._native
         assert native is not None
-        with precision(self._options.dtype):
+        with own_settings(self._options.dtype):
             carry = self._take_over() if self._carry is None else self._carry
             span = np.array([begin, end, 0, 0], np.int32)
             span[2:].view(np.uint64)[0] = native.prepare()
@@ -113,7 +114,7 @@ class CompiledTick:
         passive = (
             pack.passive_force(self._gravity, self._coriolis) if self._gravity else np.zeros((pack.size, pack.dof))
         )
-        with precision(self._options.dtype):
+        with own_settings(self._options.dtype):
             arrays = {"qpos": pack.read_qpos(), "qvel": pack.read_qvel(), "passive": passive}
             return {name: put(padded(rows)) for name, rows in arrays.items()}
 
@@ -178,7 +179,7 @@ class CompiledTick:
             friction=Friction(*map(spread, friction.model)),
             known=friction.known,
         )
-        with precision(self._options.dtype):
+        with own_settings(self._options.dtype):
             self._constants = sources, put(constants)
             self._zero = put(np.zeros((program_rows(pack.size), pack.dof)))
         return self._constants[1]

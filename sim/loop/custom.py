@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import ControllerError, InvalidArgumentError
+from batchpid.jax_settings import own_settings
 from sim.engine.building import SceneSpec
 from sim.loop.control import Control, Plant
 from sim.options import Controller, RunnerOptions
-from sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 
@@ -22,12 +23,10 @@ Float64 = NDArray[np.float64]
 class CustomControl(Control):
     """qf = sat(the controller's effort), with the limits of the params; see :class:`sim.options.Controller`."""
 
-    def __init__(
-        self, controller: Controller, robot: Robot, scene: SceneSpec, params: bp.PIDParams, plant: Plant
-    ) -> None:
-        self._controller, self._robot = controller, robot
+    def __init__(self, options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
+        self.options, self._controller = options, own_controller(options)
         super().__init__(scene, params, plant)
-        self._of_controller = controller.init(robot, len(self.saturated))
+        self._of_controller = _begin(options, len(self.saturated))
         self._check(flatten(self._of_controller))
 
     def _check(self, leaves: Mapping[str, NDArray[Any]]) -> None:
@@ -43,7 +42,7 @@ class CustomControl(Control):
         """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
         self.saturated[mask] = False
         with controller_errors(self._controller):
-            fresh = flatten(self._controller.init(self._robot, len(mask)))
+            fresh = flatten(_begin(self.options, len(mask)))
         leaves = {name: np.array(leaf) for name, leaf in flatten(self._of_controller).items()}
         for name, leaf in leaves.items():
             leaf[mask] = fresh[name][mask]
@@ -115,7 +114,7 @@ class CustomControl(Control):
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:
     """Return the state of the control of all envs at their start, by name."""
     if not isinstance(options.control, str):
-        return flatten(options.control.init(options.robot, options.num_envs))
+        return flatten(_begin(options, options.num_envs))
     return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
 
 
@@ -128,6 +127,21 @@ def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
         if controller is None:
             raise
         raise ControllerError(type(controller).__name__, error, step) from error
+
+
+def own_controller(options: RunnerOptions) -> Controller:
+    """Return the caller's own controller."""
+    assert not isinstance(options.control, str)
+    return options.control
+
+
+def _begin(options: RunnerOptions, envs: int) -> Any:
+    """Return the state of the caller's own controller of so many envs at their start."""
+    start = partial(own_controller(options).init, options.robot, envs)
+    if options.backend != "jax":
+        return start()
+    with own_settings(options.dtype):  # its arrays are of that type, whatever JAX's default in this process is
+        return unflatten(state := start(), flatten(state))
 
 
 def _check_effort(effort: Any, qpos: Any) -> None:

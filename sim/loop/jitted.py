@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.coefficients import Coefficients
+from batchpid.jax_settings import own_settings
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.loop.control import CONTROLS, Control, PIDControl
@@ -40,17 +40,6 @@ def padded(rows: Any) -> NDArray[Any]:
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)]) if missing else rows
 
 
-@contextlib.contextmanager
-def precision(dtype: Precision) -> Iterator[None]:
-    """Let JAX compute in this floating-point type."""
-    import jax
-    import jax.experimental
-
-    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # the latter before JAX 0.8
-    with home.enable_x64(dtype == "float64"):
-        yield
-
-
 def put(tree: Any) -> Any:
     """Return a structure of arrays on the CPU, as JAX's."""
     import jax
@@ -63,12 +52,12 @@ def make_control(options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams,
     jitted = options.backend == "jax"
     if not isinstance(options.control, str):
         kind = JittedCustomControl if jitted else CustomControl
-        control: Control = kind(options.control, options.robot, scene, params, plant)
+        control: Control = kind(options, scene, params, plant)
     else:
         known = None if options.robot.actuators is None else known_joints(options.robot)
         of_name = CONTROLS | {"pid": JittedPIDControl} if jitted else CONTROLS
         control = of_name[options.control](scene, params, plant, known)
-    if isinstance(control, JittedPIDControl | JittedCustomControl):
+    if isinstance(control, JittedPIDControl):
         control.options = options
     return control
 
@@ -86,8 +75,6 @@ class JittedPIDControl(PIDControl):
 
 class JittedCustomControl(CustomControl):
     """Control by the caller's own controller, compiled by JAX."""
-
-    options: RunnerOptions
 
     def _call(self, *inputs: Float64) -> Any:
         call, state = _controller(self.options, self), self.read()
@@ -131,6 +118,6 @@ def _call(function: Any, dtype: Precision, envs: int, *inputs: Any) -> Any:
     """Return a structure of arrays (envs, ...) that a function of such, compiled by JAX, returns."""
     import jax
 
-    with precision(dtype):
+    with own_settings(dtype):
         results = function(*put(jax.tree.map(padded, inputs)))
-    return jax.tree.map(lambda rows: np.array(rows)[:envs], results)
+        return jax.tree.map(lambda rows: np.array(rows)[:envs], results)

@@ -1,0 +1,49 @@
+"""Settings of JAX under which the programs of batchpid run, whatever those of the caller are.
+
+JAX's debugging settings hold for a thread or a process, and so for the programs that batchpid compiles and calls. These
+take NumPy arrays as arguments, broadcast (joints,) to (envs, joints), and keep the NaN of a failed env in its rows. The
+pure functions, such as :func:`batchpid.step`, run in the caller's own programs: they keep to the caller's settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+NEEDED: dict[str, tuple[Any, ...]] = {
+    "jax_debug_nans": (False,),
+    "jax_debug_infs": (False,),
+    "jax_check_tracer_leaks": (False,),
+    "jax_disable_jit": (False,),
+    "jax_numpy_rank_promotion": ("allow",),
+    "jax_numpy_dtype_promotion": ("standard",),
+    "jax_transfer_guard_host_to_device": ("allow", None),
+    "jax_transfer_guard_device_to_host": ("allow", None),
+    "jax_transfer_guard_device_to_device": ("allow", None),
+}
+"""Values that programs of batchpid can run with, by setting; the first is set in place of any other."""
+
+
+@contextmanager
+def own_settings(dtype: Any = None) -> Iterator[None]:
+    """Run a block under the settings that batchpid needs, with ``dtype`` "float64" or "float32" for its arrays.
+
+    Settings that fit are left alone: entering the context of each would cost more than a call of a small program.
+    """
+    import jax
+
+    config, others = jax.config, []
+    for name, values in NEEDED.items():
+        if getattr(config, name) not in values:
+            others.append((getattr(jax, name.removeprefix("jax_")), values[0]))
+    if dtype is not None and config.jax_enable_x64 != (wide := dtype == "float64"):
+        home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # the latter before JAX 0.8
+        others.append((home.enable_x64, wide))
+    if not others:
+        yield
+        return
+    with ExitStack() as stack:
+        for context, value in others:
+            stack.enter_context(context(value))
+        yield
