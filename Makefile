@@ -27,7 +27,7 @@ BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
-	@$(RUN) -m batchpid demo $(ARGS)
+	@$(RUN) -m batchpid demo --picture out/demo.png --force $(ARGS)
 
 test: $(VENV)/.dev
 	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $(ARGS)
@@ -66,7 +66,7 @@ bench-check: $(VENV)/.dev
 
 MEASURED := out/bench
 bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json \
-	--ticks 60 --rounds 3 --xla $(3)
+	--ticks 60 --rounds 3 --xla --force $(3)
 
 figures: $(VENV)/.dev
 	$(call bench_case,panda,accurate,--peers)

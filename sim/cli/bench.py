@@ -15,6 +15,7 @@ from batchpid.validate import integer
 from batchpid.versions import package_versions
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs
 from sim.cli.progress import bar
 
 
@@ -44,6 +45,7 @@ class BenchCommand:
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """Figures to write, with the machine and the versions: .json."""
+    force: flags.Force = False
 
     imports = ("sim.benchmark.benchmark",)
 
@@ -55,7 +57,7 @@ class BenchCommand:
         from sim.cli.report import table
         from sim.engine.native import status as native_status
 
-        out = flags.output_path("out", self.out, (".json",))
+        out = Outputs(force=self.force).path("out", self.out, (".json",))
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         workload = Workload(
             Robot.load(self.robot, missing_meshes=self.missing_meshes),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs
 from sim.tuning.gain_sets import gain_set
 
 
@@ -32,6 +33,7 @@ class CompareCommand:
     missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
     """First two sets on the first move, to draw: .png or .svg."""
+    force: flags.Force = False
 
     imports = ("sim.plots", "sim.runner")
 
@@ -41,7 +43,7 @@ class CompareCommand:
         from sim.cli.report import draw_first_move, evaluation_table
         from sim.cli.run import evaluate_sets, read_variation
 
-        picture = flags.output_path("picture", self.picture, plots.FORMATS)
+        picture = Outputs(force=self.force).path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]

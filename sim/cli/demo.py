@@ -10,6 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.validate import number
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs, beside
 from sim.tuning.gain_sets import gain_set
 
 
@@ -30,8 +31,9 @@ class DemoCommand:
     workers: flags.Workers = None
     backend: flags.Backend = "numpy"
     missing_meshes: flags.MissingMeshes = "skip"
-    picture: Path = Path("out/demo.png")
-    """Step responses to draw: .png or .svg."""
+    picture: flags.OptionalPath = None
+    """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
+    force: flags.Force = False
     viewer: flags.Switch = False
     """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
 
@@ -42,7 +44,6 @@ class DemoCommand:
         from sim import Runner, plots
         from sim.cli.run import hold_setpoint, start_poses
 
-        picture = flags.output_path("picture", self.picture, plots.FORMATS)
         if self.viewer:
             from sim.view.film import check_renderer, show_window
 
@@ -53,6 +54,8 @@ class DemoCommand:
             raise InvalidArgumentError(
                 "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
+        picture = self.picture or beside(Path("out") / robot.path.name, "demo")
+        picture = Outputs(force=self.force).path("picture", picture, plots.FORMATS)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, 0.3, self.seed)
         gains = gain_set(robot, self.gains)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class ExciteCommand:
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
+    force: flags.Force = False
 
     imports = ("sim.engine.dynamics", "sim.tuning.identification.excitation")
 
@@ -43,7 +45,8 @@ class ExciteCommand:
         from sim.tuning.identification.logs import setpoint_csv
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
-        out = flags.output_path("out", self.out or Path(f"out/{robot.path.stem}.excite.csv"), (".csv",))
+        out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
+        out = Outputs(force=self.force).path("out", out, (".csv",))
         motion = excite(robot, self.duration, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))

@@ -1,18 +1,11 @@
-"""Flags that several commands share: one name, one meaning and one help text each; and checks of output files."""
+"""Flags that several commands share: one name, one meaning and one help text each."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import tyro
-
-from batchpid.errors import InvalidArgumentError
-from batchpid.files import try_writing
-from batchpid.validate import file_path
-
-P = TypeVar("P", bound=Path | None)
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
@@ -27,6 +20,7 @@ def _flag(help: str | None = None, **options: Any) -> Any:
 OptionalPath = Annotated[Path | None, _flag()]
 OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
 Switch = Annotated[bool, _flag()]
+Force = Annotated[bool, _flag("Replace output files that exist.")]
 
 RobotName = Annotated[str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF.")]
 RecordedRobot = Annotated[
@@ -60,8 +54,9 @@ Actuators = Annotated[
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, drive, drive:STIFFNESS,DAMPING, or params files. Default: tuned, "
-        "tutorial and drive for a bundled robot, else designed and drive.",
+        "Sets of gains: tuned, designed, tutorial, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or .json) "
+        "that `batchpid tune` or batchpid.save_params wrote. Default: tuned, tutorial and drive for a bundled robot, "
+        "else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
@@ -89,26 +84,3 @@ Randomize = Annotated[
 Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
 Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")]
 Friction = Annotated[float, _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")]
-
-
-def output_path(argument: str, path: P, suffixes: Collection[str], source: Path | None = None) -> P:
-    """Return ``path`` after a trial whether a file can be written there; None is returned as None.
-
-    The run that follows may take hours, so nothing is left for its end that can be known before. The folder of
-    ``path`` is made when the file is written, and nothing before.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Its suffix is not one of ``suffixes``, it cannot be written, or it is the file ``source`` that is read.
-    """
-    if path is not None:
-        file_path(argument, path, suffixes)
-        problem = "is the file to read" if source is not None and path.resolve() == source.resolve() else None
-        try:
-            try_writing(path)
-        except OSError as error:
-            problem = f"cannot be written: {error.strerror}"
-        if problem is not None:
-            raise InvalidArgumentError(argument, problem, value=str(path), remedy="choose another file")
-    return path

@@ -12,6 +12,7 @@ import tyro
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs, beside
 from sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
@@ -56,7 +57,9 @@ class IdentifyCommand:
     json: flags.OptionalPath = None
     """Estimates with their 95 % intervals to write: .json."""
     picture: flags.OptionalPath = None
-    """Position errors before and after, to draw: .png or .svg. Default: named as the actuators file."""
+    """Position errors before and after, to draw: .png or .svg. Default: NAME-fit.png, next to the
+    actuators file."""
+    force: flags.Force = False
 
     imports = ("sim.plots", "sim.engine.dynamics", "sim.tuning.identification.identify")
 
@@ -70,13 +73,12 @@ class IdentifyCommand:
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
-        details = flags.output_path("json", self.json, (".json",))
-        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)
-        history = out.with_suffix(".fit.json")
+        outputs = Outputs(force=self.force, inputs=(self.params, *self.logs))
+        out = outputs.path("out", out, (".yaml", ".yml", ".json"))
+        details = outputs.path("json", self.json, (".json",))
+        picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
+        history = outputs.history(out.with_suffix(".fit.json"), resume=self.resume)
         out.parent.mkdir(parents=True, exist_ok=True)
-        if not self.resume:
-            history.unlink(missing_ok=True)
         found = identify(
             robot,
             self.logs,

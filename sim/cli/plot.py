@@ -12,6 +12,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer
 from sim import Rollout, read_recording
 from sim.cli import flags
+from sim.cli.outputs import Outputs, beside, stem
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,9 @@ class PlotCommand:
     every: int = 1
     """Draw only every n-th tick, for long recordings."""
     picture: flags.OptionalPath = None
-    """Picture to draw: .png or .svg. Default: a .png named as the recording."""
+    """Picture to draw: .png or .svg. Default: next to the recording NAME.npz, NAME-responses.png, NAME-efforts.png, or
+    NAME-versus-OTHER.png."""
+    force: flags.Force = False
 
     imports = ("sim.plots",)
 
@@ -43,8 +46,9 @@ class PlotCommand:
         every = integer("every", self.every, 1, 10**9)
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
-        named_alike = self.recording.parent / f"{self.recording.name.partition('.')[0]}.png"
-        picture = flags.output_path("picture", self.picture or named_alike, plots.FORMATS, source=self.recording)
+        shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
+        outputs = Outputs(force=self.force, inputs=(self.recording, self.versus))
+        picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
         rollout = _read(self.recording, every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)

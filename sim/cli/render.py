@@ -9,6 +9,7 @@ import tyro
 
 from batchpid.validate import integer
 from sim.cli import flags
+from sim.cli.outputs import Outputs, beside
 from sim.cli.progress import bar
 
 
@@ -30,8 +31,9 @@ class RenderCommand:
     height: int = 540
     """Height of the film [pixels]."""
     missing_meshes: flags.MissingMeshes = "skip"
-    out: Path = Path("out/film.mp4")
-    """Film to write: .mp4 or .gif."""
+    out: flags.OptionalPath = None
+    """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
+    force: flags.Force = False
 
     imports = ("sim.view.film",)
 
@@ -41,7 +43,8 @@ class RenderCommand:
         from sim.view.film import FORMATS, write_film
         from sim.view.layout import MAX_ROBOTS
 
-        out = flags.output_path("out", self.out, FORMATS, source=self.recording)
+        outputs = Outputs(force=self.force, inputs=(self.recording,))
+        out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
         rollout, robot = read_run(self.recording, self.robot, self.missing_meshes)
         rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from batchpid.validate import array, number
 from sim import Recorder, Robot, write_recording
 from sim.cli import flags
+from sim.cli.outputs import Outputs
 from sim.tuning.gain_sets import gain_set
 
 
@@ -51,6 +52,7 @@ class RolloutCommand:
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
+    force: flags.Force = False
 
     imports = ("sim.plots", "sim.runner")
 
@@ -59,8 +61,9 @@ class RolloutCommand:
         from sim import Runner, plots
         from sim.cli.run import hold_setpoint, read_variation, start_poses
 
-        out = flags.output_path("out", self.out, (".npz", ".h5", ".hdf5"))
-        picture = flags.output_path("picture", self.picture, plots.FORMATS)
+        outputs = Outputs(force=self.force)
+        out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
+        picture = outputs.path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(
             self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators, dissipation=self.dissipation
         )
@@ -87,7 +90,7 @@ class RolloutCommand:
             randomization=randomization,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
-            with Recorder(out, runner, seed=self.seed, overwrite=True) if out and streamed else nullcontext():
+            with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
                 rollout, report = hold_setpoint(runner, start, setpoint, seconds)
         if out is not None and not streamed:
             write_recording(rollout, out, seed=self.seed, overwrite=True)

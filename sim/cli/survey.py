@@ -13,6 +13,7 @@ import tyro
 
 from batchpid.files import write_atomically
 from sim.cli import flags
+from sim.cli.outputs import Outputs
 
 if TYPE_CHECKING:
     from sim.tuning.survey import RobotReport
@@ -47,6 +48,7 @@ class SurveyCommand:
     """Reports to write: a list of objects, .json."""
     out: flags.OptionalPath = None
     """Table to write in Markdown, .md."""
+    force: flags.Force = False
 
     imports = ("sim.tuning.survey",)
 
@@ -55,8 +57,9 @@ class SurveyCommand:
         from sim.cli.progress import bar
         from sim.tuning.survey import find_urdfs, survey
 
-        json_path = flags.output_path("json", self.json, (".json",))
-        out = flags.output_path("out", self.out, (".md",))
+        outputs = Outputs(force=self.force)
+        json_path = outputs.path("json", self.json, (".json",))
+        out = outputs.path("out", self.out, (".md",))
         urdfs = find_urdfs(self.paths)
         cores = len(os.sched_getaffinity(0))
         reports = survey(

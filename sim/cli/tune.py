@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import shlex
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +12,7 @@ import tyro
 from batchpid import save_params
 from sim import Robot
 from sim.cli import flags
+from sim.cli.outputs import Outputs, beside
 from sim.cli.progress import bar
 from sim.tuning.gain_sets import GainSet
 from sim.tuning.weights import Weights
@@ -53,7 +55,8 @@ class TuneCommand:
     out: flags.OptionalPath = None
     """Params file to write: .yaml or .json. Default: out/ROBOT.tuned.yaml."""
     picture: flags.OptionalPath = None
-    """Before and after on the first move, to draw: .png or .svg. Default: named as the params file."""
+    """Before and after on the first move, to draw: .png or .svg. Default: NAME-tune.png, next to the params file."""
+    force: flags.Force = False
 
     imports = ("sim.plots", "sim.tuning.search")
 
@@ -66,13 +69,13 @@ class TuneCommand:
         from sim.tuning.search import tune
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
-        out = self.out or Path(f"out/{robot.path.stem}.tuned.yaml")
-        out = flags.output_path("out", out, (".yaml", ".yml", ".json"))
-        picture = flags.output_path("picture", self.picture or out.with_suffix(".png"), plots.FORMATS)
-        history = out.with_suffix(".search.json")
+        read = [Path(path) for path in (self.actuators, self.randomize) if path is not None]
+        outputs = Outputs(force=self.force, inputs=read)
+        named = self.out or Path("out") / robot.path.name
+        out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json"))
+        picture = outputs.path("picture", self.picture or beside(named, "tune"), plots.FORMATS)
+        history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
         out.parent.mkdir(parents=True, exist_ok=True)
-        if not self.resume:
-            history.unlink(missing_ok=True)
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
         found = tune(
@@ -108,15 +111,17 @@ class TuneCommand:
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
-        chosen = 0 if evaluations[1].worse_than(evaluations[0], arm) else 1
+        rejected = found.rejected or evaluations[1].drawback(evaluations[0], arm)
+        chosen = 0 if rejected else 1
         judged = evaluations[chosen]
         worst = judged.metrics.worst()
-        if not chosen:
-            print("\nThe designed gains are written: on these moves the tuned ones fall short more often, or by more.")
+        if rejected:
+            print(f"\nThe designed gains are written, the tuned ones are rejected: {rejected}.")
         about = found.settings | {
             "cost": found.cost,
             "start_cost": found.start_cost,
             "gains": sets[chosen].name,
+            **({"rejected": rejected} if rejected else {}),
             "judged": {
                 "moves": len(judged.moves.start),
                 "seed": self.seed + 1,
@@ -131,3 +136,14 @@ class TuneCommand:
         print(f"\nwritten: {out}\npicture: {draw_first_move(robot, evaluations, picture)}")
         for text in judged.shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {text}")
+        print(f"next: {self._next_command(out)}")
+
+    def _next_command(self, params: Path) -> str:
+        """Return the command that runs the robot under the gains in the file ``params``, with the options of this."""
+        words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in ("randomize", "physics", "collisions", "cluster", "actuators", "missing_meshes"):
+            value, flag = getattr(self, name), name.replace("_", "-")
+            if value != defaults[name]:
+                words += [f"--no-{flag}"] if value is False else [f"--{flag}", str(value)]
+        return shlex.join(words)

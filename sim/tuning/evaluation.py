@@ -27,6 +27,8 @@ SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
 """A move should settle within a second, or within this multiple of the shortest that its effort limits allow."""
 MAX_ERROR, MAX_CHATTER = 1e-3, 2.0
 """Demands on the steady-state error [rad or m] and on the chatter."""
+CRITERIA = ("moves that settle too late", "moves that miss a demand", "largest excess over a demand")
+"""Criteria that rank two sets of gains, the most important first."""
 
 
 class Evaluation(NamedTuple):
@@ -62,19 +64,33 @@ class Evaluation(NamedTuple):
         found = []
         for demand, excess in self.demands(joints).items():
             for move, joint in np.argwhere(excess > 1):
-                text = f"{demand} of move {self.moves.names[move]!r}, joint {joint}: {excess[move, joint]:.2f} x limit"
+                where = f"move {self.moves.names[move]!r}, joint {self.rollout.info.joint_names[joint]!r}"
+                text = f"{demand} of {where}: {excess[move, joint]:.2f} x limit"
                 found.append((float(excess[move, joint]), text))
         return [text for _, text in sorted(found, reverse=True)]
 
-    def worse_than(self, other: Evaluation, joints: NDArray[np.bool_]) -> bool:
-        """Return whether more moves are late than in ``other``, or as many, and more miss a demand, or by more."""
+    def drawback(self, other: Evaluation, joints: NDArray[np.bool_]) -> str | None:
+        """Return the criterion in which these gains are worse than ``other``, with both figures; None if in none.
 
-        def rank(evaluation: Evaluation) -> tuple[int, int, float]:
-            demands = evaluation.demands(joints)
-            late, excess = demands["settling time"].max(1) > 1, np.max([*demands.values()], axis=(0, 2))
-            return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
+        The first of :data:`CRITERIA` in which the two differ decides, over the :meth:`demands` on ``joints`` (dof,).
+        """
+        ranks = self._rank(joints), other._rank(joints)
+        if ranks[0] <= ranks[1]:
+            return None
+        index, criterion = next(
+            (index, criterion) for index, criterion in enumerate(CRITERIA) if ranks[0][index] != ranks[1][index]
+        )
+        figures = [
+            each.shortfalls(joints)[0] if criterion == CRITERIA[-1] else f"{rank[index]} of {len(each.moves.start)}"
+            for each, rank in zip((self, other), ranks, strict=True)
+        ]
+        return f"{criterion}: {self.name} {figures[0]}, {other.name} {figures[1]}"
 
-        return rank(self) > rank(other)
+    def _rank(self, joints: NDArray[np.bool_]) -> tuple[int, int, float]:
+        """Return the figures of :data:`CRITERIA`."""
+        demands = self.demands(joints)
+        late, excess = demands["settling time"].max(1) > 1, np.max([*demands.values()], axis=(0, 2))
+        return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
 
 
 def absolute_band(robot: Robot) -> Float64:

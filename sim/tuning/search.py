@@ -74,6 +74,8 @@ class Tuning(NamedTuple):
     """Costs of every candidate of every generation."""
     settings: dict[str, Any]
     """Seed, moves, options and versions, for the record."""
+    rejected: str | None = None
+    """The criterion by which ``params`` are the designed gains and no candidate's, with both figures, or None."""
 
 
 def tune(
@@ -213,14 +215,19 @@ def tune(
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
     every = np.concatenate([np.ravel(row) for row in costs])
-    best = int(np.argmin(every))
+    best, rejected = int(np.argmin(every)), None
+    if not best:
+        rejected = f"cost in the search: best candidate {every[1:].min():.4f}, designed {every[0]:.4f}"
     if final is not None and best:
         ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS] if index]
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
         judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
         with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
-            best = finalists[int(np.argmin(judge.costs(runner, np.array(points)[finalists])))]
+            finals = judge.costs(runner, np.array(points)[finalists])
+        best = finalists[int(np.argmin(finals))]
+        if not best:
+            rejected = f"cost in the final: best candidate {min(finals[:-1]):.4f}, designed {finals[-1]:.4f}"
     return Tuning(
         params=search.params(points[best][None]),
         cost=float(every[best]),
@@ -228,11 +235,13 @@ def tune(
         start_cost=costs[0][0],
         history=tuple(costs),
         settings={**settings, "generations": len(costs)},
+        rejected=rejected,
     )
 
 
 def _plain(name: str, value: Any, resumes: bool) -> Any:
     """Return an option of the runner as a plain value: itself, or its digest."""
+    value = value.item() if isinstance(value, np.generic) else value
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if not callable(value):

@@ -81,7 +81,7 @@ def command(batchpid, rollout, tmp_path, monkeypatch):
             pytest.importorskip(NEEDS[name])
         words = {"RUN": run, "URDF": urdf}
         words |= {word: tmp_path / word.lower() for word in COMMANDS[name][0] if word.startswith("OTHER.")}
-        status, _, err = batchpid(*(words.get(word, word) for word in COMMANDS[name][0]), path)
+        status, _, err = batchpid(*(words.get(word, word) for word in COMMANDS[name][0]), path, "--force")
         return status, err
 
     return run_it
@@ -151,7 +151,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
             os.truncate(disk / "filler", max(0, (disk / "filler").stat().st_size - free))
 
     with monkeypatch.context() as patched:
-        patched.setattr("sim.cli.flags.try_writing", try_and_fill)
+        patched.setattr("sim.cli.outputs.try_writing", try_and_fill)
         status, err = command(name, path)
     if status:
         assert (status, err.count("\n")) == (2, 1), err

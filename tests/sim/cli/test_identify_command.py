@@ -47,7 +47,7 @@ def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
     assert set(document["joints"]["hinge"]) == {"armature", "damping", "friction", "strength", "bias"}
     assert document["held_out_error"][1] < document["held_out_error"][0]
     assert Robot.load(robot, actuators=out).actuators is not None
-    assert out.with_suffix(".png").exists()
+    assert (tmp_path / "motors-fit.png").exists()
     assert not out.with_suffix(".fit.json").exists()
 
 

@@ -36,12 +36,12 @@ def test_pictures_that_cannot_be_written_are_refused_before_the_recording_is_rea
 
 
 def test_a_full_disk_keeps_the_older_picture(batchpid, recording):
-    picture = recording.with_suffix(".png")
+    picture = recording.with_name("run-responses.png")
     picture.write_text("older")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
     try:
-        status, _, err = batchpid("plot", recording)
+        status, _, err = batchpid("plot", recording, "--force")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (status, err.count("\n")) == (2, 1)

@@ -19,16 +19,16 @@ from sim.cli import COMMANDS
 BATCHPID = f"{sys.executable} -m batchpid"
 SHORT = "--num-envs 2 --workers 1 --seconds 0.3"
 RUNS = {
-    "demo": f"demo {SHORT} --picture out/a.png",
-    "rollout": f"rollout {SHORT} --out out/a.npz --picture out/b.png",
-    "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --out out/a.json",
-    "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --out out/a.yaml",
-    "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --picture out/a.png",
+    "demo": f"demo {SHORT} --force --picture out/a.png",
+    "rollout": f"rollout {SHORT} --force --out out/a.npz --picture out/b.png",
+    "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --force --out out/a.json",
+    "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --force --out out/a.yaml",
+    "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --force --picture out/a.png",
     "inspect": "inspect panda --all",
-    "survey": "survey arm.urdf --moves 1 --seconds 0.1 --workers 1 --json out/a.json --out out/a.md",
-    "plot": "plot run.npz",
+    "survey": "survey arm.urdf --moves 1 --seconds 0.1 --workers 1 --force --json out/a.json --out out/a.md",
+    "plot": "plot run.npz --force",
     "view": "view --num-envs 1 --workers 1 --port 18700 --time-limit 1",
-    "render": "render run.npz --out out/a.mp4",
+    "render": "render run.npz --force --out out/a.mp4",
 }
 """A short run of each command."""
 UNDISTURBED = {name: {0, 2} if name == "render" else {0} for name in RUNS}
@@ -130,4 +130,15 @@ def test_ctrl_c_at_any_moment_of_every_command(name, folder):
         assert "Exception ignored" not in err
         assert not psutil.wait_procs(family, timeout=5)[1]
         left = {path.name for path in folder.rglob("*") if path.is_file()}
-        assert left <= {"run.npz", "arm.urdf", "run.png", "a.png", "b.png", "a.npz", "a.json", "a.md", *TUNED}
+        assert left <= {
+            "run.npz",
+            "arm.urdf",
+            "run-responses.png",
+            "a-tune.png",
+            "a.png",
+            "b.png",
+            "a.npz",
+            "a.json",
+            "a.md",
+            *TUNED,
+        }

@@ -2,13 +2,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
+from pathlib import Path
 
+import numpy as np
 import pytest
 from robots import load_bundled
+from tiny_urdf import one_joint, write
 
 import batchpid as bp
+from sim import Robot
 from sim.cli import parse
 from sim.tuning.moves import random_moves
+from sim.tuning.search import tune
 from sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
@@ -36,7 +42,7 @@ def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_
     assert about["seed"] == 0
     assert about["judged"]["settling_time"] > 0
     assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
-    assert out.with_suffix(".png").stat().st_size > 10_000
+    assert (tmp_path / "panda-tune.png").stat().st_size > 10_000
     assert not out.with_suffix(".search.json").exists()
 
 
@@ -63,12 +69,60 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
 
 def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
     out = tmp_path / "panda.yaml"
-    monkeypatch.setattr("sim.tuning.evaluation.Evaluation.worse_than", lambda *_: True)
+    monkeypatch.setattr("sim.tuning.evaluation.Evaluation.drawback", lambda *_: "chatter: tuned 3, designed 2")
     status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 0
-    assert "The designed gains are written" in said
+    assert "the tuned ones are rejected: chatter: tuned 3, designed 2." in said
     assert bp.load_about(out)["gains"] == "designed"
+    assert bp.load_about(out)["rejected"] == "chatter: tuned 3, designed 2"
     assert (bp.load_params(out)[0].kp == load_bundled("panda").designed().kp).all()
+
+
+def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    urdf = write(tmp_path, one_joint(), "my arm.urdf")
+    motors = bp.make_actuators(1, command_delay=0.001)
+    bp.save_actuators("motors.yaml", motors, Robot.load(urdf).joint_names)
+    flags = ("--no-collisions", "--actuators", "motors.yaml", "--randomize", "payload", "--out", "gains.yaml")
+    status, said, error = batchpid("tune", "my arm.urdf", *SHORT, *flags)
+    assert status == 0, error
+    command = shlex.split(said.splitlines()[-1].removeprefix("next: "))
+    assert command[:5] == ["batchpid", "rollout", "my arm.urdf", "--gains", "gains.yaml"]
+    again = parse(command[1:])
+    assert (again.physics, again.collisions, again.randomize) == ("fast", False, "payload")
+    assert again.actuators == Path("motors.yaml")
+    status, said, error = batchpid(*command[1:], "--num-envs", 1, "--workers", 0, "--seconds", 0.05)
+    assert status == 0, error
+
+
+def test_settings_keep_the_types_of_options(batchpid, tmp_path):
+    """Flags are no text in the file: "False" would be true to any program that reads it."""
+    urdf = write(tmp_path, one_joint(), "arm.urdf")
+    out = tmp_path / "gains.yaml"
+    status, _, error = batchpid("tune", urdf, *SHORT, "--no-collisions", "--out", out)
+    assert status == 0, error
+    about = bp.load_about(out)
+    assert about["collisions"] is False
+    assert about["physics"] == "fast"
+    assert not [name for name, value in about.items() if value in ("True", "False", "None")]
+
+
+def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch):
+    robot = load_bundled("panda")
+    monkeypatch.setattr("sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,))
+    found = tune(robot, generations=1, population=4, seconds=0.05, workers=0)  # the designed gains are at 0
+    assert found.rejected.startswith("cost in the search: best candidate 0.")
+    assert found.rejected.endswith(", designed 0.0000")
+
+    def worse_in_the_final(self, runner, points):
+        return (*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),)
+
+    monkeypatch.setattr("sim.tuning.candidates.Candidates.costs", worse_in_the_final)
+    found = tune(robot, generations=1, population=5, seconds=0.05, workers=0, timestep=0.0005)
+    assert found.rejected.startswith("cost in the final: best candidate 0.")
+    assert found.rejected.endswith(", designed 0.0000")
+    assert found.settings["timestep"] == 0.0005
+    np.testing.assert_array_equal(found.params.kp, found.start_params.kp)
 
 
 def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):

@@ -59,11 +59,34 @@ def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
         evaluate_gains(panda, params, moves, workers=0, seconds=1.5)
         for params in (panda.tuned(), panda.params(kp=1.0, ki=0.0, kd=0.1))
     )
-    assert weak.worse_than(tuned, arm)
-    assert not tuned.worse_than(weak, arm)
-    assert not tuned.worse_than(tuned, arm)
+    assert weak.drawback(tuned, arm)
+    assert tuned.drawback(weak, arm) is None
+    assert tuned.drawback(tuned, arm) is None
     assert max(np.max(figure) for figure in weak.demands(arm).values()) > 1
-    assert not weak.worse_than(tuned, np.zeros(panda.dof, bool))  # no joint, no demand
+    assert weak.drawback(tuned, np.zeros(panda.dof, bool)) is None  # no joint, no demand
+
+
+def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
+    moves, arm = random_moves(panda, 2, seed=4), np.ones(panda.dof, bool)
+    good = evaluate_gains(panda, panda.tuned(), moves, workers=0, seconds=0.05, name="designed")
+    zeros = np.zeros((2, panda.dof))
+
+    def performing(name, settling, overshoot):
+        figures = {"settling_time": zeros + settling, "steady_state_error": zeros, "overshoot": zeros.copy()}
+        figures["overshoot"][:, 3] = overshoot
+        metrics = good.metrics._replace(**figures)
+        return good._replace(name=name, metrics=metrics, chatter=zeros, settling_limit=np.ones(2))
+
+    designed = performing("designed", 0.5, [0, 0.1])
+    for settling, overshoot, text in (
+        (3.0, [0, 0], "moves that settle too late: tuned 2 of 2, designed 0 of 2"),
+        (0.5, [0.1, 0.1], "moves that miss a demand: tuned 2 of 2, designed 1 of 2"),
+        (0.5, [0.2, 0], "largest excess over a demand: tuned overshoot of move"),
+    ):
+        assert performing("tuned", settling, overshoot).drawback(designed, arm).startswith(text)
+    last = performing("tuned", 0.5, [0.2, 0]).drawback(designed, arm)
+    assert last.count("joint 'panda_joint4': 4.00 x limit, designed overshoot of move") == 1
+    assert last.endswith("joint 'panda_joint4': 2.00 x limit")
 
 
 def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):

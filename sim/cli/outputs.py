@@ -1,0 +1,89 @@
+"""Output files of the commands: default names, and the checks of every one before the run.
+
+A run may take hours, so nothing is left for its end that can be known before. No file is replaced without ``--force``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import TypeVar
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.files import try_writing
+from batchpid.validate import file_path
+
+P = TypeVar("P", bound=Path | None)
+
+
+class Outputs:
+    """Output files of one run of a command.
+
+    Parameters
+    ----------
+    force
+        Whether existing files are replaced.
+    inputs
+        Files that the command reads, which are never replaced; None for those that were not given.
+    """
+
+    def __init__(self, *, force: bool, inputs: Iterable[Path | None] = ()) -> None:
+        self._force = force
+        self._taken = {os.path.realpath(path): "is a file to read" for path in inputs if path is not None}
+
+    def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
+        """Return ``path`` after a trial whether a file can be written there; None is returned as None.
+
+        The folder of ``path`` is made when the file is written, and nothing before.
+
+        Raises
+        ------
+        InvalidArgumentError
+            Its suffix is not one of ``suffixes``, it cannot be written, the command reads it or writes it as another
+            output, or it exists and may not be replaced.
+        """
+        if path is not None:
+            file_path(argument, path, suffixes)
+            self._check(argument, path, None if self._force else "add --force to replace it, or choose another name")
+        return path
+
+    def history(self, path: Path, *, resume: bool) -> Path:
+        """Return the ``path`` of the state that a search keeps until its end; with ``resume`` the file may exist.
+
+        Without it the state of a stopped search is removed if existing files are replaced.
+
+        Raises
+        ------
+        InvalidArgumentError
+            As for :meth:`path`.
+        """
+        remedy = "add --resume to continue the stopped run, --force to begin anew, or choose another --out"
+        self._check("out", path, None if self._force or resume else remedy)
+        if not resume:
+            path.unlink(missing_ok=True)
+        return path
+
+    def _check(self, argument: str, path: Path, keep: str | None) -> None:
+        """Check that a file can be written; ``keep`` is the remedy if an existing one may not be replaced."""
+        target = os.path.realpath(path)
+        problem, remedy = self._taken.get(target), "choose another file"
+        try:
+            try_writing(path)
+        except OSError as error:
+            problem = f"cannot be written: {error.strerror}"
+        if problem is None and keep is not None and os.path.lexists(path):
+            problem, remedy = "exists already", keep
+        if problem is not None:
+            raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
+        self._taken[target] = "is another output of this run"
+
+
+def stem(path: Path) -> str:
+    """Return the name of a file without its suffix, and that of a recording which is not complete."""
+    return Path(path.name.removesuffix(".partial")).stem
+
+
+def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
+    """Return the default name of a picture or film next to ``path``, with what is ``shown``: NAME-SHOWN.png."""
+    return path.with_name(f"{stem(path)}-{shown}{suffix}")

@@ -1,0 +1,138 @@
+"""Output files: no command replaces one without --force, and default names say what they show."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_urdf import one_joint, write
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim import Robot, Runner, write_recording
+from sim.cli import COMMANDS
+from sim.cli.outputs import Outputs, beside
+
+SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
+WORDS = {
+    "demo": ("demo", *SHORT),
+    "rollout": ("rollout", *SHORT),
+    "bench": ("bench",),
+    "tune": ("tune", "arm.urdf"),
+    "compare": ("compare", "arm.urdf"),
+    "excite": ("excite", "arm.urdf"),
+    "identify": ("identify", "arm.urdf", "run.npz"),
+    "survey": ("survey", "arm.urdf"),
+    "plot": ("plot", "run.npz"),
+    "render": ("render", "run.npz"),
+}
+"""Words of each command that writes, without its outputs."""
+SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
+OUT = {"rollout": ".npz", "bench": ".json", "excite": ".csv", "survey": ".md", "render": ".mp4"}
+
+
+def output_flags() -> list[tuple[str, str]]:
+    """Return every flag of every command that names an output file."""
+    names = {name: {field.name for field in dataclasses.fields(command)} for name, command in COMMANDS.items()}
+    return [(name, flag) for name, flags in names.items() for flag in SUFFIXES if flag in flags]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with a robot and a recording of it."""
+    folder = tmp_path_factory.mktemp("files")
+    robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
+    with Runner(robot, 1, workers=0, substeps=2) as runner:
+        rollout = runner.rollout(np.tile(robot.start, (4, 1, 1)))
+    write_recording(rollout, folder / "run.npz")
+    return folder
+
+
+@pytest.mark.parametrize(("name", "flag"), output_flags())
+def test_an_existing_output_is_refused_before_the_run(name, flag, files, batchpid, tmp_path, monkeypatch):
+    monkeypatch.chdir(files)
+    suffix = OUT.get(name, SUFFIXES[flag]) if flag == "out" else SUFFIXES[flag]
+    (path := tmp_path / f"kept{suffix}").write_text("kept")
+    others = [(f"--{each}", tmp_path / f"new{SUFFIXES[each]}") for command, each in output_flags() if command == name]
+    others = [word for option in others if option[0] not in (f"--{flag}", "--out") for word in option]
+    status, said, complaint = batchpid(*WORDS[name], *others, f"--{flag}", path)
+    assert (status, said) == (2, "")
+    assert complaint.splitlines()[-1].startswith(f"batchpid: {flag}: exists already (got '{path}')")
+    assert "--force" in complaint
+    assert "another name" in complaint
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == "kept"
+
+
+def test_every_command_with_outputs_has_force():
+    assert WORDS.keys() == {name for name, _ in output_flags()}
+    assert {name for name, command in COMMANDS.items() if hasattr(command, "force")} == WORDS.keys()
+
+
+def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.npz").write_bytes((files / "run.npz").read_bytes())
+    (tmp_path / "run.png").write_text("kept")
+    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.npz")):
+        status, _, complaint = batchpid("plot", "run.npz", *words)
+        assert status == 0, complaint
+        status, _, complaint = batchpid("plot", "run.npz", *words)
+        assert "exists already" in complaint
+        assert batchpid("plot", "run.npz", *words, "--force")[0] == 0
+    names = {"run.npz", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert (tmp_path / "run.png").read_text() == "kept"
+
+
+def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp_path, monkeypatch):
+    monkeypatch.setattr("sim.plots.step_responses", lambda *_, **__: None)
+    monkeypatch.setattr("sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path)
+    monkeypatch.chdir(tmp_path)
+    assert batchpid("demo", *SHORT)[0] == 0
+    status, said, complaint = batchpid("demo", *SHORT)
+    assert (status, said) == (2, "")
+    assert "out/panda-demo.png" in complaint
+    assert batchpid("demo", *SHORT, "--force")[0] == 0
+    assert batchpid("demo", "jaco2", *SHORT)[0] == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"panda-demo.png", "jaco2-demo.png"}
+
+
+def test_a_recording_that_is_not_complete_names_its_picture_as_the_complete_one():
+    assert beside(Path("a/run.2.h5.partial"), "film", ".mp4") == Path("a/run.2-film.mp4")
+
+
+def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(tmp_path):
+    (path := tmp_path / "motors.yaml").write_text("kept")
+    (link := tmp_path / "link.yaml").symlink_to(path)
+    outputs = Outputs(force=True, inputs=(None, path))
+    for each in (path, link, tmp_path / "." / "motors.yaml"):
+        with pytest.raises(InvalidArgumentError, match="is a file to read"):
+            outputs.path("out", each, (".yaml",))
+    assert outputs.path("out", tmp_path / "a.json", (".json",)) == tmp_path / "a.json"
+    with pytest.raises(InvalidArgumentError, match="is another output of this run"):
+        outputs.path("json", tmp_path / "a.json", (".json",))
+
+
+def test_a_stopped_search_is_neither_lost_nor_continued_unasked(tmp_path):
+    path = tmp_path / "a.search.json"
+    assert Outputs(force=False).history(path, resume=True) == path  # nothing to continue yet
+    path.write_text("costs")
+    with pytest.raises(InvalidArgumentError, match=r"exists already.*--resume to continue.*--force to begin anew"):
+        Outputs(force=False).history(path, resume=False)
+    assert Outputs(force=False).history(path, resume=True).read_text() == "costs"
+    Outputs(force=True).history(path, resume=True)
+    assert path.read_text() == "costs"
+    Outputs(force=True).history(path, resume=False)
+    assert not path.exists()
+
+
+def test_gains_of_the_user_are_kept_by_tune(files, batchpid, tmp_path):
+    robot = Robot.load(files / "arm.urdf")
+    bp.save_params(path := tmp_path / "gains.yaml", robot.params(kp=3.0), robot.joint_names)
+    before = path.read_bytes()
+    status, _, complaint = batchpid("tune", files / "arm.urdf", "--out", path)
+    assert status == 2
+    assert f"out: exists already (got '{path}'); add --force to replace it, or choose another name" in complaint
+    assert path.read_bytes() == before
