@@ -52,7 +52,7 @@ check: $(VENV)/.dev
 	@$(MAKE) --no-print-directory docs
 
 docs: $(VENV)/.dev
-	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict
 
 format: $(VENV)/.dev
 	$(RUN) -m ruff check --fix .

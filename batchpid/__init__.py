@@ -27,6 +27,9 @@ from batchpid import startup
 
 startup.prepare()
 
+__version__ = "0.1.0"
+"""Version of the package; pyproject.toml reads it here."""
+
 from batchpid import actuators, presets
 from batchpid.actuators import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.bumpless import track

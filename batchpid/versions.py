@@ -10,13 +10,15 @@ PACKAGES = ("batchpid", "numpy", "sapien", "jax", "h5py", "cmaes", "mujoco", "gy
 
 
 def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of Python and of those ``packages`` that are installed, by name."""
+    """Return the versions of Python and of those ``packages`` that are installed, by name; batchpid is its own tree."""
     from importlib.metadata import PackageNotFoundError, version  # slow to import
+
+    import batchpid
 
     versions = {"python": platform.python_version()}
     for package in packages:
         try:
-            versions[package] = version(package)
+            versions[package] = batchpid.__version__ if package == "batchpid" else version(package)
         except PackageNotFoundError:
             continue
     return versions

@@ -233,6 +233,7 @@ def _encode(k: Coefficients, qpos: Any, qvel: Any, position: Any, velocity: Any)
 
 
 STAGES = Stages(_delivered, command_limits, _play, _encode)
+"""Stages for NumPy and JAX, as this module computes them."""
 
 
 def advance_effort(

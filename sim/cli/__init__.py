@@ -19,9 +19,9 @@ from typing import Any
 
 import tyro
 
+import batchpid
 from batchpid.errors import BatchPIDError
 from batchpid.startup import exit_at_once
-from batchpid.versions import package_versions
 from sim.cli.bench import BenchCommand
 from sim.cli.compare import CompareCommand
 from sim.cli.demo import DemoCommand
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """Run one command and return its exit status, or raise its error."""
     if arguments == ["--version"]:
-        print(package_versions(["batchpid"]).get("batchpid", "not installed: running from its source tree"))
+        print(batchpid.__version__)
         return 0
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning

@@ -27,6 +27,7 @@ from sim.observation import Rollout
 from sim.plots import drawing
 
 FORMATS = (".png", ".svg")
+"""Suffixes of the files that :func:`save` writes."""
 Joints: TypeAlias = Sequence[int | str] | None
 """Joints to draw, by index or name; None or empty for all."""
 _MEDIAN = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")

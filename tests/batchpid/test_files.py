@@ -1,6 +1,7 @@
 """Atomic writes and package versions."""
 
 import ast
+import importlib.metadata
 import platform
 from pathlib import Path
 
@@ -83,6 +84,15 @@ def test_every_file_is_written_by_the_atomic_writer():
             mode = last if name == "open" and isinstance(last, str) and set(last) <= set("rwax+bt") else "r"
             assert not set(mode) & set("wax+"), f"{path}:{node.lineno}"
             assert name not in ("write_text", "write_bytes", "tofile", "imsave"), f"{path}:{node.lineno}"
+
+
+def test_the_own_version_is_that_of_the_tree_in_use_installed_or_not(monkeypatch):
+    def not_installed(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", not_installed)
+    assert package_versions(("batchpid", "numpy")).keys() == {"python", "batchpid"}
+    assert package_versions(("batchpid",))["batchpid"] == batchpid.__version__
 
 
 def test_versions_are_those_of_installed_packages():

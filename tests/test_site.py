@@ -1,0 +1,77 @@
+"""The pages that `make docs` builds: every public name is in the reference, and every link has a target."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = sorted(
+    ".".join(path.parent.relative_to(ROOT).parts)
+    for top in ("batchpid", "sim")
+    for path in (ROOT / top).rglob("__init__.py")
+    if "__all__ = " in path.read_text()
+)
+REFERENCE = {
+    name for page in (ROOT / "docs/api").glob("*.md") for name in re.findall(r"^::: (.*)$", page.read_text(), re.M)
+}
+
+
+def test_the_packages_with_public_names_are_found():
+    assert {"batchpid", "batchpid.actuators", "sim", "sim.plots", "sim.tuning", "sim.view"} <= set(PACKAGES)
+
+
+def places(package: str, name: str) -> set[str]:
+    """Return the entries of the reference that would show a public name: its own, its package's, or its module's."""
+    value = getattr(importlib.import_module(package), name)
+    if isinstance(value, ModuleType):
+        return {value.__name__}
+    if not hasattr(value, "__qualname__"):  # a constant does not say where it is defined
+        shown = {each for each in REFERENCE if each.startswith(f"{package}.") and each in sys.modules}
+        return {package, *(each for each in shown if getattr(sys.modules[each], name, None) is value)}
+    return {f"{package}.{name}", package, value.__module__, f"{value.__module__}.{name}"}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_is_in_the_reference(package):
+    names = importlib.import_module(package).__all__
+    assert [name for name in names if not places(package, name) & REFERENCE] == []
+
+
+def test_every_link_of_the_site_has_a_target(tmp_path, monkeypatch):
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("material")
+    from mkdocs.commands.build import build
+    from mkdocs.config import load_config
+
+    monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # Without the plugin that reads docstrings, which takes a quarter of a minute.
+        config = load_config(str(ROOT / "mkdocs.yml"), plugins=["search"], site_dir=str(tmp_path), strict=True)
+        build(config)
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) > 20
+    dead = {
+        (str(page.relative_to(tmp_path)), link)
+        for page in pages
+        if page.name != "404.html"
+        for link in re.findall(r'(?:href|src)="([^"#?]+)', page.read_text())
+        if not re.match(r"\w+:|//|/|_mkdocstrings", link) and not (page.parent / unquote(link)).exists()
+    }
+    assert dead == set()
+    assert 'href="SECURITY.html"' in (tmp_path / "view.html").read_text()
+
+
+def test_the_docs_are_built_with_their_warnings():
+    """--quiet keeps warnings from --strict, which then passes with dead links."""
+    recipe = re.search(r"^docs:.*\n\t(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
+    assert "--strict" in recipe
+    assert "quiet" not in recipe
