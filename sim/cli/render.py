@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,8 @@ class RenderCommand:
 
         outputs = Outputs(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
-        rollout, robot = read_run(self.recording, self.robot, self.missing_meshes)
+        usage = f"batchpid render {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf"
+        rollout, robot = read_run(self.recording, self.robot, self.missing_meshes, usage)
         rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")
         path = write_film(

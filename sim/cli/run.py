@@ -83,17 +83,23 @@ def read_variation(
     return replace(robot, actuators=actuators), randomization
 
 
-def read_run(path: Path, robot: str | None, missing_meshes: str) -> tuple[Rollout, Robot]:
+def read_run(path: Path, robot: str | None, missing_meshes: str, usage: str) -> tuple[Rollout, Robot]:
     """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
+
+    ``usage`` is the command with the robot named, for the message. A recording may come from a stranger, so it does not
+    say which file to open.
 
     Raises
     ------
     InvalidArgumentError
-        The file cannot be read, or no robot is named and the recorded one is not bundled.
+        The file cannot be read, or no robot is named and the recorded one is not bundled, or another of that name.
     """
     rollout = read_recording(path)
-    if robot is None and rollout.info.robot not in Robot.bundled():
-        raise InvalidArgumentError(
-            "robot", f"{rollout.info.robot!r} of the recording is not bundled", remedy="give the path of its URDF"
-        )
-    return rollout, Robot.load(robot or rollout.info.robot, missing_meshes=missing_meshes)
+    name, description = rollout.info.robot, rollout.info.urdf
+    if robot is not None:
+        return rollout, Robot.load(robot, missing_meshes=missing_meshes)
+    found = Robot.load(name, missing_meshes=missing_meshes) if name in Robot.bundled() else None
+    if found is None or description not in (None, found.urdf):
+        problem = "is not bundled" if found is None else "is another one than the bundled robot of that name"
+        raise InvalidArgumentError("robot", f"{name!r} of the recording {problem}", remedy=f"name its URDF: {usage}")
+    return rollout, found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -100,7 +101,8 @@ class ViewCommand:
         from sim.view import Playback
         from sim.view.layout import MAX_ROBOTS
 
-        rollout, robot = read_run(path, self.robot, self.missing_meshes)
+        usage = f"batchpid view PATH/TO/ROBOT.urdf --play {shlex.quote(str(path))}"
+        rollout, robot = read_run(path, self.robot, self.missing_meshes, usage)
         if rollout.num_envs > MAX_ROBOTS:
             print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
         return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=1 / self.fps)

@@ -16,12 +16,12 @@ pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
 
 
-def write(path, robot="panda", envs=1):
+def write(path, robot="panda", envs=1, **changed):
     """Write a rollout of two ticks at rest."""
     panda = load_bundled("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
-    info = replace(panda.run_info(), robot=robot)
+    info = replace(panda.run_info(), robot=robot, **changed)
     return write_recording(Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path)
 
 
@@ -105,9 +105,19 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
     assert f"port {port} is in use; the page is at " in said
 
 
+def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(batchpid, tmp_path):
+    run = write(tmp_path / "my run.npz", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
+    said = "robot: 'panda' of the recording is another one than the bundled robot of that name; name its URDF: batchpid"
+    assert f"{said} view PATH/TO/ROBOT.urdf --play '{run}'" in batchpid("view", "--play", run)[2]
+    assert f"{said} render '{run}' PATH/TO/ROBOT.urdf" in batchpid("render", run)[2]
+
+
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
     run = write(tmp_path / "run.npz", robot="arm")
-    assert "robot: 'arm' of the recording is not bundled; give the path" in batchpid("view", "--play", run)[2]
+    assert (
+        "robot: 'arm' of the recording is not bundled; name its URDF: batchpid view PATH/TO/ROBOT.urdf --play"
+        in batchpid("view", "--play", run)[2]
+    )
     path = tmp_path / "arm.urdf"
     path.write_text(load_bundled("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0
