@@ -13,7 +13,7 @@ SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
 
 def saved(batchpid, path, *flags):
-    status, _, err = batchpid("rollout", *SHORT, "--out", path, *flags)
+    status, _, err = batchpid("rollout", *SHORT, "--force", "--out", path, *flags)
     assert status == 0, err
     with np.load(path) as file:
         return dict(file)
