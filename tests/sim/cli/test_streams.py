@@ -14,6 +14,8 @@ import psutil
 import pytest
 from tiny_urdf import one_joint, write
 
+from batchpid import save_params
+from sim import Robot
 from sim.cli import COMMANDS
 
 BATCHPID = f"{sys.executable} -m batchpid"
@@ -24,6 +26,9 @@ RUNS = {
     "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --force --out out/a.json",
     "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --force --out out/a.yaml",
     "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --force --picture out/a.png",
+    "excite": "excite arm.urdf --duration 1 --force --out out/a.csv",
+    "identify": "identify arm.urdf log.npz --params gains.yaml --evaluations 1 --no-payload --workers 1 --force "
+    "--out out/a.yaml",
     "inspect": "inspect panda --all",
     "survey": "survey arm.urdf --moves 1 --seconds 0.1 --workers 1 --force --json out/a.json --out out/a.md",
     "plot": "plot run.npz --force",
@@ -33,7 +38,8 @@ RUNS = {
 """A short run of each command."""
 UNDISTURBED = {name: {0, 2} if name == "render" else {0} for name in RUNS}
 """Exit statuses of these runs; 2 where this machine cannot render."""
-TUNED = {"a.yaml", "a.search.json"}
+INPUTS = {"arm.urdf", "gains.yaml", "run.npz", "log.npz"}
+WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".npz", ".json", ".md", ".csv")
 MOMENTS = int(os.environ.get("BATCHPID_SOAK_MOMENTS", "8"))
 """Number of interrupts of each command."""
 
@@ -78,10 +84,13 @@ def test_ctrl_c_while_packages_are_imported_ends_in_one_line(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with a recording and a robot, for long tests of every command."""
-    write(tmp_path, one_joint(), "arm.urdf")
-    line = f"{BATCHPID} rollout --num-envs 1 --workers 0 --seconds 0.05 --out run.npz"
-    assert shell(line, tmp_path)[0] == 0
+    """A folder with a recording, a robot, its gains and its log, for long tests of every command."""
+    robot = Robot.load(write(tmp_path, one_joint(), "arm.urdf"))
+    save_params(tmp_path / "gains.yaml", robot.designed("effort"), robot.joint_names)
+    line = f"{BATCHPID} rollout --num-envs 1 --workers 0"
+    log = "arm.urdf --gains gains.yaml --seconds 1 --setpoint 0.3 --out log.npz"
+    for words in ("--seconds 0.05 --out run.npz", log):
+        assert shell(f"{line} {words}", tmp_path)[0] == 0
     return tmp_path
 
 
@@ -130,15 +139,4 @@ def test_ctrl_c_at_any_moment_of_every_command(name, folder):
         assert "Exception ignored" not in err
         assert not psutil.wait_procs(family, timeout=5)[1]
         left = {path.name for path in folder.rglob("*") if path.is_file()}
-        assert left <= {
-            "run.npz",
-            "arm.urdf",
-            "run-responses.png",
-            "a-tune.png",
-            "a.png",
-            "b.png",
-            "a.npz",
-            "a.json",
-            "a.md",
-            *TUNED,
-        }
+        assert left <= INPUTS | {"run-responses.png", "b.png", *(f"a{each}" for each in WRITTEN)}
