@@ -12,7 +12,7 @@ from tiny_urdf import one_joint, write
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner, write_recording
-from sim.cli import COMMANDS
+from sim.cli import COMMANDS, parse
 from sim.cli.outputs import Outputs, beside
 
 SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
@@ -136,3 +136,14 @@ def test_gains_of_the_user_are_kept_by_tune(files, batchpid, tmp_path):
     assert status == 2
     assert f"out: exists already (got '{path}'); add --force to replace it, or choose another name" in complaint
     assert path.read_bytes() == before
+
+
+def test_make_can_repeat_its_runs():
+    makefile = (Path(__file__).parents[3] / "Makefile").read_text().replace("\\\n", "")
+    runs = [line.partition(" -m batchpid ")[2].split() for line in makefile.splitlines() if " -m batchpid " in line]
+    assert {words[0] for words in runs} == {"demo", "bench"}
+    assert all("--force" in words for words in runs)
+    demo = next(words for words in runs if words[0] == "demo")
+    assert demo.pop() == "$(ARGS)"  # last, so that they win
+    command = parse([*demo, "--picture", "mine.png"])
+    assert (command.force, command.picture) == (True, Path("mine.png"))
