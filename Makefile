@@ -1,9 +1,9 @@
 # make demo    64 robots under one batch PID: a table, and a picture in out/demo.png
-# make test     all tests but the minutes-long ones
+# make test     all tests but the minutes-long ones, and every benchmark on a tiny workload
 # make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
 # make check    linter, formatter, types, floors and docs: what CI runs before the tests
 # make docs     the API reference and the guides, as pages in out/site
-# make bench    benchmarks and their baselines
+# make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
 # make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
 # make soak     the minutes-long tests
@@ -30,7 +30,7 @@ demo: $(VENV)/.base
 	@$(RUN) -m batchpid demo --picture out/demo.png --force $(ARGS)
 
 test: $(VENV)/.dev
-	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $(ARGS)
+	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal --benchmark-disable $(ARGS)
 
 # Features that NumPy chooses at run time and this processor has, by NumPy's own list (its names change by version).
 numpy_features = $(RUN) -c "from numpy._core._multiarray_umath import __cpu_dispatch__ as d, __cpu_features__ as f; \

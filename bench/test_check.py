@@ -11,7 +11,7 @@ import statistics
 from typing import NamedTuple
 
 import pytest
-from test_actuators import speeds_over_ideal
+from test_actuator_cost import speeds_over_ideal
 from test_few_robots import COUNTS, few_robots
 
 from sim import Robot
@@ -62,15 +62,32 @@ ACTUATOR_FLOORS = {
 }
 
 
+@pytest.fixture
+def check(most):
+    """Function that fails unless one of a few runs of ``measure`` has every ratio at its floor or above."""
+
+    def check(label, measure):
+        for _ in range(ATTEMPTS):
+            found = measure()
+            print(f"\n{label}: " + ", ".join(f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()))
+            short = {name: both for name, both in found.items() if most.floors and both[0] < both[1]}
+            if not short:
+                return
+        pytest.fail(f"{label}: (ratio, floor) in the last of {ATTEMPTS} runs: {short}")
+
+    return check
+
+
 @pytest.mark.check
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_ratios_keep_their_floors(name, physics):
+def test_ratios_keep_their_floors(check, most, name, physics):
     floors = [floor for floor in FLOORS if native.status().active or floor.over != PYTHON]
     names = {case for floor in floors for case in (floor.case, floor.over)}
 
     def measure():
-        workload = Workload(Robot.load(name), num_envs=48, physics=physics, ticks=60, rounds=3)
+        envs, workers, rounds = min(48, most.envs), min(2, most.workers), min(3, most.rounds)
+        workload = Workload(Robot.load(name), envs, workers, physics, ticks=60, rounds=rounds)
         results = measure_rates(workload, names=names)
         return {
             f"{floor.case} / {floor.over}": (results[floor.case].over(results[floor.over]), getattr(floor, physics))
@@ -83,11 +100,11 @@ def test_ratios_keep_their_floors(name, physics):
 @pytest.mark.check
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_few_robots_keep_their_floors(name, physics):
+def test_few_robots_keep_their_floors(check, most, name, physics):
     def measure():
         found = {}
         for count in COUNTS:
-            seconds = few_robots(name, count, physics, rounds=3)
+            seconds = few_robots(name, count, physics, most, rounds=3)
             ratio = statistics.median(theirs / ours for ours, theirs in seconds)
             found[f"{count} in this process / tutorial"] = ratio, FEW_FLOORS[count][physics == "fast"]
         return found
@@ -97,22 +114,9 @@ def test_few_robots_keep_their_floors(name, physics):
 
 @pytest.mark.check
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
-def test_actuators_keep_their_floors(physics):
+def test_actuators_keep_their_floors(check, most, physics):
     def measure():
-        return {
-            f"{name} / ideal": (ratio, ACTUATOR_FLOORS[name])
-            for name, ratio in speeds_over_ideal(physics, rounds=30).items()
-        }
+        speeds = speeds_over_ideal(physics, most, rounds=30)
+        return {f"{name} / ideal": (ratio, ACTUATOR_FLOORS[name]) for name, ratio in speeds.items()}
 
     check(f"actuators of panda, {physics}", measure)
-
-
-def check(label, measure):
-    """Fail unless one of a few runs of ``measure`` has every ratio at its floor or above."""
-    for _ in range(ATTEMPTS):
-        found = measure()
-        print(f"\n{label}: " + ", ".join(f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()))
-        short = {name: both for name, both in found.items() if both[0] < both[1]}
-        if not short:
-            return
-    pytest.fail(f"{label}: (ratio, floor) in the last of {ATTEMPTS} runs: {short}")

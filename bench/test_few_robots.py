@@ -13,15 +13,16 @@ from sim import Robot
 from sim.benchmark.tutorial import TutorialLoop
 from sim.benchmark.workload import Workload
 
-TICKS, ROUNDS = 50, 7
+TICKS, ROUNDS = 50, 5
 COUNTS = (1, 4, 16)
 
 
-def few_robots(name, num_envs, physics, rounds=ROUNDS):
+def few_robots(name, num_envs, physics, most, rounds=ROUNDS):
     """Return the seconds per env step of our loop and of the tutorial's in each round (rounds, 2)."""
-    workload = Workload(Robot.load(name), num_envs=num_envs, workers=0, physics=physics, ticks=TICKS)
+    num_envs, ticks, rounds = min(num_envs, most.envs), min(TICKS, most.ticks), min(rounds, most.rounds)
+    workload = Workload(Robot.load(name), num_envs, workers=0, physics=physics, ticks=ticks)
     tutorial = TutorialLoop(workload.robot, workload.target, start=workload.start)
-    setpoints = np.broadcast_to(workload.target, (TICKS, *workload.target.shape))
+    setpoints = np.broadcast_to(workload.target, (ticks, *workload.target.shape))
     seconds = []
     with workload.runner() as runner:
         for _ in range(rounds + 1):
@@ -41,11 +42,10 @@ def few_robots(name, num_envs, physics, rounds=ROUNDS):
 @pytest.mark.parametrize("num_envs", COUNTS)
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_few_robots(benchmark, name, physics, num_envs):
+def test_few_robots(benchmark, report, compare, most, name, physics, num_envs):
     benchmark.group = "few robots in the caller's process"
-    seconds = []
-    benchmark.pedantic(lambda: seconds.extend(few_robots(name, num_envs, physics)), rounds=1)
-    ours = [both[0] for both in seconds]
-    benchmark.stats.stats.data[:] = ours
-    benchmark.extra_info["env_steps_per_second"] = round(1 / statistics.median(ours))
-    benchmark.extra_info["over_tutorial"] = round(statistics.median(theirs / ours for ours, theirs in seconds), 3)
+    seconds = benchmark.pedantic(lambda: few_robots(name, num_envs, physics, most), rounds=1)
+    report([ours for ours, _ in seconds])
+    ratio = statistics.median(theirs / ours for ours, theirs in seconds)
+    benchmark.extra_info["over_tutorial"] = round(ratio, 3)
+    compare(f"{name}, {physics}, in one process", f"{num_envs} robots", "tutorial", ratio)

@@ -1,47 +1,42 @@
-"""Time of an env step: the closed loop, the tutorial's loop and the bare engine.
+"""Rates of the closed loop, the tutorial's loop, the bare engine and third-party peers, measured in turn.
 
-Groups hold what is to be compared. A round is one simulated second of 64 robots (the tutorial's loop: one, or one per
-core), and its time is divided by its env-steps: every row is the time of an env step, and the column OPS is env-steps
-per second, which ``extra_info`` has as well. ``batchpid bench`` prints the same cases paired.
+``batchpid bench`` prints the same. A row is the time of an env step, and the column OPS is env-steps per second, which
+``extra_info`` has as well.
 """
+
+import importlib.util
 
 import pytest
 
 from sim import Robot
-from sim.benchmark.baselines import make_baselines
-from sim.benchmark.benchmark import CASES, XLA_CASES, make_closed_loops
+from sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_rates
+from sim.benchmark.peers import PEERS
 from sim.benchmark.workload import Workload
 
-ROUNDS = 3
+TICKS, ROUNDS = 50, 3
 
 
-@pytest.mark.parametrize("case", CASES | XLA_CASES)
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_case(benchmark, name, physics, case):
-    benchmark.group = f"{name}, {physics}"
-    workload = Workload(Robot.load(name), physics=physics)
-    ours = case.startswith("closed loop")
-    cases = make_closed_loops(workload, [case]) if ours else make_baselines(workload)
-    measure(benchmark, workload, case, cases[case])
+@pytest.fixture(
+    scope="module",
+    params=[(name, physics) for name in ("panda", "jaco2") for physics in ("accurate", "fast")],
+    ids=", ".join,
+)
+def setup(request, most):
+    """Name of robot and physics, and the results of all cases; of peers, which have no presets, beside "accurate"."""
+    name, physics = request.param
+    envs, workers, rounds = min(64, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
+    workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
+    peers = [each for each in PEERS if physics == "accurate" and importlib.util.find_spec(PEERS[each].package)]
+    return ", ".join(request.param), measure_rates(workload, peers=peers, names=CASES | XLA_CASES)
 
 
-def measure(benchmark, workload, name, case):
-    """Time rounds of ``case`` and check that its robots moved."""
-
-    def reset():
-        case.reset()
-
-    try:
-        final = benchmark.pedantic(case.run, setup=reset, rounds=ROUNDS, warmup_rounds=1)
-    finally:
-        case.close()
-    workload.check_motion(name, final)
-    report_per_env_step(benchmark, case.env_steps)
-
-
-def report_per_env_step(benchmark, env_steps):
-    """Report the time per env-step in place of the time per round, and env-steps per second."""
-    stats = benchmark.stats.stats
-    stats.data[:] = [seconds / env_steps for seconds in stats.data]
-    benchmark.extra_info["env_steps_per_second"] = round(1 / stats.median)
+@pytest.mark.parametrize("case", CASES | XLA_CASES | PEERS)
+def test_case(benchmark, report, compare, setup, case):
+    benchmark.group, results = setup
+    if case not in results:
+        pytest.skip("beside accurate, if installed")
+    result = results[case]
+    benchmark.pedantic(lambda: result, rounds=1)
+    report([1 / rate for rate in result.rates])
+    if case != OURS:
+        compare(benchmark.group, OURS, case, results[OURS].over(result))

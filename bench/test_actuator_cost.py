@@ -14,7 +14,7 @@ from sim import Robot
 from sim.benchmark.workload import Workload
 from sim.loop.actuators import JointActuators
 
-ENVS, JOINTS, STEPS = 16, 9, 512
+ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {
     "command_delay": 0.005,
     "sensor_delay": 0.003,
@@ -41,13 +41,14 @@ CASES = {
 """Options of actuators whose runners are compared with one of ideal ones."""
 
 
-def speeds_over_ideal(physics, rounds):
+def speeds_over_ideal(physics, most, rounds):
     """Return the speed of each case over that of actuators=None: the median of rounds in which all take turns.
 
     Processor time of this process, in which the robots are: another program disturbs it less.
     """
-    workload = Workload(Robot.load("panda"), num_envs=ENVS, workers=0, physics=physics, ticks=10)
-    setpoints = np.broadcast_to(workload.target, (workload.ticks, ENVS, len(workload.target)))
+    num_envs, rounds = min(ENVS, most.envs), min(rounds, most.rounds)
+    workload = Workload(Robot.load("panda"), num_envs, workers=0, physics=physics, ticks=TICKS)
+    setpoints = np.broadcast_to(workload.target, (workload.ticks, num_envs, len(workload.target)))
     rng, seconds = np.random.default_rng(0), []
     with ExitStack() as stack:
         chosen = {name: bp.make_actuators(JOINTS, **options) for name, options in CASES.items()}
@@ -68,21 +69,21 @@ def speeds_over_ideal(physics, rounds):
 
 
 @pytest.mark.benchmark(group="actuators")
-def test_all_effects(benchmark):
+def test_all_effects(benchmark, most):
     qpos, qvel, effort = np.random.default_rng(0).uniform(0.1, 1.0, (3, ENVS, JOINTS))
+    steps = int(min(STEPS, most.ticks))
     actuators = JointActuators(bp.make_actuators(JOINTS, **EFFECTS), qpos, 1 / 2000, 0)
 
     def run():
-        for _ in range(STEPS):
+        for _ in range(steps):
             measured, rate = actuators.measure(qpos, qvel)
             limits = actuators.limits(measured, rate)
             delivered = actuators.deliver(effort, qpos, qvel)
         return measured, delivered, limits
 
-    measured, delivered, (_, most) = benchmark(run)
+    measured, delivered, (_, most) = benchmark.pedantic(run, rounds=100, warmup_rounds=1)
     assert (most < 70.0).all(), "the effort limit over the strength"
     assert not np.array_equal(measured, qpos)
     assert not np.array_equal(delivered, effort)
-    if benchmark.stats is not None:
-        benchmark.extra_info["us_per_env_step"] = 1e6 * benchmark.stats.stats.median / (STEPS * ENVS)
-        print(f"\n{benchmark.extra_info['us_per_env_step']:.2f} us for an env step of {JOINTS} joints")
+    benchmark.extra_info["us_per_env_step"] = 1e6 * benchmark.stats.stats.median / (steps * ENVS)
+    print(f"\n{benchmark.extra_info['us_per_env_step']:.2f} us for an env step of {JOINTS} joints")
