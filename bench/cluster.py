@@ -17,7 +17,6 @@ import tyro
 
 from sim import Ray, Robot, Runner
 
-NUM_ENVS = 64
 SMALL = {"object_store_memory": 100 << 20, "include_dashboard": False}
 
 
@@ -25,6 +24,7 @@ SMALL = {"object_store_memory": 100 << 20, "include_dashboard": False}
 class Bench:
     """Options."""
 
+    num_envs: int = 64
     turns: int = 10
     ticks: int = 160
     """Ticks of a rollout, of 20 sim steps each."""
@@ -37,7 +37,7 @@ class Bench:
 
         head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}  # as the local pool
         cluster = Cluster(initialize_head=True, head_node_args=head)
-        for cpus in (4, 1, 1):
+        for cpus in (3, 1):
             cluster.add_node(num_cpus=cpus, **SMALL)
         robot = Robot.load("panda")
         setpoints = np.tile(robot.settings.target, (self.ticks, 1))
@@ -48,7 +48,7 @@ class Bench:
         }
         with ExitStack() as stack:
             runners = {
-                name: stack.enter_context(Runner(robot, NUM_ENVS, params=robot.params(), **options))
+                name: stack.enter_context(Runner(robot, self.num_envs, params=robot.params(), **options))
                 for name, options in where.items()
             }
             rollouts, latencies = (np.zeros((turns, len(runners))) for turns in (self.turns, self.steps))
@@ -56,8 +56,9 @@ class Bench:
                 for column, runner in enumerate(runners.values()):
                     runner.reset()
                     began = time.perf_counter()
-                    runner.rollout(setpoints)
+                    qpos = runner.rollout(setpoints).qpos
                     rollouts[turn, column] = time.perf_counter() - began
+                    assert np.abs(qpos[-1] - qpos[0]).max() > 0.01, "the robots did not move"
             for turn in range(self.steps):
                 for column, runner in enumerate(runners.values()):
                     began = time.perf_counter()

@@ -20,7 +20,6 @@ import tyro
 from sim import Robot, Runner
 from sim.engine.contact_prediction import ContactPredictor
 
-NUM_ENVS, SECONDS = 64, 2.0
 MOTIONS: dict[str, tuple[float, dict[str, Any]]] = {
     # name: (standard deviation of random efforts, in effort limits; options of the Runner)
     "random efforts up to the limits": (1.0, {}),
@@ -40,14 +39,15 @@ def prediction(enabled: bool) -> Iterator[None]:
         ContactPredictor.predicts_contact = predicts_contact  # type: ignore[method-assign]
 
 
-def run(robot: Robot, scale: float, physics: str, pack_size: int, **options: Any) -> tuple[np.ndarray, float]:
-    """Return the positions (ticks, envs, dof) and the seconds it took."""
-    shape = (round(SECONDS * 100), NUM_ENVS, robot.dof)
-    effort = scale * np.random.default_rng(0).normal(size=shape) * robot.effort_limit
+def run(
+    robot: Robot, shape: tuple[int, int], scale: float, physics: str, pack_size: int, **options: Any
+) -> tuple[np.ndarray, float]:
+    """Return the positions (ticks, envs, dof), with ``shape`` (ticks, envs), and the seconds it took."""
+    effort = scale * np.random.default_rng(0).normal(size=(*shape, robot.dof)) * robot.effort_limit
     params = robot.params(kp=0.0, ki=0.0, kd=0.0)
     common: dict[str, Any] = {"control": "effort", "params": params, "workers": 0, "pack_size": pack_size}
-    with Runner(robot, NUM_ENVS, physics=physics, **common, **options) as runner:
-        runner.reset(robot.sample(NUM_ENVS, seed=0))
+    with Runner(robot, shape[1], physics=physics, **common, **options) as runner:
+        runner.reset(robot.sample(shape[1], seed=0))
         began = time.perf_counter()
         qpos = runner.rollout(effort).qpos
         seconds = time.perf_counter() - began
@@ -55,20 +55,21 @@ def run(robot: Robot, scale: float, physics: str, pack_size: int, **options: Any
     return qpos, seconds
 
 
-def main(robots: tuple[str, ...] = ("jaco2", "panda")) -> None:
+def main(robots: tuple[str, ...] = ("jaco2", "panda"), num_envs: int = 64, seconds: float = 2.0) -> None:
     """Print the envs that differ without and with the prediction, and the time with it over that without."""
-    print("| 64 robots, 2 s | solver | without | with | time |\n| --- | --- | --- | --- | --- |")
+    shape = round(seconds * 100), num_envs
+    print(f"| {num_envs} robots, {seconds:g} s | solver | without | with | time |\n| --- | --- | --- | --- | --- |")
     for name in robots:
         robot = Robot.load(name)
         for motion, (scale, options) in MOTIONS.items():
             for physics in ("accurate", "fast"):
-                different, seconds = {}, {}
+                different, took = {}, {}
                 for enabled in (False, True):
                     with prediction(enabled):
-                        alone, _ = run(robot, scale, physics, 1, **options)
-                        packed, seconds[enabled] = run(robot, scale, physics, 4, **options)
+                        alone, _ = run(robot, shape, scale, physics, 1, **options)
+                        packed, took[enabled] = run(robot, shape, scale, physics, 4, **options)
                     different[enabled] = int((alone != packed).any((0, 2)).sum())
-                ratio = f"{seconds[True] / seconds[False]:.2f}"
+                ratio = f"{took[True] / took[False]:.2f}"
                 row = (f"{name}, {motion}", physics, different[False], different[True], ratio)
                 print(f"| {' | '.join(map(str, row))} |", flush=True)
 

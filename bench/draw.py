@@ -66,18 +66,21 @@ class Options:
 
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of new measurements; default: none."""
+    docs: Path = DOCS
+    """Folder of the page; the README.md beside it has some of the tables, too."""
 
 
 def main(options: Options) -> None:
     """Merge new figures, if any; draw the pictures; write the tables."""
-    path = DOCS / "performance.json"
+    docs = options.docs
+    path = docs / "performance.json"
     figures = json.loads(path.read_text()) if path.is_file() else {}
     if options.folder is not None:
         figures |= gather(options.folder, figures)
         write_atomically(path, json.dumps(figures, indent=1) + "\n")
-    save(draw_speed(figures), DOCS / "images" / "performance.png")
-    save(draw_accuracy(figures["accuracy"]), DOCS / "images" / "accuracy.png")
-    for page in (DOCS / "performance.md", DOCS.parent / "README.md"):
+    save(draw_speed(figures), docs / "images" / "performance.png")
+    save(draw_accuracy(figures["accuracy"]), docs / "images" / "accuracy.png")
+    for page in (docs / "performance.md", docs.parent / "README.md"):
         text = page.read_text()
         for name, table in tables(figures).items():
             marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)

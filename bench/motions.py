@@ -30,7 +30,7 @@ from sim.engine.native import status
 from sim.engine.pack import Pack
 from sim.tuning.moves import Moves, random_moves, tutorial_move
 
-NUM_ENVS, SUBSTEPS = 32, 20
+SUBSTEPS = 20
 REPEATS = 4
 """Runs of the tutorial's loop in a round: one robot alone is soon done."""
 HOLD = "start pose held"
@@ -75,6 +75,7 @@ class Options:
     """
 
     robots: tuple[str, ...] = ("panda", "jaco2")
+    num_envs: int = 32
     moves: int = 20
     ticks: int = 50
     rounds: int = 3
@@ -127,7 +128,7 @@ def measure(
     runners = {}
     for case, enabled in zip(CASES[1 : 3 if options.isolation else 2], (True, False), strict=False):
         with isolation(enabled):
-            runners[case] = Runner(robot, NUM_ENVS, params=robot.params(), workers=0, **ours)
+            runners[case] = Runner(robot, options.num_envs, params=robot.params(), workers=0, **ours)
     for start, target, motion, tutorial in zip(*chosen, tutorials, strict=True):
         seconds: dict[str, list[float]] = {case: [] for case in (CASES[0], *runners)}
         for _ in range(options.rounds):
@@ -135,7 +136,7 @@ def measure(
             for _ in range(REPEATS):
                 tutorial.reset()
                 tutorial.run(options.ticks * SUBSTEPS)
-            seconds[CASES[0]].append(NUM_ENVS / REPEATS * (time.process_time() - began))
+            seconds[CASES[0]].append(options.num_envs / REPEATS * (time.process_time() - began))
             for case, runner in runners.items():
                 runner.reset(start)
                 began = time.process_time()
@@ -146,7 +147,7 @@ def measure(
                 if motion in (HOLD, "tutorial"):
                     assert (moved > 0.01) == (motion != HOLD), f"{motion}: the robots moved by {moved:g} rad"
         times = list(zip(*seconds.values(), strict=True))
-        us = statistics.median(seconds[CASES[1]]) / (NUM_ENVS * options.ticks * SUBSTEPS) * 1e6
+        us = statistics.median(seconds[CASES[1]]) / (options.num_envs * options.ticks * SUBSTEPS) * 1e6
         over = statistics.median(each[0] / each[1] for each in times)
         cost = statistics.median(each[1] / each[2] for each in times) if options.isolation else None
         yield Row(moved, us, over, cost)

@@ -160,7 +160,7 @@ def report(costs: Costs) -> str:
     return "\n\n".join(f"**{title}**\n\n{table(ticks, case)}" for title, ticks, case in cases)
 
 
-def measure() -> str:
+def measure(calls: int = 30) -> str:
     """Return Ray's costs on this machine, the lowest of several: calls with the arrays of one node and piece."""
     import ray
 
@@ -178,7 +178,7 @@ def measure() -> str:
         setpoints, shared = np.zeros((2, count * size.down), np.uint8)
         rollout = np.zeros(count * size.up, np.uint8)
         found = []
-        for _ in range(30):
+        for _ in range(calls):
             begin = perf_counter()
             shared[:] = setpoints.copy()  # kept for a replay, and for a recorder
             answer = node.execute.remote(setpoints, len(rollout))
@@ -191,18 +191,18 @@ def measure() -> str:
                 rollout[:] = rows
             found.append((sent - begin, perf_counter() - waited))
         times[name] = np.min(found, axis=0)
-    calls = []
-    for _ in range(30):
+    trips = []
+    for _ in range(calls):
         begin = perf_counter()
         ray.get(node.execute.remote(np.zeros(1, np.uint8), 1))
-        calls.append(perf_counter() - begin)
+        trips.append(perf_counter() - begin)
     ray.shutdown()
     (send, receive), (longer_send, longer_receive) = times["small"], times["large"]
     count = ticks * ENVS * CORES
     send_rate, receive_rate = count * size.down / (longer_send - send), count * size.up / (longer_receive - receive)
     return (
         f"send {1e3 * send:.2f} ms, {send_rate / 1e9:.1f} GB/s; receive {1e3 * receive:.2f} ms, "
-        f"{receive_rate / 1e9:.1f} GB/s; round trip {1e3 * min(calls):.2f} ms"
+        f"{receive_rate / 1e9:.1f} GB/s; round trip {1e3 * min(trips):.2f} ms"
     )
 
 

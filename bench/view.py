@@ -55,6 +55,9 @@ class Options:
     width: int = 1280
     height: int = 800
     seconds: float = 8.0
+    loading: float = 8.0
+    """Seconds until everything is loaded."""
+    port: int = 18200
     picture: Path | None = None
     """Save a picture of the page 2 s after a step from the start pose to the target."""
 
@@ -66,21 +69,17 @@ def main(options: Options) -> None:
     target = robot.settings.target if robot.settings is not None else robot.start
     live.set_setpoint(target)
     first = live.frame().qpos
-    with View(live, port=18200) as view, tempfile.TemporaryDirectory() as profile:
+    with View(live, port=options.port) as view, tempfile.TemporaryDirectory() as profile:
         thread = threading.Thread(target=view.run)
         thread.start()
         before = {process.pid for process in psutil.Process().children(recursive=True)}
-        chrome = webdriver.ChromeOptions()
-        chrome.binary_location = shutil.which("chromium")
-        for flag in (*FLAGS, f"--window-size={options.width},{options.height}", f"--user-data-dir={profile}"):
-            chrome.add_argument(flag)
-        page = webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
+        page = open_browser(options, profile)
         # Without fixedDpr viser lowers the resolution in a slow browser, which would spoil a picture.
         page.get(view.url if options.picture is None else f"{view.url}?fixedDpr=1")
         browser = [each for each in psutil.Process().children(recursive=True) if each.pid not in before]
         for process in browser:
             process.nice(19)
-        time.sleep(8)
+        time.sleep(options.loading)
         page.execute_script(COUNT)
         spent = _spent(browser)
         frames, simulated, began = live.time / live.period, live.time, time.monotonic()
@@ -102,6 +101,15 @@ def main(options: Options) -> None:
         f"{served:.1f} frames/s served, {min(served, drawn / wall):.1f} drawn, {factor:.2f} x real time, "
         f"{1e3 * spent / max(1.0, min(served * wall, drawn)):.0f} ms of processor time in the browser per drawn frame"
     )
+
+
+def open_browser(options: Options, profile: str) -> webdriver.Chrome:
+    """Return headless Chromium with an empty page, and its profile in folder ``profile``."""
+    chrome = webdriver.ChromeOptions()
+    chrome.binary_location = shutil.which("chromium")
+    for flag in (*FLAGS, f"--window-size={options.width},{options.height}", f"--user-data-dir={profile}"):
+        chrome.add_argument(flag)
+    return webdriver.Chrome(options=chrome, service=webdriver.ChromeService(shutil.which("chromedriver")))
 
 
 def _spent(processes: list[psutil.Process]) -> float:

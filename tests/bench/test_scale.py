@@ -1,15 +1,12 @@
 """The page on large clusters shows what its simulation prints, and the simulation agrees with simple cases."""
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scripts import ROOT, load_script
 
-ROOT = Path(__file__).parents[1]
-SCALE = runpy.run_path(str(ROOT / "bench/scale.py"))
+SCALE = vars(load_script("scale"))
 FREE = {"send": 0.0, "send_rate": 1e30, "receive": 0.0, "receive_rate": 1e30, "round_trip": 0.0, "bandwidth": 1e30}
 EVEN = {"jitter": 0.0, "slow": 0.0, "detection": -20.0, "restart": 0.0}
 

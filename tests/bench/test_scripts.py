@@ -1,0 +1,115 @@
+"""Every script of bench/ runs, on a tiny workload; bench/scale.py without Ray: test_scale.py."""
+
+import json
+import shutil
+
+import pytest
+from clusters import FILTERS
+from scripts import ROOT, load_script
+
+TESTED = {"accuracy", "cluster", "contact", "draw", "motions", "scale", "view"}
+
+
+def rows(text):
+    """Return the cells of the rows of a Markdown table, without those of its head."""
+    lines = [line.strip("| ") for line in text.splitlines() if line.startswith("|")]
+    return [line.split(" | ") for line in lines[2:]]
+
+
+def test_every_script_has_a_test():
+    scripts = {path.stem for path in (ROOT / "bench").glob("*.py")} - {"conftest"}
+    assert {name for name in scripts if not name.startswith("test_")} == TESTED
+
+
+def test_accuracy(tmp_path, capsys):
+    accuracy = load_script("accuracy")
+    accuracy.main(accuracy.Options(count=1, seconds=0.02, json=tmp_path / "new" / "accuracy.json"))
+    figures = json.loads((tmp_path / "new" / "accuracy.json").read_text())["accuracy"]
+    assert {row["motion"] for row in figures} == {"free", "contact", "limit"}
+    assert all(0 < row["rms"] <= row["max"] < 0.1 and len(row["over_time"]["max"]) == 2 for row in figures)
+    assert "equation of motion" in capsys.readouterr().out
+
+
+def test_contact(capsys):
+    load_script("contact").main(robots=("jaco2",), num_envs=2, seconds=0.2)
+    found = rows(capsys.readouterr().out)
+    assert len(found) == 4
+    assert all(with_prediction == "0" for _, _, _, with_prediction, _ in found)
+
+
+def test_motions(tmp_path, capsys):
+    motions = load_script("motions")
+    path = tmp_path / "motions.json"
+    motions.main(motions.Options(num_envs=2, moves=1, ticks=5, rounds=1, json=path))
+    figures = json.loads(path.read_text())["motions"]
+    assert set(figures) == {"panda", "jaco2"}
+    assert all(ratio > 0 for robot in figures.values() for variant in robot.values() for ratio in variant.values())
+    assert "median" in capsys.readouterr().out
+
+
+def test_draw(tmp_path):
+    """From the figures of the page, as the programs of ``make figures`` write them, comes the page again."""
+    docs = tmp_path / "docs"
+    (docs / "images").mkdir(parents=True)
+    for name in ("README.md", "docs/performance.md", "docs/performance.json"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    draw = load_script("draw")
+    figures = json.loads((docs / "performance.json").read_text())
+    benchmarks = [
+        {"group": group, "params": {draw.SCALING[group][0]: int(at)}, "extra_info": {"env_steps_per_second": rate}}
+        for group, rates in figures["scaling"].items()
+        for at, rate in rates.items()
+    ]
+    for robot, resources in figures["resources"].items():
+        for name, value in resources.items():
+            benchmarks.append({"group": "resources", "params": {"workload": robot}, "extra_info": {name: value}})
+    for case, ratios in figures["few"].items():
+        for count, ratio in ratios.items():
+            params = dict(zip(("name", "physics"), case.split(", "), strict=True), num_envs=int(count))
+            benchmarks.append({"group": "few", "params": params, "extra_info": {"over_tutorial": ratio}})
+    new = tmp_path / "new"
+    new.mkdir()
+    (new / "pytest.json").write_text(json.dumps({"benchmarks": benchmarks}))
+    (new / "motions.json").write_text(json.dumps(figures["motions"]))
+    (new / "accuracy.json").write_text(json.dumps({"accuracy": figures["accuracy"]}))
+    draw.main(draw.Options(new, docs))
+    for name in ("README.md", "docs/performance.md", "docs/performance.json"):
+        assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
+    for name in ("performance", "accuracy"):
+        assert (docs / "images" / f"{name}.png").stat().st_size > 10_000
+
+
+class Page:
+    """Browser that draws nothing."""
+
+    def get(self, url):
+        self.url = url
+
+    def execute_script(self, script):
+        return 3 if "return" in script else None
+
+    def quit(self):
+        pass
+
+
+def test_view(monkeypatch, capsys):
+    pytest.importorskip("viser")
+    pytest.importorskip("selenium")
+    view, page = load_script("view"), Page()
+    monkeypatch.setattr(view, "open_browser", lambda options, profile: page)
+    view.main(view.Options("panda", num_envs=1, seconds=1.0, loading=0.0, port=18290))
+    assert page.url.startswith("http")
+    assert "frames/s served" in capsys.readouterr().out
+
+
+class TestOnRay:
+    pytestmark = FILTERS
+
+    def test_cluster(self, capsys):
+        pytest.importorskip("ray")
+        load_script("cluster").Bench(num_envs=4, turns=1, ticks=20, steps=1).run()
+        assert len(rows(capsys.readouterr().out)) == 3
+
+    def test_the_measured_costs_of_the_page_on_large_clusters(self):
+        pytest.importorskip("ray")
+        assert "round trip" in load_script("scale").measure(calls=2)
