@@ -6,7 +6,7 @@
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
 # make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
-# make soak     the minutes-long tests
+# make soak     the minutes-long tests, each result as it comes (an hour)
 #
 # Each builds .venv if it is missing or older than pyproject.toml, and the extensions if they are older than their
 # sources. Another Python: make PYTHON=/path/to/python3.12
@@ -84,7 +84,7 @@ accuracy: $(VENV)/.dev
 	@$(RUN) bench/draw.py $(MEASURED)
 
 soak: $(VENV)/.dev
-	@$(RUN) -m pytest -m slow --timeout 14400 $(ARGS)
+	@$(RUN) -u -m pytest -m slow -vv --durations 20 $(ARGS)
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -92,7 +92,8 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
         if missing(match):
             continue
         line = page.read_text()[: match.start("code")].count("\n")
-        exec(compile("\n" * line + match["code"], page, "exec"), namespace)
+        code = re.sub(r"\b64\b", "8", match["code"])  # envs
+        exec(compile("\n" * line + code, page, "exec"), namespace)
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=name)

@@ -8,12 +8,16 @@ from collections.abc import Iterable
 import psutil
 
 
+PATIENCE = 200.0
+"""Seconds that a test waits for what has to happen soon: so many that a busy machine does not matter."""
+
+
 def children() -> set[psutil.Process]:
     """Return the children of this process; libraries of other tests may have some that stay."""
     return set(psutil.Process().children())
 
 
-def have_ended(pids: Iterable[int], seconds: float = 5.0) -> bool:
+def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:
     """Wait for processes to end, so long at most; return whether they have."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:

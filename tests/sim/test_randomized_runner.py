@@ -242,7 +242,6 @@ def test_lost_workers_draw_the_same_again():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3000)
 def test_many_lost_workers_draw_the_same_again():
     assert_kills_change_nothing(KILLS)
 

@@ -80,7 +80,6 @@ def test_unknown_motion_is_refused(panda):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_errors_are_of_the_documented_order_of_magnitude(name):
     """The table of docs/performance.md, within a factor."""

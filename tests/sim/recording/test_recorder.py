@@ -338,7 +338,7 @@ def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
     process.send_signal(number)
     lines += process.stdout.read().splitlines()
     process.stdout.close()
-    process.wait(timeout=30)
+    process.wait()
     return np.array([line.split() for line in lines if len(line.split()) == 2], float)
 
 

@@ -241,7 +241,7 @@ def test_nothing_is_left_of_a_program_that_is_killed(local, machines):
         time.sleep(0.3)
         process.kill()
     assert len(pids) > (4 if local else 1)
-    assert have_ended(pids, seconds=20.0)
+    assert have_ended(pids)
     assert left_in_memory(shared) == set()
 
 

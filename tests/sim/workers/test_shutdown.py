@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import have_ended
+from processes import PATIENCE, have_ended
 
 from sim import Runner
 
@@ -58,7 +58,7 @@ def test_workers_end_with_a_parent_that_gets_a_signal(number, body):
     with process:
         time.sleep(0.3)
         process.send_signal(number)
-        error = process.communicate(timeout=20)[1]
+        error = process.communicate(timeout=PATIENCE)[1]
     assert have_ended(pids)
     assert set(os.listdir("/dev/shm")) <= shared
     if number == signal.SIGINT:
@@ -71,7 +71,7 @@ def test_stopped_workers_end_with_a_parent_that_is_killed():
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)
         process.kill()
-        process.communicate(timeout=20)
+        process.communicate(timeout=PATIENCE)
     assert have_ended(pids)
 
 
@@ -100,7 +100,7 @@ def test_workers_outlive_the_thread_that_made_them(panda):
 def test_workers_end_with_their_runner_or_with_the_program(body, status):
     process, pids = start(body)
     with process:
-        error = process.communicate(timeout=30)[1]
+        error = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == status, error
     assert have_ended(pids)
     assert "Exception ignored" not in error
@@ -118,7 +118,7 @@ def test_a_forked_child_does_not_end_the_workers_of_its_parent():
     """
     process, pids = start(body)
     with process:
-        output, error = process.communicate(timeout=30)
+        output, error = process.communicate(timeout=PATIENCE)
     assert output.strip() == "True", error
     assert have_ended(pids)
 
@@ -140,7 +140,7 @@ def test_programs_need_no_main_guard(kind, tmp_path):
         text=True,
         env=environment,
         cwd=tmp_path,
-        timeout=60,
+        timeout=PATIENCE,
     )
     assert done.stdout.splitlines()[-1] == "True 2", done.stderr
     assert have_ended([int(pid) for pid in done.stdout.splitlines()[0].split()])

@@ -115,7 +115,7 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
 
 def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
-    motion = excite(arm, 3.0, rate=2000.0, lowest=0.6).position
+    motion = excite(arm, 2.0, rate=2000.0, lowest=0.6).position
     per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
     motors = Motors(*per_joint, row(truth.delay), row(0.005), row(0.0))
     drive = Drive(1 / 2000, params, "gravity+coriolis", substeps=4)
@@ -226,9 +226,9 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
 
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
-    time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    time, qpos, command = (table[:400] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
-    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 9}
+    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 6}
     seen = []
     whole = identify(arm, log, **options, progress=lambda steps: (seen.append(step) or step for step in steps))
 

@@ -177,7 +177,7 @@ def test_a_joint_at_its_limit_is_told(panda):
     setpoints[:100, 3] = panda.upper[3] + 1e-3
     (line,) = at_limits(panda, free)
     assert line.startswith("free.csv: joint 'panda_joint4' is at its limit in 0.25 of the rows")
-    with pytest.warns(LogWarning, match="'panda_joint4' is at its limit"):
+    with pytest.raises(LogWarning, match="'panda_joint4' is at its limit"):  # an error here, which ends the fit
         identify(panda, free, params=panda.designed("effort"), evaluations=1, workers=0, payload=False)
 
 

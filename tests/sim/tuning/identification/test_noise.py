@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("scipy")
@@ -39,6 +39,7 @@ def test_the_spread_of_draws_has_their_covariance():
     np.testing.assert_allclose(columns @ columns.T, np.cov(draws[:, :, 0].T), atol=1e-12)
 
 
+@settings(max_examples=12)
 @given(st.floats(1e-6, 1e-3), st.integers(1, 2))
 def test_the_noise_of_a_log_is_told_from_its_motion(size, every):
     rng, time = np.random.default_rng(0), DT * np.arange(4000)
