@@ -7,7 +7,6 @@ from collections.abc import Iterable
 
 import psutil
 
-
 PATIENCE = 200.0
 """Seconds that a test waits for what has to happen soon: so many that a busy machine does not matter."""
 
