@@ -107,11 +107,12 @@ def mass_table(robot: Robot, *, light_too: bool) -> str:
     rows = [
         [name, f"{link.mass:.4g} kg" if link.mass else "none", SOURCES[link.source]] for name, link in shown.items()
     ]
-    counts = Counter(link.source for link in masses.values() if link.mass)
-    parts = [f"{_count(count, 'link')} with the mass from {SOURCES[source]}" for source, count in counts.items()]
+    shares = {source: sum(link.mass for link in masses.values() if link.source == source) for source in SOURCES}
+    parts = [f"{share:.4g} kg from {SOURCES[source]}" for source, share in shares.items() if share]
+    lines = f"Total {total:.4g} kg" + f": {'; '.join(parts)}" * (len(parts) > 1) + "."
     if hidden := len(masses) - len(shown):
-        parts.append(f"{_count(hidden, 'link')} with little mass or none not shown (--all)")
-    return table(rows, ("link", "mass", "from"), "lrl") + "\n" + _fill(f"Total {total:.4g} kg: {', '.join(parts)}.")
+        lines += f" Not shown: {_count(hidden, 'link')} with little mass or none (--all)."
+    return table(rows, ("link", "mass", "from"), "lrl") + "\n" + _fill(lines)
 
 
 def contact_lines(robot: Robot, *, pairs_too: bool) -> str:

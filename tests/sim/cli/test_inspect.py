@@ -97,8 +97,8 @@ def test_masses_and_their_sources(batchpid, tmp_path):
         "arm": ["6", "kg", "collision shapes at 1000 kg/m^3"],
         "hand": ["1", "kg", "<inertial>, repaired"],
     }
-    assert "Total 8 kg: 2 links with the mass from <inertial>, 1 link with the mass from collision shapes" in out
-    assert "2 links with little mass or none not shown (--all)" in flat(out)
+    assert "Total 8 kg: 1 kg from <inertial>; 1 kg from <inertial>, repaired; 6 kg from collision shapes" in flat(out)
+    assert "Not shown: 2 links with little mass or none (--all)." in flat(out)
     every = batchpid("inspect", path, "--all")[1]
     assert {"frame", "speck"} <= {line.split(" ")[0] for line in every.splitlines()}
 

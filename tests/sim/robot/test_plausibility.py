@@ -57,7 +57,7 @@ def found(described: Robot) -> dict[str, str]:
         (
             {"size": 1000.0, "by_shapes": True},
             "scale",
-            r"link '.' \(424 m\): no robot.* 1.2 m long; scale the mesh.*0.001",
+            r"link '.' \(424 m\): no robot.* 1.2 m long; give sizes in metres.*0.001",
         ),
         (
             {"size": 1000.0},
