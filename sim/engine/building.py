@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from itertools import combinations
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
 from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
+
+_building = RLock()
+"""Held by the thread that builds: SAPIEN's settings are those of the process, and builders are shared."""
 
 with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fifths of the start of a worker
     # Its packages suppress a Ctrl-C while they are imported: not amid a run.
@@ -64,14 +68,15 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     RobotError
         SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
-    builder = _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
-    if not spec.collisions:
-        for link in builder.link_builders:
-            if link._auto_inertial:  # a link without <inertial> has the inertia of its shapes
-                shaped = link.build_physx_component()
-                link.set_mass_and_inertia(shaped.mass, shaped.cmass_local_pose, shaped.inertia)
-            link.collision_records = []
-    return builder
+    with _building:
+        builder = _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
+        if not spec.collisions:
+            for link in builder.link_builders:
+                if link._auto_inertial:  # a link without <inertial> has the inertia of its shapes
+                    shaped = link.build_physx_component()
+                    link.set_mass_and_inertia(shaped.mass, shaped.cmass_local_pose, shaped.inertia)
+                link.collision_records = []
+        return builder
 
 
 @lru_cache(maxsize=8)
@@ -85,7 +90,8 @@ def merged(spec: SceneSpec) -> Merged:
     def inertia_of_shapes(link: str) -> SpatialInertia:
         return link_inertia(unmerged()[link].build_physx_component())
 
-    return merge_fixed_links(spec.urdf, inertia_of_shapes)
+    with _building:
+        return merge_fixed_links(spec.urdf, inertia_of_shapes)
 
 
 def unmerged_links(urdf: str, fixed_base: bool) -> dict[str, Any]:
@@ -191,8 +197,14 @@ def _in_memory(text: str) -> Iterator[str]:
 def engine_settings(spec: SceneSpec) -> Iterator[None]:
     """Apply ``spec`` to SAPIEN's process-wide settings, and restore the caller's at the end.
 
-    Every setting is overwritten, so that a result does not depend on what the caller's process did before.
+    Every setting is overwritten, so that a result does not depend on what the caller's process did before. One thread
+    at a time is within.
     """
+    with _building:
+        yield from _engine_settings(spec)
+
+
+def _engine_settings(spec: SceneSpec) -> Iterator[None]:
     scene, body = physx.get_scene_config(), physx.get_body_config()
     shape, material = physx.get_shape_config(), physx.get_default_material()
     # Settings that are not given get SAPIEN's defaults.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property, lru_cache, wraps
+from threading import RLock
+from typing import Any, Concatenate, ParamSpec, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,17 +33,30 @@ from sim.robot.mimics import coupling_of
 from sim.robot.parts import Joint
 
 Float64 = NDArray[np.float64]
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _one_at_a_time(method: Callable[Concatenate[Dynamics, P], T]) -> Callable[Concatenate[Dynamics, P], T]:
+    """Let one thread at a time into the methods of an object, which set its pose first and then read from it."""
+
+    @wraps(method)
+    def locked(self: Dynamics, *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return locked
 
 
 class Dynamics:
     """Dynamics and contacts of one robot alone, at poses qpos (n, dof).
 
     The dynamics are Pinocchio's, on the model that SAPIEN derives, with ``payload`` [kg] at the center of mass of
-    ``link`` if one is given. Friction and damping are left out.
+    ``link`` if one is given. Friction and damping are left out. It may be used by several threads.
     """
 
     def __init__(self, spec: SceneSpec, payload: float = 0.0, link: str | None = None) -> None:
-        self._spec = spec
+        self._spec, self._lock = spec, RLock()
         self._system = new_system(replace(spec, timestep=1e-6))
         self._scene, self._robot = build_scene(spec, self._system)
         if link is not None:
@@ -65,6 +79,7 @@ class Dynamics:
         """Bodies of the robot on a fixed base."""
         return bodies_of(self._robot)
 
+    @_one_at_a_time
     def mass_matrix(self, qpos: Any) -> Any:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg].
 
@@ -75,6 +90,7 @@ class Dynamics:
             return mass_matrix(self.bodies, qpos)
         return _rowwise(self._model.compute_generalized_mass_matrix, qpos)
 
+    @_one_at_a_time
     def joint_mass_matrix(self, qpos: NDArray[Any], added: Mapping[str, Float64] | None = None) -> Float64:
         """Return the mass matrices (n, dof, dof) that the joints show, on a floating base where the robot has one.
 
@@ -103,10 +119,12 @@ class Dynamics:
             matrices[row] = (jacobians.transpose(0, 2, 1) @ inertias[row] @ jacobians).sum(0)
         return matrices
 
+    @_one_at_a_time
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         return _rowwise(self._model.compute_inverse_dynamics, qpos, qvel, qacc)
 
+    @_one_at_a_time
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
 
@@ -119,6 +137,7 @@ class Dynamics:
             return np.linalg.solve(reduced, acting[..., None])[..., 0] @ coupling.matrix.T
         return _rowwise(self._model.compute_forward_dynamics, qpos, qvel, effort)
 
+    @_one_at_a_time
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
 
@@ -132,6 +151,7 @@ class Dynamics:
             ]
         )
 
+    @_one_at_a_time
     def link_distances(self, qpos: NDArray[Any]) -> dict[Pair, float]:
         """Return the distances [m] of the pairs of links of the URDF that are near each other, at one pose (dof,).
 
@@ -143,6 +163,7 @@ class Dynamics:
             distances[pair] = min(distance, distances.get(pair, np.inf))
         return distances
 
+    @_one_at_a_time
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
         """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
 
@@ -165,6 +186,7 @@ class Dynamics:
         pairs = touching_pairs(self._robot, self._spec.ground)
         return ContactPredictor(link_extents(self._robot), pairs, self._robot.dof, self._spec.timestep)
 
+    @_one_at_a_time
     def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
 
@@ -176,6 +198,7 @@ class Dynamics:
         boxes = (link.compute_global_aabb_tight() for link in links if link.collision_shapes)
         return min((float(box[0, 2]) for box in boxes), default=np.inf)
 
+    @_one_at_a_time
     def link_poses(self, qpos: NDArray[Any]) -> Float64:
         """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
         self._model.compute_forward_kinematics(np.asarray(qpos, np.float64))
@@ -183,6 +206,7 @@ class Dynamics:
             [self._model.get_link_pose(link).to_transformation_matrix() for link in range(len(self._links))], np.float64
         )
 
+    @_one_at_a_time
     def near_pairs(self, qpos: NDArray[Any]) -> list[NearPair]:
         """Return the pairs of shapes that the engine lists as near each other, at one pose (dof,)."""
         self._robot.set_qpos(qpos.astype(np.float32))
