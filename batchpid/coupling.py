@@ -31,7 +31,7 @@ class Follower(NamedTuple):
 
 
 class Coupling:
-    """Coupling of a robot's joints. Arrays are (joints,) unless said otherwise.
+    """Coupling of a robot's joints. Arrays are (joints,) unless said otherwise, and read-only.
 
     Attributes
     ----------
@@ -64,25 +64,27 @@ class Coupling:
                 multiplier, offset = multiplier * factor, offset + multiplier * shift
             self.leader[joint], self.multiplier[joint], self.offset[joint] = leader, multiplier, offset
             self.independent[joint] = False
+        for each in (self.leader, self.multiplier, self.offset, self.independent):
+            _read_only(each)  # robots with the same joints share a coupling
 
     @cached_property
     def matrix(self) -> Float64:
         """G (joints, independent joints)."""
         matrix = np.zeros((len(self.leader), len(self.leader)))
         matrix[np.arange(len(self.leader)), self.leader] = self.multiplier
-        return matrix[:, self.independent]
+        return _read_only(matrix[:, self.independent])
 
     @cached_property
     def jacobian(self) -> Float64:
         """J (followers, joints) of the constraint J q = o of every follower, q_f - m q_l = o."""
         whole = np.eye(len(self.leader))
         whole[np.arange(len(self.leader)), self.leader] -= self.multiplier
-        return whole[self.followers]
+        return _read_only(whole[self.followers])
 
     @cached_property
     def followers(self) -> NDArray[np.intp]:
         """Indices of the followers (followers,)."""
-        return np.flatnonzero(~self.independent)
+        return _read_only(np.flatnonzero(~self.independent))
 
     def positions(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
@@ -127,3 +129,8 @@ class Coupling:
     def __repr__(self) -> str:
         laws = (f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers)
         return f"Coupling({len(self.leader)} joints: {', '.join(laws)})"
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array

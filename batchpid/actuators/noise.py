@@ -25,11 +25,13 @@ _HALF = np.uint32(16)
 
 @cache
 def quantiles(dtype: Any) -> NDArray[Any]:
-    """Return the values of z in ascending order (65536,)."""
+    """Return the values of z in ascending order (65536,), read-only: all callers share them."""
     inverse = NormalDist().inv_cdf
     upper = np.array([inverse((i + 0.5) / 2**16) for i in range(2**15, 2**16)])
     upper /= np.sqrt((upper**2).mean())
-    return np.concatenate((-upper[::-1], upper)).astype(dtype)
+    table = np.concatenate((-upper[::-1], upper)).astype(dtype)
+    table.setflags(write=False)
+    return table
 
 
 def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:

@@ -24,13 +24,14 @@ class Namespace:
 
     def __init__(self) -> None:
         self.noted: list[tuple[str, tuple[Symbol, ...], Symbol]] = []
-        self.literals: dict[float, Symbol] = {}
+        self.literals: dict[str, tuple[float, Symbol]] = {}
+        """By their digits, which tell -0.0 from 0.0."""
 
     def symbol(self, value: Any) -> Symbol:
         """Return ``value`` as a symbol: itself, or that of a number."""
         if isinstance(value, Symbol):
             return value
-        return self.literals.setdefault(float(value), Symbol(self))
+        return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
     def apply(self, name: str, *values: Any) -> Symbol:
         """Note an operation; return its result."""
@@ -159,7 +160,7 @@ def trace(function: Callable[..., Any], constants: int, inputs: int) -> Trace:
         if result in needed:
             needed.update(operands)
             operations.insert(0, (name, operands, result))
-    literals = {symbol: number for number, symbol in namespace.literals.items() if symbol in needed}
+    literals = {symbol: number for number, symbol in namespace.literals.values() if symbol in needed}
     order = [*given[:constants], *literals, *given[constants:]]
     places = {symbol: place for place, symbol in enumerate(order)}
     last_use = {operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands}

@@ -23,6 +23,7 @@ from sim.engine.physics import Physics
 from sim.engine.user_content import Build, Frames, HeadlessScene
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
+from sim.robot.meshes import note_meshes
 from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
 
@@ -172,6 +173,8 @@ def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
             raise RobotError(f"SAPIEN cannot load the robot: {error}; correct the URDF") from error
     if len(builders) != 1 or actors:
         raise RobotError("the URDF does not describe one articulated robot; it needs at least one moving joint")
+    records = (record for link in builders[0].link_builders for record in link.collision_records)
+    note_meshes(record.filename for record in records if record.filename)
     return builders[0]
 
 

@@ -59,5 +59,8 @@ def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
 
 @lru_cache(maxsize=256)
 def _hull(filename: str) -> NDArray[np.float32]:
-    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled."""
-    return PhysxCollisionShapeConvexMesh(preprocess_mesh_file(filename), (1, 1, 1), get_default_material()).vertices
+    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a file only once."""
+    shape = PhysxCollisionShapeConvexMesh(preprocess_mesh_file(filename), (1, 1, 1), get_default_material())
+    vertices = np.array(shape.vertices)
+    vertices.setflags(write=False)
+    return vertices

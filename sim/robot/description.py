@@ -134,6 +134,7 @@ class RobotDescription(Urdf):
         They are the URDF's; where it gives none, :func:`sim.robot.effort.suggested_effort_limit`, which loads SAPIEN.
         """
         given = self.effort_limit
+        given.setflags(write=False)  # the array is kept
         if np.isfinite(given).all():
             return given
         qpos = self.sample(POSES)
@@ -141,7 +142,9 @@ class RobotDescription(Urdf):
         if self.coupling is not None:
             mass_matrix = self.coupling.mass_matrix(mass_matrix)
         suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
-        return np.where(np.isfinite(given), given, suggested)
+        found = np.where(np.isfinite(given), given, suggested)
+        found.setflags(write=False)
+        return found
 
     @property
     def velocity_limit(self) -> Float64:

@@ -10,7 +10,8 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,24 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     else:
         candidates = [folder / relative for folder in (above[0], *package_dirs, *above[1:]) if relative]
     return next((each.absolute() for each in candidates if os.path.isfile(each)), None)
+
+
+_in_use: dict[str, str] = {}
+"""Digests of the mesh files that SAPIEN has read in this process; it keeps the first content under a path for good."""
+
+
+def note_meshes(paths: Iterable[str]) -> None:
+    """Note that SAPIEN reads these mesh files."""
+    for path in {*paths} - _in_use.keys():
+        with suppress(OSError):  # SAPIEN's error says more
+            _in_use[path] = digest(Path(path).read_bytes())
+
+
+def check_unchanged(path: Path) -> None:
+    """Raise RobotError if a mesh file is not as SAPIEN has read it in this process."""
+    if (known := _in_use.get(str(path))) is not None and digest(path.read_bytes()) != known:
+        problem = f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that it read first"
+        raise RobotError(f"{problem}; start Python again, or save the mesh under another name")
 
 
 def content_of(urdf: str) -> str:

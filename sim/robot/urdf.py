@@ -19,7 +19,7 @@ from sim.robot.findings import Finding, refuse
 from sim.robot.inertia import from_entries, triangle_excess
 from sim.robot.joint_repair import ends_of
 from sim.robot.link_repair import MOMENTS
-from sim.robot.meshes import find_mesh, mesh_problem
+from sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from sim.robot.parts import Joint, Link, Mimic, Urdf
 from sim.robot.repair import repair
 from sim.robot.xml import number, numbers, parse_xml
@@ -84,6 +84,7 @@ def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, 
             missing.append(name if problem is None else f"{name} ({problem})")
             collision.getparent().remove(collision)
         else:
+            check_unchanged(found)
             mesh.set("filename", str(found))
     return missing
 

@@ -81,3 +81,10 @@ def test_a_loop_of_followers_is_refused():
 
 def test_repr_shows_the_laws():
     assert repr(Coupling(2, [Follower(1, 0, -0.5, 0.1)])) == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
+
+
+@given(couplings())
+def test_arrays_of_a_coupling_that_robots_share_are_read_only(case):
+    coupling = case[0]
+    for name in ("leader", "multiplier", "offset", "independent", "matrix", "jacobian", "followers"):
+        assert not getattr(coupling, name).flags.writeable

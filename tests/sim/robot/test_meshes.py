@@ -174,3 +174,33 @@ def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path)
     for use in (loaded.check, lambda: Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0))):
         with pytest.raises(RobotError, match=r"link 'arm'.*collision shape from .*odd\.obj; repair"):
             use()
+
+
+def test_a_mesh_that_changed_since_it_was_simulated_is_refused(tmp_path):
+    """SAPIEN keeps what it read first: the new shape would be simulated as the old one, without a word."""
+    arm = '<collision><geometry><mesh filename="m.stl"/></geometry></collision>'
+    path, mesh = write(tmp_path, one_joint(arm=arm)), tmp_path / "m.stl"
+    mesh.write_bytes(stl())
+    robot = Robot.load(path)
+    robot.mass_matrix(robot.start)
+    longer = np.frombuffer(stl()[84:], np.dtype([("numbers", "<f4", 12), ("end", "u2")])).copy()
+    longer["numbers"] *= 2
+    mesh.write_bytes(stl()[:84] + longer.tobytes())
+    with pytest.raises(RobotError, match=r"m\.stl: has changed since.*under another name"):
+        Robot.load(path)
+    mesh.write_bytes(stl())
+    assert Robot.load(path).about() == robot.about()
+
+
+def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_path):
+    arm = INERTIAL + '<collision><geometry><mesh filename="m.stl"/></geometry></collision>'
+    (tmp_path / "m.stl").write_bytes(stl())
+    path = write(tmp_path, one_joint(arm=arm))
+    first = Robot.load(path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/m.stl").write_bytes(stl())
+    assert Robot.load(write(tmp_path / "other", one_joint(arm=arm))).about() == first.about()  # but for the folder
+    (tmp_path / "m.stl").write_bytes(ascii_stl())
+    assert Robot.load(path).about()["urdf"] != first.about()["urdf"]
+    for name, value in (("merge_fixed", False), ("fixed_base", False), ("self_collision", "none")):
+        assert Robot.load(path, **{name: value}).about()[name] == value != first.about()[name]
