@@ -12,6 +12,7 @@ from batchpid.backends import JAXBackend, NumPyBackend
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import frozen
 from batchpid.params import PIDParams
+from batchpid.read_only import read_only
 from batchpid.state import PIDState, Terms
 from batchpid.validate import choice, env_mask, instance, integer, names, positive, read_array
 
@@ -117,15 +118,15 @@ class BatchPID:
 
     @property
     def state(self) -> PIDState | None:
-        """State of the law; None before the first measurement. With JAX it is valid until the next call."""
-        return self._state
+        """State of the law, read-only; None before the first measurement. With JAX it is valid until the next call."""
+        return None if self._state is None else PIDState(*map(read_only, self._state))
 
     @property
     def terms(self) -> Terms | None:
-        """Terms of the last call; None before the first."""
+        """Terms of the last call, read-only; None before the first."""
         if not self._engine.terms:
             raise InvalidArgumentError("terms", "are not kept", remedy="build the BatchPID with terms=True")
-        return self._terms
+        return None if self._terms is None else Terms(*map(read_only, self._terms))
 
     def __call__(
         self,

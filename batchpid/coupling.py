@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.read_only import read_only
+
 Float64 = NDArray[np.float64]
 
 
@@ -64,27 +66,27 @@ class Coupling:
                 multiplier, offset = multiplier * factor, offset + multiplier * shift
             self.leader[joint], self.multiplier[joint], self.offset[joint] = leader, multiplier, offset
             self.independent[joint] = False
-        for each in (self.leader, self.multiplier, self.offset, self.independent):
-            _read_only(each)  # robots with the same joints share a coupling
+        for name, array in vars(self).items():
+            vars(self)[name] = read_only(array)
 
     @cached_property
     def matrix(self) -> Float64:
         """G (joints, independent joints)."""
         matrix = np.zeros((len(self.leader), len(self.leader)))
         matrix[np.arange(len(self.leader)), self.leader] = self.multiplier
-        return _read_only(matrix[:, self.independent])
+        return read_only(matrix[:, self.independent])
 
     @cached_property
     def jacobian(self) -> Float64:
         """J (followers, joints) of the constraint J q = o of every follower, q_f - m q_l = o."""
         whole = np.eye(len(self.leader))
         whole[np.arange(len(self.leader)), self.leader] -= self.multiplier
-        return _read_only(whole[self.followers])
+        return read_only(whole[self.followers])
 
     @cached_property
     def followers(self) -> NDArray[np.intp]:
         """Indices of the followers (followers,)."""
-        return _read_only(np.flatnonzero(~self.independent))
+        return read_only(np.flatnonzero(~self.independent))
 
     def positions(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
@@ -129,8 +131,3 @@ class Coupling:
     def __repr__(self) -> str:
         laws = (f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers)
         return f"Coupling({len(self.leader)} joints: {', '.join(laws)})"
-
-
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    array.setflags(write=False)
-    return array

@@ -103,5 +103,9 @@ class CallOrderError(BatchPIDError, RuntimeError):
     """Calls in an order without meaning, such as ``recv`` without ``send``."""
 
 
+class NotCopyableError(BatchPIDError, TypeError):
+    """The object owns processes or files, and can be neither copied nor pickled."""
+
+
 class InUseError(BatchPIDError, RuntimeError):
     """The object is in use: by another thread, a signal handler, or the process from which this one was forked."""

@@ -17,6 +17,7 @@ import numpy as np
 from batchpid.choices import CHOICES, Everywhere
 from batchpid.display import params_summary
 from batchpid.errors import InvalidArgumentError
+from batchpid.keywords import known_keywords
 from batchpid.leaves import LeafBuilder
 from batchpid.validate import at_least, is_traced
 
@@ -144,6 +145,7 @@ class PIDParams(NamedTuple):
                 at_least(f"params.{name}", np.asarray(leaf), low, joint_names, infinite=True)
 
 
+@known_keywords
 def make_params(
     joints: int,
     kp: Any,

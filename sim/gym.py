@@ -7,16 +7,21 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.validate import array, choice, env_mask, integer, number
+from batchpid.elementwise import TURN, wrap
+from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError, MissingDependencyError
+from batchpid.keywords import check_keywords
+from batchpid.single_owner import SingleOwner
+from batchpid.validate import array, choice, env_mask, flag, integer, number
 from sim.observation import Observation
 from sim.options import RunnerOptions
+from sim.robot.description import LIMIT_TOLERANCE
 from sim.robot.robot import Robot
 from sim.runner import Runner
 
@@ -35,12 +40,12 @@ ACTIONS = ("setpoint", "increment")
 SPREAD = 0.1
 """Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or m]."""
 MARGIN = 0.05
-"""Share of a joint's range, at each end, in which no goal is drawn."""
+"""Share of a joint's range, at each limit, in which no goal is drawn."""
 MAX_SPEED = 100.0
 """Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
 
 
-class ReachVectorEnv(VectorEnv):
+class ReachVectorEnv(SingleOwner, VectorEnv):
     """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
     Joints are the independent ones (:attr:`sim.Robot.independent`): followers move with their leaders.
@@ -48,9 +53,14 @@ class ReachVectorEnv(VectorEnv):
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
     - *Action* (envs, joints) in [-1, 1]: the setpoint within the joint limits, or an increment of the setpoint.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is within ``tolerance``.
+      A joint without a range counts as 0.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if ``terminate_on_success``.
     - *Truncated*: after ``max_episode_steps``.
     - *Info*: "success", "error" (largest |goal - qpos|), "diverged".
+
+    A continuous joint has the range [-pi, pi]. Its qpos and goal are observed in that range, its error is the short way
+    round, and increments turn it on past pi where the law does so (control "pid" with ``continuous`` in its params).
+    Another joint without limits has the range of half a turn, or pi m, on either side of its start.
 
     Parameters
     ----------
@@ -76,6 +86,8 @@ class ReachVectorEnv(VectorEnv):
         An argument is out of range.
     """
 
+    instead = "make another env with the same arguments"
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -91,11 +103,12 @@ class ReachVectorEnv(VectorEnv):
         render_mode: None = None,
         **options: Any,
     ) -> None:
+        check_keywords("ReachVectorEnv", options, RUNNER_OPTIONS + OWN_OPTIONS)
         self.robot = robot if isinstance(robot, Robot) else Robot.load(robot)
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         self.actions = choice("actions", actions, ACTIONS)
         self.tolerance = number("tolerance", tolerance, 0.0, 1e3, "rad or m")
-        self.terminate_on_success = terminate_on_success
+        self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
         self.max_episode_steps = (
             None if max_episode_steps is None else integer("max_episode_steps", max_episode_steps, 1, 10**9)
         )
@@ -103,9 +116,11 @@ class ReachVectorEnv(VectorEnv):
             raise InvalidArgumentError(
                 "render_mode", "is not supported", value=render_mode, remedy="watch robots with batchpid view"
             )
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        modes = {mode.value: mode for mode in AutoresetMode}
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
-        timestep = options.get("timestep", RunnerOptions.timestep)
+        timestep = number("timestep", options.get("timestep", RunnerOptions.timestep), 1e-6, 0.1, "seconds")
         substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
 
         self._independent = np.flatnonzero(self.robot.independent)
@@ -113,27 +128,39 @@ class ReachVectorEnv(VectorEnv):
             limit[self._independent] for limit in (self.robot.lower, self.robot.upper, self.robot.velocity_limit)
         )
         self.joint_names = tuple(self.robot.joint_names[joint] for joint in self._independent)
-        self.low = np.where(np.isfinite(lower), lower, -np.pi)
-        self.high = np.where(np.isfinite(upper), upper, np.pi)
+        continuous = self.robot.continuous[self._independent]
+        self._turns = np.where(continuous, 1 / TURN, 0.0)
+        self._start = wrap(self.robot.start[self._independent], self._turns, np)
+        middle = np.where(continuous, 0.0, self._start)
+        self.low = np.where(np.isfinite(lower), lower, middle - np.pi)
+        self.high = np.where(np.isfinite(upper), upper, middle + np.pi)
+        span = self.high - self.low
+        self._span = np.where(span > LIMIT_TOLERANCE, span, np.inf)
+        self._margin = np.where(continuous, 0.0, MARGIN * span)
         joints = len(self.joint_names)
         if max_increment is None:
             max_increment = np.minimum(fastest, MAX_SPEED) * substeps * timestep
         self.max_increment = array("max_increment", max_increment, (1, joints), self.joint_names)[0]
         speed = np.full(joints, MAX_SPEED)
+        beyond = np.where(continuous, 0.0, np.pi)
         self.single_observation_space = spaces.Box(
-            np.concatenate([self.low - np.pi, -speed, self.low]).astype(np.float32),
-            np.concatenate([self.high + np.pi, speed, self.high]).astype(np.float32),
+            np.concatenate([self.low - beyond, -speed, self.low]).astype(np.float32),
+            np.concatenate([self.high + beyond, speed, self.high]).astype(np.float32),
         )
         self.single_action_space = spaces.Box(-1.0, 1.0, (joints,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
+        law = self.runner.params.continuous if self.runner.control == "pid" else None
+        turns = np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
+        self._setpoint_turns = np.minimum(self._turns, turns[self._independent])
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._goal, self._setpoint = np.zeros((2, self.num_envs, joints))
         self._observation = np.zeros((self.num_envs, 3 * joints), np.float32)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
+        self._is_stepping = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -142,7 +169,13 @@ class ReachVectorEnv(VectorEnv):
 
         An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
         an env draws depends on its own seed alone, which is the stream of a ``randomization``, too.
+
+        Raises
+        ------
+        CallOrderError
+            A step was begun and has not been waited for.
         """
+        self._expect_no_step("reset")
         mask = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
@@ -175,6 +208,7 @@ class ReachVectorEnv(VectorEnv):
         CallOrderError
             The last step that was begun has not been waited for.
         """
+        self._expect_no_step("step_async")
         action = np.clip(array("actions", actions, self._goal.shape, self.joint_names), -1.0, 1.0)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -182,10 +216,11 @@ class ReachVectorEnv(VectorEnv):
         if self.actions == "setpoint":
             setpoint = self.low + (action + 1) / 2 * (self.high - self.low)
         else:
-            setpoint = np.clip(self._setpoint + action * self.max_increment, self.low, self.high)
+            setpoint = self._setpoint + action * self.max_increment
+            setpoint = np.clip(wrap(setpoint, self._setpoint_turns, np), self.low, self.high)
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
         self.runner.send(self._of_robot(setpoint))
-        self._setpoint = setpoint
+        self._setpoint, self._is_stepping = setpoint, True
 
     def step_wait(self) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
         """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
@@ -195,11 +230,19 @@ class ReachVectorEnv(VectorEnv):
         CallOrderError
             No step was begun.
         """
-        self._observe(self.runner.recv())
+        if not self._is_stepping:
+            raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
+        try:
+            observation = self.runner.recv()
+        except BatchPIDError:  # there is no such step any more; an interrupted call can be repeated
+            self._is_stepping = False
+            raise
+        self._is_stepping = False
+        self._observe(observation)
         begins = self._done.copy()
         self._steps += 1
 
-        reward = 1.0 * self._success - (self._error / (self.high - self.low)).mean(1)
+        reward = 1.0 * self._success - (self._error / self._span).mean(1)
         terminated = self._diverged | (self._success & self.terminate_on_success)
         truncated = self._steps >= (np.inf if self.max_episode_steps is None else self.max_episode_steps)
         if begins.any():  # in next-step mode this step begins the next episode
@@ -226,12 +269,11 @@ class ReachVectorEnv(VectorEnv):
     def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
         """Draw start and goal of the masked envs, and place their robots; ``streams`` are new ones of some envs."""
         start = self._setpoint.copy()
-        margin = MARGIN * (self.high - self.low)
         for env in np.flatnonzero(mask).tolist():
             generator = self._generators[env]
-            drawn = self.robot.start[self._independent] + generator.uniform(-SPREAD, SPREAD, len(self.joint_names))
-            start[env] = np.clip(drawn, self.low, self.high)
-            self._goal[env] = generator.uniform(self.low + margin, self.high - margin)
+            drawn = self._start + generator.uniform(-SPREAD, SPREAD, len(self.joint_names))
+            start[env] = np.clip(wrap(drawn, self._turns, np), self.low, self.high)
+            self._goal[env] = generator.uniform(self.low + self._margin, self.high - self._margin)
         self._setpoint = start
         self._steps[mask] = 0
         self._done = self._done & ~mask
@@ -253,12 +295,17 @@ class ReachVectorEnv(VectorEnv):
     def _observe(self, observed: Observation) -> None:
         """Update the observation; an env that diverged keeps its last finite one."""
         space: Any = self.single_observation_space
-        state = (observed.qpos[:, self._independent], observed.qvel[:, self._independent])
-        joined = np.concatenate([*state, self._goal.astype(np.float32)], axis=1)
+        qpos = wrap(observed.qpos[:, self._independent].astype(np.float64), self._turns, np)
+        joined = np.concatenate([qpos, observed.qvel[:, self._independent], self._goal], axis=1).astype(np.float32)
         self._diverged = ~observed.ok
         self._observation = np.where(observed.ok[:, None], np.clip(joined, space.low, space.high), self._observation)
-        self._error = np.abs(self._goal - self._observation[:, : len(self.joint_names)])
+        self._error = np.abs(wrap(self._goal - self._observation[:, : len(self.joint_names)], self._turns, np))
         self._success = observed.ok & (self._error <= self.tolerance).all(1)
+
+    def _expect_no_step(self, call: str) -> None:
+        """Raise CallOrderError if a step is under way."""
+        if self._is_stepping:
+            raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
     def _info(self, mask: Bool) -> dict[str, Any]:
         """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
@@ -267,10 +314,20 @@ class ReachVectorEnv(VectorEnv):
         return info | {f"_{key}": mask.copy() for key in values}
 
 
-class ReachEnv(gymnasium.Env):
+OWN_OPTIONS = tuple(inspect.signature(ReachVectorEnv).parameters)[:-1]
+"""Arguments of :class:`ReachVectorEnv`, apart from those of the runner."""
+RUNNER_OPTIONS = tuple({*inspect.signature(Runner).parameters} - {"robot", "num_envs", "substeps"})
+"""Options of the runner, whose substeps are those of ``rate_hz``."""
+
+
+class ReachEnv(SingleOwner, gymnasium.Env):
     """One robot of :class:`ReachVectorEnv` as a :class:`gymnasium.Env`, by default in this process."""
 
+    instead = ReachVectorEnv.instead
+
     def __init__(self, robot: str | Robot = "panda", *, render_mode: None = None, **options: Any) -> None:
+        fixed = ("num_envs", "max_episode_steps", "autoreset_mode")
+        check_keywords("ReachEnv", options, [name for name in OWN_OPTIONS + RUNNER_OPTIONS if name not in fixed])
         options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
         self._envs = ReachVectorEnv(1, robot, max_episode_steps=None, render_mode=render_mode, **options)
         self.runner = self._envs.runner

@@ -16,6 +16,7 @@ from batchpid.computed_torque import check_gain_units
 from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import frozen
+from batchpid.read_only import read_only
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
 from sim.cluster import Ray
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
@@ -40,7 +41,8 @@ class Controller(Protocol):
     def init(self, robot: Robot, num_envs: int) -> Any:
         """Return the state of so many envs at their start: None, an array, or tuples and dicts of these.
 
-        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots.
+        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots. Later states have
+        the same structure, shapes and dtypes.
         """
 
     def __call__(
@@ -53,7 +55,8 @@ class Controller(Protocol):
     ) -> tuple[Any, Any]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
 
-        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward.
+        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward. The
+        arrays are read-only copies, which the controller may keep.
         """
 
 
@@ -193,7 +196,8 @@ class RunnerOptions:
                 "build", "must be a function", value=self.build, remedy="define build(scene, env)"
             )
         if self.speed_limit is not None:
-            checked["speed_limit"] = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
+            limit = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
+            checked["speed_limit"] = read_only(limit.copy())
         if self.checkpoint_steps is not None:
             checked["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
         if self.randomization is not None:

@@ -6,7 +6,6 @@ Longer than 300 lines because the public signatures and their documentation are 
 from __future__ import annotations
 
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError, CallOrderError, ClosedError, InvalidArgumentError
+from batchpid.single_owner import SingleOwner
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.cluster import Ray
@@ -99,7 +99,7 @@ class _Books(NamedTuple):
     """Observation of the tick that was sent, until :meth:`Runner.recv` returns it."""
 
 
-class Runner:
+class Runner(SingleOwner):
     """N robots in N headless SAPIEN scenes under explicit PID, drive or effort control.
 
     Parameters
@@ -118,6 +118,8 @@ class Runner:
     InvalidArgumentError
         An argument is out of range; raised before any process starts.
     """
+
+    instead = "make another Runner with the same options, and restore a runner.snapshot() in it"
 
     def __init__(
         self,
@@ -249,7 +251,7 @@ class Runner:
         position = self._state("qpos", self.robot.start if qpos is None else qpos)
         velocity = self._state("qvel", 0.0 if qvel is None else qvel)
         chosen = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
-        self._limits.check("qpos", self.robot.coupled(position[chosen]))
+        self._limits.check("qpos", self.robot.coupled(position), chosen)
         draws, randomization = books.draws, self.options.randomization
         if randomization is not None:
             draws = randomization.redraw(self.robot, draws, chosen, seed)
@@ -384,14 +386,17 @@ class Runner:
         seen = empty_observation(ticks, self.num_envs, dof)
         times = (steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
-        for tick in range(ticks) if progress is None else progress(range(ticks)):
+        shown = iter(range(ticks) if progress is None else progress(range(ticks)))
+        for tick in range(ticks):  # whatever ``progress`` makes of it
+            next(shown, None)
             if tick == done:
                 done = min(ticks, tick + self._max_ticks())
                 part = slice(tick, done)
                 self._run(command.map(lambda rows, part=part: rows[part]), self.substeps)
                 for table, rows in zip(seen, pool.arrays.observation, strict=True):
                     table[part] = rows[: done - tick]
-        info = replace(info, faults=tuple(self.faults))
+        next(shown, None)  # the end
+        info = replace(info, faults=self.faults)
         return Rollout(times, command.setpoint, seen, self.timestep * self.substeps, info)
 
     def observe(self) -> Observation:
@@ -521,9 +526,9 @@ class Runner:
             params=self.params,
             actuators=self.actuators,
             start=self.observe().qpos,
-            versions=self._versions,
+            versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
-            faults=tuple(self.faults),
+            faults=self.faults,
             randomization=None if self.options.randomization is None else self.options.randomization.to_dict(),
             draws=None if self.options.randomization is None else self.draws,
             episodes=None if self.options.randomization is None else self.episodes,
@@ -534,7 +539,7 @@ class Runner:
         return package_versions()
 
     @property
-    def faults(self) -> deque[Fault]:
+    def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
         return self._books.faults.faults
 
@@ -649,7 +654,7 @@ class Runner:
         )
         command = self._coupled(command)
         if self._checks_setpoints:
-            self._limits.check("setpoint", command.setpoint)
+            self._limits.check("setpoint", command.setpoint, stacklevel=4)
         return command.map(lambda rows: rows[None]), count
 
     def _run(self, command: Command, substeps: int) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from batchpid.actuators.fields import JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
 from batchpid.display import span, summary
 from batchpid.errors import InvalidArgumentError
+from batchpid.keywords import known_keywords
 from batchpid.leaves import LeafBuilder
 from batchpid.validate import at_least, entries, integer, is_traced, number, read_array
 
@@ -123,6 +124,7 @@ class Actuators(NamedTuple):
         return summary("Actuators", [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())])
 
 
+@known_keywords
 def make_actuators(
     joints: int,
     *,

@@ -25,6 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.read_only import read_only
+
 Float64 = NDArray[np.float64]
 
 MAX_ACCELERATION = 3000.0
@@ -81,9 +83,10 @@ class ContactPredictor:
     def __init__(
         self, links: Sequence[LinkExtent], pairs: Iterable[tuple[int, int]], dof: int, timestep: float
     ) -> None:
-        self.reach = reach = np.zeros((len(links) + 1, dof))
+        reach = np.zeros((len(links) + 1, dof))
         for row, link in zip(reach, links, strict=False):
             _add_reach(row, link, links)
+        self.reach = read_only(reach)
         between = (reach[:, None] > 0) != (reach[None] > 0)
         # A joint above both links moves them alike.
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
@@ -91,7 +94,7 @@ class ContactPredictor:
         self._timestep = timestep
         pairs = [pair for pair in pairs if self._arm[pair].any()]
         self._first, self._second = np.array(pairs, int).reshape(-1, 2).T
-        self.arms = self._arm[self._first, self._second]
+        self.arms = read_only(self._arm[self._first, self._second])
         self._index = np.full(self._arm.shape[:2], -1)
         self._index[self._first, self._second] = self._index[self._second, self._first] = np.arange(len(pairs))
         self._balls = np.concatenate([link.balls for link in links])

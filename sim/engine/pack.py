@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from batchpid.actuators import Actuators
 from batchpid.friction import Friction
+from batchpid.single_owner import SingleOwner
 from sim.engine.building import SceneSpec, build_scene, engine_settings, link_frames, new_system, set_collision_group
 from sim.engine.calls import EngineCalls
 from sim.engine.contact_watch import ContactWatch
@@ -35,7 +36,7 @@ _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 Float32 = NDArray[np.float32]
 
 
-class Pack:
+class Pack(SingleOwner):
     """M scenes of ``spec``, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
 
     Attributes

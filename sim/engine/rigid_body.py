@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.read_only import read_only
 from sim.engine.native import xla
 from sim.engine.native.interface import BODY
 from sim.robot.rotations import from_rpy, rotate
@@ -69,7 +70,8 @@ def bodies_of(robot: Any) -> RigidBodies:
             at, principal = place @ _matrix(link.cmass_local_pose), np.diag([float(str(one)) for one in link.inertia])
             parts[body].append(SpatialInertia(link.mass, at[:3, 3], at[:3, :3] @ principal @ at[:3, :3].T))
     bodies = [total(of_body) for of_body in parts]
-    return RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, zip(*bodies, strict=True)))
+    of_bodies = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, zip(*bodies, strict=True)))
+    return RigidBodies._make(map(read_only, of_bodies))
 
 
 def mass_matrix(bodies: RigidBodies, qpos: Any) -> Any:

@@ -51,11 +51,14 @@ class Control:
         no limit.
     drive
         Damping and stiffness of the engine's drives [N m s/rad, N m/rad].
+    returned
+        Last effort of a controller of the caller's own (M, dof); None for the other controls.
     """
 
     reads_qpos_each_step = True
     limits: tuple[Any, Any] = None, None
     drive: tuple[Any, Any] = 0.0, 0.0
+    returned: NDArray[Any] | None = None
 
     def __init__(self, scene: SceneSpec, params: bp.PIDParams, plant: Plant, known: KnownJoints | None = None) -> None:
         self._scene, self._plant, self.params, self._known = scene, plant, params, known
@@ -89,7 +92,7 @@ class Control:
         """
         raise NotImplementedError
 
-    def _saturate(self, effort: Float64) -> Float64:
+    def saturate(self, effort: Float64) -> Float64:
         """Return ``effort`` within the limits of motors and params."""
         return clip(clip(effort, *self.limits, np), self.params.effort_min, self.params.effort_max, np)
 
@@ -240,7 +243,7 @@ class EffortControl(Control):
         if self._coupling is not None:
             setpoint = self._coupling.efforts(setpoint)
         total = setpoint if feedforward is None else setpoint + feedforward
-        effort = self._saturate(total)
+        effort = self.saturate(total)
         if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort

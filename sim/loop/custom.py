@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.jax_settings import own_settings
+from batchpid.read_only import read_only
 from sim.engine.building import SceneSpec
 from sim.loop.control import Control, Plant
 from sim.options import Controller, RunnerOptions
@@ -26,10 +27,14 @@ class CustomControl(Control):
     def __init__(self, options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
         self.options, self._controller = options, own_controller(options)
         super().__init__(scene, params, plant)
-        self._of_controller = _begin(options, len(self.saturated))
-        self._check(flatten(self._of_controller))
+        self._of_controller = self._init()
+        self._like = flatten(self._of_controller)
+        self.returned = np.zeros(self.saturated.shape)
 
-    def _check(self, leaves: Mapping[str, NDArray[Any]]) -> None:
+    def _init(self) -> Any:
+        """Return a copy of the controller's state at the start, checked."""
+        state = _begin(self.options, len(self.saturated))
+        leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
         for name, leaf in leaves.items():
             if leaf.shape[:1] != self.saturated.shape[:1]:
                 raise InvalidArgumentError(
@@ -37,12 +42,13 @@ class CustomControl(Control):
                     f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {len(self.saturated)} envs",
                     remedy="let every array of the state have the envs as its first axis",
                 )
+        return unflatten(state, leaves)
 
     def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
         """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
         self.saturated[mask] = False
         with controller_errors(self._controller):
-            fresh = flatten(_begin(self.options, len(mask)))
+            fresh = _like(self._like, flatten(self._init()))
         leaves = {name: np.array(leaf) for name, leaf in flatten(self._of_controller).items()}
         for name, leaf in leaves.items():
             leaf[mask] = fresh[name][mask]
@@ -50,7 +56,9 @@ class CustomControl(Control):
 
     def _call(self, *inputs: Float64) -> Any:
         """Return the controller's effort, and keep its state."""
-        self._of_controller, wanted = self._controller(self._of_controller, *inputs)
+        own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, and not write to them
+        state, wanted = self._controller(self._of_controller, *own)
+        self._of_controller = unflatten(self._of_controller, _like(self._like, flatten(state, read=np.array)))
         return wanted
 
     def call(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
@@ -66,7 +74,7 @@ class CustomControl(Control):
         qpos = inputs[1]
         try:
             state, wanted = self._controller(unflatten(self._of_controller, leaves), *inputs)
-            new = flatten(state, read=jax.numpy.asarray)
+            new = _like(leaves, flatten(state, read=jax.numpy.asarray))
             effort = jax.numpy.asarray(wanted, qpos.dtype)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
             raise InvalidArgumentError(
@@ -75,11 +83,7 @@ class CustomControl(Control):
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
         _check_effort(effort, qpos)
-        if {name: leaf.shape for name, leaf in new.items()} != {name: leaf.shape for name, leaf in leaves.items()}:
-            raise InvalidArgumentError(
-                "control", "returned a state of another structure or shape", remedy="return one as init does"
-            )
-        return {name: leaf.astype(leaves[name].dtype) for name, leaf in new.items()}, effort
+        return new, effort
 
     def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
         """Call the controller, and saturate.
@@ -93,11 +97,12 @@ class CustomControl(Control):
         passive = np.zeros_like(qpos) if feedforward is None else feedforward
         setpoint = self._command.setpoint
         with controller_errors(self._controller, step + 1):
-            total = np.asarray(self._call(setpoint, qpos, qvel, passive), np.float64)
+            total = np.array(self._call(setpoint, qpos, qvel, passive), np.float64)
             _check_effort(total, qpos)
+        self.returned = total
         if self._coupling is not None:
             total = self._coupling.efforts(total)
-        effort = self._saturate(total)
+        effort = self.saturate(total)
         if step + 1 == self._substeps:
             self.saturated = effort != total
         return effort
@@ -150,6 +155,33 @@ def _check_effort(effort: Any, qpos: Any) -> None:
         got, wanted = (f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape for a in (effort, qpos))
         problem = f"returned an effort of shape {got}, not {wanted}"
         raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
+
+
+def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arrays of a controller's state in the dtypes of ``before``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They have other names or shapes, or a dtype that does not fit.
+    """
+    new = {}
+    for name in dict.fromkeys([*before, *leaves]):
+        old, leaf = before.get(name), leaves.get(name)
+        if old is None or leaf is None:
+            problem = f"returned a state {'without' if leaf is None else 'with an unknown'} {name!r}"
+        elif leaf.shape != old.shape:
+            problem = f"returned a state {name!r} of shape {leaf.shape}, not {old.shape}"
+        elif leaf.dtype == old.dtype:
+            new[name] = leaf
+            continue
+        elif np.can_cast(leaf.dtype, old.dtype, "same_kind"):
+            new[name] = leaf.astype(old.dtype)
+            continue
+        else:
+            problem = f"returned a state {name!r} of {leaf.dtype}, which does not fit into {old.dtype}"
+        raise InvalidArgumentError("control", problem, remedy="return a state as init does")
+    return new
 
 
 def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray) -> dict[str, Any]:

@@ -260,6 +260,8 @@ class EnvGroup:
             self.pack.look(compiled.left())
             qpos = self.pack.read_qpos()
             if not self._sound(qpos):
+                if self._control.returned is not None:
+                    self._control.returned = self._motor
                 if self._control.reads_qpos_each_step or self._compensates:  # as in NumPy's loop
                     self._qpos = compiled.read("qpos_before")
                 self._contain(qpos, done)
@@ -306,10 +308,15 @@ class EnvGroup:
         qvel = self.pack.read_qvel()
         bad = ~(np.isfinite(qpos) & np.isfinite(qvel))
         # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
-        source = ~np.isfinite(self.pack.qf) & bad.any(1, keepdims=True)
+        failed = bad.any(1, keepdims=True)
+        source = ~np.isfinite(self.pack.qf) & failed
+        if self._control.returned is not None:
+            wrong = ~np.isfinite(self._control.saturate(self._control.returned)) & failed
+            wrong = np.where(wrong.any(1, keepdims=True), wrong, source)  # actuators may have delayed it
+            containment.fail(wrong, "effort", step, self._qpos)
         containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
         if self._speed_limit is not None:
-            fast = (np.abs(qvel) > self._speed_limit) & ~bad.any(1, keepdims=True)
+            fast = (np.abs(qvel) > self._speed_limit) & ~failed
             containment.fail(fast, "speed", step, self._qpos)
         self._qpos = np.where(bad, self._qpos, qpos)
         self._place_failed()

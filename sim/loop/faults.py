@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,8 +17,14 @@ from numpy.typing import NDArray
 from sim.loop.arrays import Arrays
 from sim.options import FaultAction
 
-CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel")
-"""Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite."""
+CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
+"""Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite.
+
+"effort" is what a controller of the caller's own returned. Snapshots hold the index, so that new causes come last.
+"""
+
+LONGEST = 10_000
+"""Faults that a log keeps."""
 
 Bool = NDArray[np.bool_]
 
@@ -40,7 +45,11 @@ class Fault(NamedTuple):
     """``on_fault`` of the runner: "hold" or "reset"."""
 
     def __str__(self) -> str:
-        known = {"state": "its state is no longer finite", "speed": "it is faster than speed_limit"}
+        known = {
+            "state": "its state is no longer finite",
+            "speed": "it is faster than speed_limit",
+            "effort": "the effort that its controller returned is not finite",
+        }
         cause = known.get(self.cause, f"the {self.cause} given for it is not finite")
         action = "held until it is reset" if self.action == "hold" else "reset"
         return f"env {self.env}, joint {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
@@ -51,10 +60,10 @@ class FaultWarning(UserWarning):
 
 
 class FaultLog:
-    """Faults of a runner's envs, the last 10 000. It is not changed: methods return a log that is."""
+    """Faults of a runner's envs, the last :data:`LONGEST`. It is not changed: methods return a log that is."""
 
     def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
-        self.faults: deque[Fault] = deque(maxlen=10_000)
+        self.faults: tuple[Fault, ...] = ()
         """Latest last."""
         self._joint_names, self._timestep, self._action = joint_names, timestep, action
         self._steps = np.full(num_envs, -1)
@@ -76,13 +85,13 @@ class FaultLog:
             return self
         fault = arrays.fault
         log = self.restored(fault.step)
-        new = np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist()
-        if new:
-            log.faults = self.faults.copy()
-        for env in new:
+        new = list[Fault]()
+        for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():
             step = int(log._steps[env])
             joint, cause = self._joint_names[fault.joint[env]], CAUSES[fault.cause[env]]
-            log.faults.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
+            new.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
+        if new:
+            log.faults = (*self.faults, *new)[-LONGEST:]
         return log
 
 

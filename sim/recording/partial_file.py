@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from batchpid.single_owner import SingleOwner
 from sim.observation import RunInfo
 from sim.recording import files
 from sim.recording.files import RecordingError
@@ -23,7 +24,7 @@ METADATA_BYTES = 1 << 18
 """Disk space that is kept for what HDF5 notes about the next rows."""
 
 
-class PartialFile:
+class PartialFile(SingleOwner):
     """File ``partial``, which gets the name ``path`` when it is complete.
 
     Parameters

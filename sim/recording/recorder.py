@@ -15,7 +15,6 @@ import contextlib
 import math
 import os
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
+from batchpid.single_owner import SingleOwner
 from batchpid.validate import flag, instance, integer
 from sim.loop.faults import Fault
 from sim.observation import RECORDED, Observation, Redraw
@@ -54,7 +54,7 @@ class _Row(NamedTuple):
     observation: Observation
 
 
-class Recorder:
+class Recorder(SingleOwner):
     """Recorder of every tick of ``runner`` until it is closed.
 
     Parameters
@@ -80,6 +80,8 @@ class Recorder:
         The file cannot be made.
     """
 
+    instead = "close it, and record the next run with another Recorder"
+
     def __init__(
         self, path: str | os.PathLike[str], runner: Runner, *, seed: int | None = None, overwrite: bool = False
     ) -> None:
@@ -101,7 +103,7 @@ class Recorder:
         self._rows: SimpleQueue[_Row | None] = SimpleQueue()  # None: the end
         self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
         self._oldest = math.inf  # when the oldest row was recorded that is being written
-        self._faults: deque[Fault] = runner.faults  # up to the last row
+        self._faults: tuple[Fault, ...] = runner.faults  # up to the last row
         self._episodes, self._redraws = runner.episodes, list[Redraw]()
         self._end: Callable[[PartialFile], None] | None = None
         self._error: RecordingError | None = None

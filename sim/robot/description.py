@@ -16,6 +16,7 @@ import batchpid as bp
 from batchpid.coupling import Coupling
 from batchpid.digest import digest
 from batchpid.errors import InvalidArgumentError
+from batchpid.read_only import read_only
 from sim.observation import RunInfo
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.effort import POSES, suggested_effort_limit
@@ -134,17 +135,14 @@ class RobotDescription(Urdf):
         They are the URDF's; where it gives none, :func:`sim.robot.effort.suggested_effort_limit`, which loads SAPIEN.
         """
         given = self.effort_limit
-        given.setflags(write=False)  # the array is kept
         if np.isfinite(given).all():
-            return given
+            return read_only(given)
         qpos = self.sample(POSES)
         mass_matrix = self.dynamics().mass_matrix(qpos)
         if self.coupling is not None:
             mass_matrix = self.coupling.mass_matrix(mass_matrix)
         suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
-        found = np.where(np.isfinite(given), given, suggested)
-        found.setflags(write=False)
-        return found
+        return read_only(np.where(np.isfinite(given), given, suggested))
 
     @property
     def velocity_limit(self) -> Float64:

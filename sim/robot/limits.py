@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
+LISTED = 4
+"""Envs that a warning lists for each joint."""
+
 
 class SetpointWarning(UserWarning):
     """A setpoint or start pose lies outside a joint's limits."""
@@ -23,23 +26,40 @@ class SetpointCheck:
         self._low, self._high = robot.lower - LIMIT_TOLERANCE, robot.upper + LIMIT_TOLERANCE
         self._warned: set[tuple[str, int]] = set()
 
-    def check(self, argument: str, positions: NDArray[Any], stacklevel: int = 3) -> None:
-        """Warn of finite ``positions`` (..., dof) [rad or m] outside the limits, ``stacklevel`` frames up."""
+    def check(
+        self, argument: str, positions: NDArray[Any], envs: NDArray[np.bool_] | None = None, stacklevel: int = 3
+    ) -> None:
+        """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits, ``stacklevel`` frames up.
+
+        One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) are to be checked.
+        """
         below, above = positions < self._low, positions > self._high
         if not (np.count_nonzero(below) or np.count_nonzero(above)):
             return
-        outside = below | above
-        positions = np.where(np.isfinite(positions), positions, np.nan)
-        outside &= np.isfinite(positions)
-        for index in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist():
-            if (argument, index) in self._warned:
-                continue
-            self._warned.add((argument, index))
-            joint, column = self._robot.joints[index], positions[..., index]
-            worst = column.flat[np.nanargmax(np.maximum(joint.lower - column, column - joint.upper))]
-            warnings.warn(
-                f"{argument} of joint {joint.name!r} is {worst:g} {joint.unit}, outside its limits "
-                f"[{joint.lower:g}, {joint.upper:g}]: the joint cannot reach it; move it inside",
-                SetpointWarning,
-                stacklevel=stacklevel,
-            )
+        outside = (below | above) & np.isfinite(positions)
+        if envs is not None:
+            outside &= envs[:, None]
+        new = [
+            joint
+            for joint in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist()
+            if (argument, joint) not in self._warned
+        ]
+        if not new:
+            return
+        self._warned.update((argument, joint) for joint in new)
+        found = "; ".join(self._describe(joint, positions[..., joint], outside[..., joint]) for joint in new)
+        warnings.warn(
+            f"{argument} is outside the joint limits, where no joint can follow: {found}; move it inside",
+            SetpointWarning,
+            stacklevel=stacklevel,
+        )
+
+    def _describe(self, index: int, positions: NDArray[Any], outside: NDArray[np.bool_]) -> str:
+        """Return joint, limits, worst position and envs of ``positions`` (..., envs), of which some are outside."""
+        joint = self._robot.joints[index]
+        beyond = np.where(outside, np.maximum(joint.lower - positions, positions - joint.upper), 0.0)
+        worst = positions.flat[np.argmax(beyond)]
+        envs = np.flatnonzero(outside.reshape(-1, outside.shape[-1]).any(0)).tolist()
+        listed = ", ".join(map(str, envs[:LISTED])) + (f" and {len(envs) - LISTED} more" if len(envs) > LISTED else "")
+        of_envs = "" if outside.shape[-1] == 1 else f" (env{'s' * (len(envs) > 1)} {listed})"
+        return f"joint {joint.name!r} at {worst:g} {joint.unit}, not in [{joint.lower:g}, {joint.upper:g}]{of_envs}"

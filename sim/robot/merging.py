@@ -16,12 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from lxml import etree
 
+from batchpid.read_only import read_only
 from sim.robot.parts import MOVING_TYPES, Placement
 from sim.robot.rotations import from_rpy, multiply, rotate, to_rpy
 from sim.robot.spatial_inertia import SpatialInertia, total
 from sim.robot.xml import number, numbers
 
-_IDENTITY = Placement("", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+_IDENTITY = Placement("", read_only(np.zeros(3)), read_only(np.array([1.0, 0.0, 0.0, 0.0])))
 
 
 class Merged(NamedTuple):
@@ -202,7 +203,7 @@ def _composed(placement: Placement, element: etree._Element) -> Placement:
     origin = element.find("origin")
     xyz, rpy = (np.array(numbers(origin, key, "0 0 0", element.tag)) for key in ("xyz", "rpy"))
     position = placement.position + rotate(placement.wxyz, xyz)
-    return Placement(placement.link, position, multiply(placement.wxyz, from_rpy(rpy)))
+    return Placement(placement.link, read_only(position), read_only(multiply(placement.wxyz, from_rpy(rpy))))
 
 
 def _set_origin(element: etree._Element, placement: Placement) -> None:

@@ -16,6 +16,7 @@ import assets
 import batchpid as bp
 from batchpid.choices import CHOICES
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
+from batchpid.read_only import read_only
 from batchpid.validate import choice, file_path, flag
 from sim.robot.actuators import load_robot_actuators
 from sim.robot.description import RobotDescription
@@ -220,7 +221,8 @@ def _find(name_or_path: str | Path) -> Path:
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
     data = yaml.safe_load(path.read_text())
     rows = [data["joints"][joint.name] for joint in joints]
-    columns = {key: np.array([row[key] for row in rows], float) for key in ("start", "target", "kp", "ki", "kd")}
+    keys = ("start", "target", "kp", "ki", "kd")
+    columns = {key: read_only(np.array([row[key] for row in rows], float)) for key in keys}
     return Settings(
         **columns,
         drive_stiffness=float(data["drive"]["stiffness"]),

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from batchpid.errors import MissingDependencyError
+from batchpid.single_owner import SingleOwner
 from sim.observation import Rollout
 from sim.robot.findings import summary
 from sim.view.charts import Charts
@@ -27,7 +28,7 @@ NOTICE_SECONDS = 1.0
 """Shortest time between two notices of what was refused [s]."""
 
 
-class View(AbstractContextManager["View"]):
+class View(SingleOwner, AbstractContextManager["View"]):
     """Page that shows ``data``, served at ``host`` and ``port``, or at the next free port, until :meth:`close`.
 
     Only who knows :attr:`url` can open it. What a page sends is checked; what is refused is shown on the pages.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.single_owner import SingleOwner
 from batchpid.validate import choice, integer, number
 from sim.observation import Observation, Rollout
 from sim.options import ControlMode, RunnerOptions
@@ -33,7 +34,7 @@ GRAVITY = 9.81
 """Acceleration of a payload [m/s^2]."""
 
 
-class LiveSimulation:
+class LiveSimulation(SingleOwner):
     """``num_envs`` robots for each of ``controls``, all under the same setpoints.
 
     Parameters

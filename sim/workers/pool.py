@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 import batchpid as bp
 from batchpid.errors import ClosedError
+from batchpid.single_owner import SingleOwner
 from sim.loop.arrays import Arrays, Ticks
 from sim.loop.failure import Failure, order
 from sim.options import RunnerOptions
@@ -65,7 +66,7 @@ class _Slot:
     """Of the worker's file descriptor."""
 
 
-class WorkerPool:
+class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
     ``params`` are those that the loops start with. The workers start with :meth:`open`. With ``options.cluster`` they

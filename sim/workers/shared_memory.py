@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.single_owner import SingleOwner
 from sim.loop.arrays import Layout
 
 _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
-class SharedArrays:
+class SharedArrays(SingleOwner):
     """Named arrays of given ``layout`` in one block of shared memory: a new one, or with ``fd`` an existing one."""
 
     def __init__(self, layout: Layout, fd: int | None = None) -> None:

@@ -24,6 +24,7 @@ from typing import Any, Self
 import cloudpickle
 
 from batchpid.errors import InvalidArgumentError, WorkerError
+from batchpid.single_owner import SingleOwner
 from sim.engine import native
 from sim.loop.arrays import Arrays
 from sim.loop.failure import Failure, failure_of
@@ -48,7 +49,7 @@ class WorkerLost(WorkerError):
     """A worker died or is stuck; the message names it, its envs and the cause."""
 
 
-class Worker(ABC):
+class Worker(SingleOwner, ABC):
     """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result.
 
     The first result, None, comes without a request, when the loop is built.
@@ -90,7 +91,7 @@ class Worker(ABC):
         """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""
         return None
 
-    def check_alive(self, idle_limit: float, limit: float) -> None:  # noqa: B027  (this process is alive)
+    def check_alive(self, idle_limit: float, limit: float) -> None:
         """Check a worker that has not answered yet.
 
         Raises
@@ -100,7 +101,7 @@ class Worker(ABC):
             counting the time for which it waited for a core.
         """
 
-    def pin(self, core: int) -> None:  # noqa: B027  (this process stays where it is)
+    def pin(self, core: int) -> None:
         """Run on one core only."""
 
 

@@ -4,6 +4,8 @@ import gc
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 gymnasium = pytest.importorskip("gymnasium")
 
@@ -95,10 +97,10 @@ def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
     for number in range(5):
         action = np.full((2, 9), 0.1 * number, np.float32)
         ours.step_async(action)
-        with pytest.raises(CallOrderError, match="recv"):
+        with pytest.raises(CallOrderError, match="step_wait"):
             ours.step_async(action)
         assert same(ours.step_wait(), theirs.step(action))
-    with pytest.raises(CallOrderError, match="send"):
+    with pytest.raises(CallOrderError, match="step_async"):
         ours.step_wait()
     ours.close()
     theirs.close()
@@ -204,3 +206,90 @@ def test_actions_and_observations_are_those_of_independent_joints(tmp_path):
     np.testing.assert_array_equal(observation[:, 0], qpos[:, left])
     np.testing.assert_allclose(qpos[:, right], -0.5 * qpos[:, left], atol=1e-5)
     env.close()
+
+
+TURNS = np.arange(-3, 4)
+
+
+@pytest.fixture(scope="module")
+def carousel(tmp_path_factory):
+    """Envs of a robot whose first joint is continuous, whose second cannot move, and whose third has a range."""
+    still = LIMIT.replace('lower="-1" upper="1"', 'lower="0.5" upper="0.5"')
+    joints = (
+        joint("turn", "base", "a", "continuous", '<limit effort="50" velocity="9"/>'),
+        joint("still", "a", "b", inner=still),
+        joint("bend", "b", "c"),
+    )
+    path = write(tmp_path_factory.mktemp("carousel"), robot(*map(link, ("base", "a", "b", "c")), *joints))
+    options = {"actions": "increment", "workers": 0, "collisions": False, "max_increment": 0.05}
+    envs = ReachVectorEnv(len(TURNS), Robot.load(path), max_episode_steps=None, tolerance=0.01, **options)
+    yield envs
+    envs.close()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), off=st.floats(-np.pi, np.pi))
+def test_turns_of_a_continuous_joint_change_neither_observation_nor_reward(carousel, seed, off):
+    observation, _ = carousel.reset(seed=[seed] * len(TURNS))
+    assert (observation == observation[0]).all()
+    pose = observation[:, 6:].astype(np.float64)
+    pose[:, 0] += off + 2 * np.pi * TURNS
+    carousel.runner.reset(pose)
+    observation, reward, _, _, info = carousel.step(np.zeros((len(TURNS), 3)))
+    assert carousel.observation_space.contains(observation)
+    angle, goal = observation[:, 0].astype(np.float64), observation[:, 6].astype(np.float64)
+    np.testing.assert_allclose(np.exp(1j * angle), np.exp(1j * angle[0]), atol=2e-4)
+    way = np.abs(np.angle(np.exp(1j * (goal - angle))))
+    error = np.maximum(way, np.abs(observation[:, 8] - observation[:, 2]))
+    np.testing.assert_allclose(info["error"], error, atol=1e-5)
+    np.testing.assert_array_equal(info["success"], info["error"] <= 0.01)
+    np.testing.assert_allclose(reward, info["success"] - way / (6 * np.pi), atol=5e-3)
+
+
+def test_a_goal_is_reached_across_the_half_turn(carousel):
+    """Increments turn a continuous joint on, and the observed position stays in [-pi, pi]."""
+    carousel.reset(seed=[7] * len(TURNS))
+    action = np.zeros((len(TURNS), 3))
+    action[:, 0] = 1.0
+    seen = np.array([carousel.step(action)[0][0, 0] for _ in range(140)])
+    steps = np.diff(seen)
+    assert np.abs(seen).max() <= np.float32(np.pi)
+    assert np.count_nonzero(steps < -6) == 1
+    assert (steps[steps > -6] > -1e-3).all()
+
+
+def test_a_joint_that_cannot_move_does_not_enter_the_reward(carousel):
+    observation, _ = carousel.reset(seed=3)
+    assert np.isfinite(carousel.step(np.zeros((len(TURNS), 3)))[1]).all()
+    assert (observation[:, 7] == 0.5).all()
+
+
+def test_a_reset_while_a_step_is_under_way_is_an_error(carousel):
+    observation, _ = carousel.reset(seed=1)
+    action = np.zeros((len(TURNS), 3))
+    carousel.step_async(action)
+    for call in (carousel.reset, lambda: carousel.step(action)):
+        with pytest.raises(CallOrderError, match="call step_wait"):
+            call()
+    stepped, *_ = carousel.step_wait()
+    assert (stepped[:, 6:] == observation[:, 6:]).all()
+    carousel.reset(seed=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (ReachVectorEnv, {"robto": "panda"}, r"robto: is not an argument of ReachVectorEnv; did you mean 'robot'"),
+        (ReachVectorEnv, {"worker": 0}, "did you mean 'workers'"),
+        (ReachVectorEnv, {"substeps": 5}, "substeps: is not an argument"),
+        (ReachVectorEnv, {"timestep": 0}, "timestep"),
+        (ReachVectorEnv, {"autoreset_mode": "Never"}, "autoreset_mode.*'NextStep'"),
+        (ReachVectorEnv, {"terminate_on_success": "no"}, "terminate_on_success"),
+        (ReachEnv, {"max_episode_steps": 9}, "max_episode_steps: is not an argument of ReachEnv"),
+        (ReachEnv, {"autoreset_mode": "NextStep"}, "autoreset_mode: is not an argument of ReachEnv"),
+        (lambda **options: gymnasium.make_vec(ID, 2, **options), {"robto": "panda"}, "did you mean 'robot'"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_the_nearest(make, options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        make(**options)

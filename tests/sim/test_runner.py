@@ -93,3 +93,11 @@ def test_its_repr_fits_two_lines(panda):
             "       physics 'accurate', timestep 0.0005 s, 20 substeps, at 0.01 s)"
         )
     assert "closed" in repr(runner)
+
+
+@pytest.mark.parametrize("progress", [lambda ticks: ticks[:2], lambda ticks: ticks[::-1], lambda ticks: [*ticks] * 2])
+def test_every_tick_is_run_whatever_shows_the_progress(hinge, progress):
+    setpoints = np.linspace(0, 0.2, 5)[:, None]
+    with Runner(hinge, 1, workers=0, checkpoint_steps=40) as runner, Runner(hinge, 1, workers=0) as other:
+        shown, plain = runner.rollout(setpoints, progress=progress), other.rollout(setpoints)
+    np.testing.assert_allclose(shown.qpos, plain.qpos, atol=1e-5)

@@ -23,3 +23,7 @@ def test_a_trace_holds_what_its_results_need_and_no_more():
     assert len(noted.operations) == 5 * 4
     assert np.frombuffer(noted.results, np.int32).tolist() == [2, 1]
     assert noted.literals == ()
+
+
+def test_literals_of_a_trace_keep_their_sign():
+    assert [repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals] == ["0.0", "-0.0"]

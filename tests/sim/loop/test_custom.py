@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 from typing import NamedTuple
@@ -12,8 +13,9 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Runner, Snapshot
+from sim import FaultWarning, Runner, Snapshot
 from sim.loop.custom import flatten, unflatten
+from sim.loop.faults import CAUSES
 
 N, TICKS = 5, 12
 
@@ -107,8 +109,8 @@ class WrongState(Counter):
 
 
 class WrongEffort(Counter):
-    def __call__(self, *_):
-        return None, np.zeros(4)
+    def __call__(self, state, *_):
+        return state, np.zeros(4)
 
 
 class DivergesInOneEnv(Counter):
@@ -125,6 +127,56 @@ def test_what_does_not_fit_is_an_error(panda):
     runner = Runner(panda, N, control=WrongEffort(), workers=0)
     with runner, pytest.raises(InvalidArgumentError, match=r"returned an effort of shape \(4,\), not \(5, 9\)"):
         runner.step(np.zeros(panda.dof))
+
+
+class NanAtOneJoint(Counter):
+    def __init__(self, xp=np):
+        self.xp = xp
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        bad = (setpoint > 0.9) & (state["steps"] == 6)[:, None]
+        return state | {"steps": state["steps"] + 1}, self.xp.where(bad, self.xp.nan, passive)
+
+
+@pytest.mark.parametrize("how", ["numpy", "program of XLA", "jitted calls", "delayed"])
+def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
+    options = {"workers": 0, "substeps": 10, "control": NanAtOneJoint()}
+    delay = 0
+    if how in ("program of XLA", "jitted calls"):
+        jnp = pytest.importorskip("jax.numpy")
+        options |= {"backend": "jax", "control": NanAtOneJoint(jnp)}
+    if how in ("delayed", "jitted calls"):
+        delay = 2
+        options["actuators"] = bp.make_actuators(panda.dof, command_delay=delay / 2000)
+    setpoint = np.zeros((N, panda.dof))
+    setpoint[3, 4] = setpoint[3, 6] = 1.0
+    message = r"env 3, joint 'panda_joint5': the effort that its controller returned is not finite, at step"
+    with Runner(panda, N, **options) as runner:
+        with pytest.warns(FaultWarning, match=message):
+            runner.step(setpoint)
+        assert runner.backend.startswith("law in XLA") == ("jax" in str(options.get("backend")))
+        (fault,) = runner.faults
+        snapshot = runner.snapshot()
+    assert fault[:2] == (3, 7 + delay)
+    assert (fault.joint, fault.cause) == ("panda_joint5", "effort")
+    assert CAUSES[snapshot.states.containment["cause"][3]] == "effort"
+
+
+def test_the_numbers_of_causes_stay():
+    """Snapshots hold them."""
+    assert CAUSES == ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
+
+
+class Diverges(Counter):
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, 0 * passive + 1e38
+
+
+@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+def test_a_finite_effort_that_ends_the_state_is_a_fault_of_the_state(panda):
+    with Runner(panda, 1, control=Diverges(), workers=0, params=panda.params(effort_limit=None)) as runner:
+        runner.step(np.zeros(panda.dof))
+        assert [fault.cause for fault in runner.faults] == ["state"]
 
 
 @pytest.mark.filterwarnings("ignore::sim.FaultWarning")
@@ -162,3 +214,115 @@ def test_states_are_taken_apart_and_put_together(state):
     assert str(again) == str(state)
     assert type(again) is type(state)
     assert len(set(leaves)) == len(leaves)
+
+
+class Writes(Counter):
+    """Writes to one of its inputs."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __call__(self, state, *inputs):
+        inputs[self.number][...] = 0.5
+        return super().__call__(state, *inputs)
+
+
+@pytest.mark.parametrize("number", range(4), ids=["setpoint", "qpos", "qvel", "passive"])
+def test_inputs_are_read_only(panda, number):
+    with pytest.raises(Exception, match="read-only"):
+        rollout(panda, Writes(number))
+
+
+class Keeps:
+    """Has its last inputs as its state, as views or as copies; their changes are its effort."""
+
+    def __init__(self, keep):
+        self.keep = keep
+
+    def init(self, robot, num_envs):
+        return [np.zeros((num_envs, robot.dof))] * 4
+
+    def __call__(self, state, *inputs):
+        changes = [new - old for new, old in zip(inputs, state, strict=True)]
+        return [self.keep(rows) for rows in inputs], inputs[3] + 20 * changes[0] + 5 * changes[1] + changes[2]
+
+
+@pytest.mark.parametrize("compensate", ["gravity", "none"])
+def test_inputs_may_be_kept(panda, compensate):
+    seen = []
+    for keep in (lambda rows: rows, np.copy):
+        with Runner(panda, N, control=Keeps(keep), workers=0, substeps=3, compensate=compensate) as runner:
+            steps = range(4)
+            seen.append([runner.step(0.01 * np.full((N, 9), k), feedforward=np.full(9, k)) for k in steps][-1])
+    assert_identical(*seen)
+
+
+class Reuses(Counter):
+    """Returns the same arrays at every call, for every group of envs: a state that counts, and an effort."""
+
+    def __init__(self, reuse):
+        self.reuse, self.arrays = reuse, {}
+
+    def _own(self, *shape):
+        return self.arrays.setdefault(shape, np.zeros(shape)) if self.reuse else np.zeros(shape)
+
+    def init(self, robot, num_envs):
+        return self._own(num_envs, 1)
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        count, effort = self._own(len(qpos), 1), self._own(*qpos.shape)
+        count[...] = state + setpoint[:, :1]
+        effort[...] = passive + count
+        return count, effort
+
+
+def test_arrays_of_the_controller_may_be_used_again(panda):
+    def run(reuse):
+        options = {"workers": 0, "substeps": 3, "control": Reuses(reuse), "collisions": False, "pack_size": 2}
+        with Runner(panda, 32, **options) as runner:
+            return [runner.step(np.outer(np.linspace(0, 0.03, 32), np.ones(9))) for _ in range(3)][-1]
+
+    assert_identical(run(True), run(False))
+
+
+class Changes(Counter):
+    """Returns another state than it should."""
+
+    def __init__(self, change):
+        self.change = change
+
+    def init(self, robot, num_envs):
+        return super().init(robot, num_envs) | {"count": np.zeros(num_envs, int)}
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return self.change({**state, "steps": state["steps"] + 1}), passive
+
+
+CHANGES = {
+    "rows": (lambda state: state | {"steps": state["steps"][:2]}, r"a state 'steps' of shape \(2,\), not \(\d+,\)"),
+    "axes": (lambda state: state | {"steps": state["steps"][:, None]}, r"a state 'steps' of shape \(\d+, 1\), not"),
+    "lost": (lambda state: {"steps": state["steps"], "count": state["count"]}, "a state without 'filter/0'"),
+    "more": (lambda state: state | {"more": state["steps"]}, "a state with an unknown 'more'"),
+    "none": (lambda state: None, "a state without '(steps|count)'"),
+    "kind": (lambda state: state | {"count": state["count"] + 0.5}, "a state 'count' of float64.*into int64"),
+}
+
+
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_state_of_another_kind_is_refused_by_name(panda, change, backend):
+    if backend == "jax" and importlib.util.find_spec("jax") is None:
+        pytest.skip("needs JAX")
+    how, message = CHANGES[change]
+    runner = Runner(panda, N, control=Changes(how), workers=0, backend=backend)
+    with runner, pytest.raises(InvalidArgumentError, match=f"control: returned {message}"):
+        runner.step(np.zeros(panda.dof))
+
+
+def test_a_state_keeps_its_dtype(panda):
+    wide = Changes(lambda state: state | {"steps": state["steps"].astype(np.float32), "count": state["count"] > 0})
+    with Runner(panda, N, control=wide, workers=0) as runner:
+        runner.step(np.zeros(panda.dof))
+        snapshot = runner.snapshot()
+        runner.restore(snapshot)
+    assert [snapshot.states.controller[name].dtype for name in ("steps", "count")] == [np.float64, np.int64]

@@ -133,7 +133,3 @@ def test_laws_that_differ_in_a_choice_alone_have_programs_of_their_own(order):
         for qpos in (0.5, np.nan):
             state, effort = program.advance(state, (setpoint, None), np.full((1, 2), qpos), None, None)[:2]
         assert (effort == {"zero": 0.0, "hold": 5.0}[non_finite]).all()
-
-
-def test_literals_of_a_trace_keep_their_sign():
-    assert [repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals] == ["0.0", "-0.0"]

@@ -198,7 +198,7 @@ def test_an_env_whose_effort_is_nan_fails_alone(counter, panda, on_fault):
     setpoint[3] = 1.5
     with Runner(panda, N, control=Failing(), backend="jax", workers=0, substeps=20, on_fault=on_fault) as runner:
         obs = runner.step(setpoint)
-        assert [(fault.env, fault.step, fault.cause) for fault in runner.faults] == [(3, 15, "state")]
+        assert [(fault.env, fault.step, fault.cause) for fault in runner.faults] == [(3, 15, "effort")]
         assert np.isfinite(runner.step(setpoint).qpos).all()
     np.testing.assert_array_equal(obs.ok, np.arange(N) != 3)
     assert_identical(obs, sound, np.arange(N) != 3)
@@ -224,7 +224,7 @@ class WrongState(Counter):
     [
         (NumPyOnly(), "control: cannot be traced by JAX.*use backend='numpy'"),
         (WrongEffort(), r"control: returned an effort of shape \(4,\), not \(16, 9\)"),
-        (WrongState(), "control: returned a state of another structure"),
+        (WrongState(), "control: returned a state without 'filter/0'"),
     ],
     ids=lambda one: type(one).__name__,
 )

@@ -1,0 +1,35 @@
+"""Checks of keyword arguments: an unknown one is an error that names the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import inspect
+from collections.abc import Callable, Collection
+from typing import ParamSpec, TypeVar
+
+from batchpid.errors import InvalidArgumentError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -> None:
+    """Raise InvalidArgumentError for the first name in ``given`` that is not among the ``known`` ones of ``owner``."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
+            raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
+
+
+def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate ``function``, which others pass their ``**options`` to, so that it checks the names of keywords."""
+    known = tuple(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **options: P.kwargs) -> R:
+        check_keywords(function.__name__, options, known)
+        return function(*args, **options)
+
+    return checked

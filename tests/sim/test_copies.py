@@ -1,0 +1,64 @@
+"""Objects that own processes, scenes or files refuse to be copied or pickled, and go on."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+
+import cloudpickle
+import pytest
+
+from batchpid.errors import NotCopyableError
+from sim import Recorder, Robot, Runner
+from sim.workers.pool import WorkerPool
+from tests.sim.tiny_urdf import one_joint, write
+
+COPIES = (copy.copy, copy.deepcopy, pickle.dumps, cloudpickle.dumps)
+
+
+@pytest.fixture
+def hinge(tmp_path):
+    return Robot.load(write(tmp_path, one_joint()))
+
+
+def refuses(value, advice=""):
+    for make in COPIES:
+        with pytest.raises(NotCopyableError, match=f"a {type(value).__name__} can be neither .*{re.escape(advice)}"):
+            make(value)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_runner(hinge, workers):
+    with Runner(hinge, 1, workers=workers) as runner:
+        refuses(runner, "restore a runner.snapshot() in it")
+        assert runner.step([0.1]).ok.all()
+    with pytest.raises(NotCopyableError):
+        copy.copy(runner)  # a closed one, too
+
+
+def test_a_pool_and_its_workers(hinge):
+    with Runner(hinge, 1, workers=0) as runner:
+        pool = WorkerPool(runner.options, runner.params)
+        pool.open()
+        refuses(pool)
+        refuses(pool.workers[0])
+        pool.close()
+
+
+def test_a_recorder(hinge, tmp_path):
+    pytest.importorskip("h5py")
+    with Runner(hinge, 1, workers=0) as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
+        refuses(recorder, "another Recorder")
+        runner.step([0.1])
+
+
+def test_an_environment(hinge):
+    pytest.importorskip("gymnasium")
+    from sim.gym import ReachEnv, ReachVectorEnv
+
+    for env in (ReachVectorEnv(1, hinge, workers=0), ReachEnv(hinge)):
+        env.reset(seed=0)
+        refuses(env, "the same arguments")
+        env.step(env.action_space.sample())
+        env.close()
