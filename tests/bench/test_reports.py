@@ -44,10 +44,5 @@ def test_the_slow_tests_print_each_result_as_it_comes():
 
 def test_slow_tests_have_no_limits_of_their_own():
     """The limit of all ends one that hangs, whatever else the machine does."""
-    assert not [
-        path.name
-        for path in (ROOT / "tests").rglob("test_*.py")
-        if re.search(
-            r"mark\.slow\)?\n@pytest\.mark\.timeout|mark\.timeout\(\d+\)\n@pytest\.mark\.slow", path.read_text()
-        )
-    ]
+    own = re.compile(r"mark\.slow\)?\n@pytest\.mark\.timeout|mark\.timeout\(\d+\)\n@pytest\.mark\.slow")
+    assert not [path.name for path in (ROOT / "tests").rglob("test_*.py") if own.search(path.read_text())]
