@@ -47,14 +47,12 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
         if len(cells) != len(header):
             problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
             raise error(str(path), problem, "complete or remove the line")
-        try:
-            rows.append([float(cell) if cell.strip() else math.nan for cell in cells])
-        except ValueError:
-            column, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
-            if column.partition(":")[0] in (*QUANTITIES, "time"):
+        row = [_number(cell) for cell in cells]
+        for column, cell, value in zip(header, cells, row, strict=True):
+            if value is None and column.partition(":")[0].strip() in (*QUANTITIES, "time"):
                 problem = f"line {number}, column {column!r} is no number"
-                raise error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
-            rows.append([float(cell) if _is_number(cell) else math.nan for cell in cells])
+                raise error(str(path), problem, "write numbers with a decimal point", cell.strip())
+        rows.append([math.nan if value is None else value for value in row])
         lines.append(number)
     if header is None or not rows:
         raise error(str(path), "has no rows", "give a header and one row per sample")
@@ -65,12 +63,12 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
     return {name: table[:, index] for index, name in enumerate(header)}, lines
 
 
-def _is_number(cell: str) -> bool:
+def _number(cell: str) -> float | None:
+    """Return the number in a cell, NaN for an empty one, None for text."""
     try:
-        float(cell)
+        return float(cell) if cell.strip() else math.nan
     except ValueError:
-        return not cell.strip()
-    return True
+        return None
 
 
 def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
