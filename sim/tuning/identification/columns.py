@@ -47,12 +47,10 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
         if len(cells) != len(header):
             problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
             raise error(str(path), problem, "complete or remove the line")
-        row = [_number(cell) for cell in cells]
-        for column, cell, value in zip(header, cells, row, strict=True):
-            if value is None and column.partition(":")[0].strip() in (*QUANTITIES, "time"):
-                problem = f"line {number}, column {column!r} is no number"
-                raise error(str(path), problem, "write numbers with a decimal point", cell.strip())
-        rows.append([math.nan if value is None else value for value in row])
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:  # a cell is empty, or text
+            rows.append(_read_row(path, number, header, cells))
         lines.append(number)
     if header is None or not rows:
         raise error(str(path), "has no rows", "give a header and one row per sample")
@@ -63,12 +61,18 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
     return {name: table[:, index] for index, name in enumerate(header)}, lines
 
 
-def _number(cell: str) -> float | None:
-    """Return the number in a cell, NaN for an empty one, None for text."""
-    try:
-        return float(cell) if cell.strip() else math.nan
-    except ValueError:
-        return None
+def _read_row(path: Path, number: int, header: list[str], cells: list[str]) -> list[float]:
+    """Return the numbers of line ``number``; NaN for empty cells, and for text in columns of other quantities."""
+    row = []
+    for column, cell in zip(header, cells, strict=True):
+        try:
+            row.append(float(cell) if cell.strip() else math.nan)
+        except ValueError:
+            if column.partition(":")[0].strip() in (*QUANTITIES, "time"):
+                problem = f"line {number}, column {column!r} is no number"
+                raise error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
+            row.append(math.nan)
+    return row
 
 
 def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
