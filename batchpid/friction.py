@@ -154,6 +154,7 @@ def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
         Half width in which the sign is blurred (joints,) [rad or m].
     """
     xp = namespace(coulomb, error, rate, band)
+    coulomb, band = xp.atleast_2d(coulomb), xp.atleast_2d(band)
     ahead = error if rate is None else error + LOOKAHEAD * rate
     return clip(ahead * (coulomb / band), -coulomb, coulomb, xp)
 

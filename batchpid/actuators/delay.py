@@ -58,7 +58,7 @@ def discretise(delay: Any, dt: Any, history: Any) -> Delay:
     steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
     floor = xp.minimum(xp.floor(steps), samples - 2)
     fraction = steps - floor
-    first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)
+    first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)[None]
     later = first + floor.astype(int) * joints
     if not is_traced(fraction) and not fraction.any():
         return Delay(later[None], None)

@@ -108,7 +108,8 @@ def init(
         encoder = position
     if actuators.seed is not None:
         numbers = xp.arange(len(zeros)) if envs is None else envs
-        key = noise.keys(actuators.seed, numbers, xp.zeros(len(zeros), xp.uint32) + xp.asarray(episode), xp)
+        episodes = xp.broadcast_to(xp.asarray(episode), (len(zeros),))
+        key = noise.keys(actuators.seed, numbers, episodes, xp)
         step = xp.zeros(len(zeros), xp.uint32)
     state = ActuatorState(command, None, sensor, encoder, key, step)
     if actuators.lag is None:

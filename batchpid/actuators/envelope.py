@@ -81,8 +81,9 @@ def command_envelope(actuators: Actuators) -> Envelope:
     shift = 0.0 if bias is None else bias
     ends = {name: getattr(k, name) for name in ("stall", "reverse", "limit", "least", "offset", "least_offset")}
     ends = {name: (end - shift) / divisor for name, end in ends.items() if end is not None}
-    rates = {name: getattr(k, name) for name in ("slope", "rise")}
-    return k._replace(**ends, **{name: rate / divisor for name, rate in rates.items() if rate is not None})
+    slope = None if k.slope is None else k.slope / divisor
+    rise = None if k.rise is None else k.rise / (divisor if strength is None else divisor[None])
+    return k._replace(**ends, slope=slope, rise=rise)
 
 
 def limits(k: Envelope, qpos: Any, velocity: Any) -> tuple[Any, Any]:

@@ -11,6 +11,13 @@ from quick_jit import quick_jit
 import batchpid as bp
 
 
+@pytest.fixture(autouse=True)
+def strict() -> Any:
+    """Let the pure functions be traced under JAX's strict modes in every test."""
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        yield
+
+
 @pytest.fixture(params=OPTIONS, ids=str)
 def options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """Arguments of make_params, with every option on in some case."""

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from sim.engine import native
+
+_lock = threading.Lock()
+
+
+def status() -> native.NativeStatus:
+    """Return whether programs of JAX can call the extension, and the reason if not. Imports JAX."""
+    calls = native.status()
+    if not calls.active:
+        return calls
+    with _lock:  # JAX takes a name once
+        problem = _registered()
+    return native.NativeStatus(not problem, problem)
 
 
 @cache
@@ -22,15 +35,6 @@ def _registered() -> str:
         except Exception as error:  # JAX promises no type
             return f"JAX {jax.__version__} does not take the extension's functions: {error}"
     return ""
-
-
-def status() -> native.NativeStatus:
-    """Return whether programs of JAX can call the extension, and the reason if not. Imports JAX."""
-    calls = native.status()
-    if not calls.active:
-        return calls
-    problem = _registered()
-    return native.NativeStatus(not problem, problem)
 
 
 def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:

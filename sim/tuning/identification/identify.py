@@ -142,7 +142,10 @@ def identify(
     variants = _variants(drive, motions)
     known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(variants))
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
-    pool: Any = ProcessPoolExecutor(processes, mp_context=get_context("spawn")) if processes > 1 else nullcontext()
+    pool: Any = nullcontext()
+    if processes > 1:
+        verdict: Any = {"initializer": os.environ.update, "initargs": (native.environment(),)}
+        pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), **verdict)
     with pool as executor:
         problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in variants]
         ideal = _ideal(robot, joints)

@@ -1,0 +1,154 @@
+"""Debugging settings of JAX change no result of BatchPID, and hold in the caller's own programs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax_debugging import SETTINGS, changed
+
+import batchpid as bp
+from batchpid import actuators, backends, friction
+from batchpid.jax_settings import NEEDED, own_settings
+
+
+def controller():
+    """Return a controller with float32 params."""
+    options = {"ki": 3.0, "kd": 1.0, "effort_limit": [1.0, 2.0, 3.0], "derivative_filter_time": 0.01}
+    return bp.BatchPID(bp.make_params(3, [4.0, 5.0, 6.0], dtype=np.float32, **options), 2, 0.01, backend="jax")
+
+
+def efforts(pid):
+    """Return the efforts of calls, resets and changes of params, with NaN among the measurements."""
+    rows, params = [], pid.params
+    pid.reset(np.zeros((2, 3)))
+    with own_settings("float32"):
+        ones = jnp.ones((2, 3), jnp.int32)
+    for step in range(3):
+        measurement = np.full((2, 3), 0.1 * step)
+        measurement[1, 0] = np.nan if step == 1 else 0.0
+        rows.append(pid([1.0, 0.0, 2.0], measurement, feedforward=ones))
+    pid.reset(np.zeros((2, 3)), [True, False])
+    pid.track(1.0, np.zeros((2, 3)), ones)
+    pid.params = params.replace(kp=7.0)
+    rows.append(pid(ones, np.zeros((2, 3)), feedforward=1.0))
+    pid.params = params
+    assert rows[0].dtype == np.float32
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def pid():
+    return controller()
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_no_setting_changes_a_result(pid, name):
+    expected = efforts(pid)
+    with changed(**{name: SETTINGS[name]}):
+        np.testing.assert_array_equal(efforts(pid), expected)
+
+
+def test_all_of_them_at_once_in_large_batches(monkeypatch):
+    monkeypatch.setattr(backends, "LARGE", 1)
+    expected = efforts(controller())
+    with changed(**SETTINGS):
+        np.testing.assert_array_equal(efforts(controller()), expected)
+
+
+def test_settings_in_environment_variables_change_no_result(pid):
+    values = {name.upper(): {True: "1"}.get(value, value) for name, value in SETTINGS.items()}
+    program = (
+        "import jax, test_jax_settings as test; assert jax.config.jax_debug_nans; "
+        "print(test.efforts(test.controller()).tobytes().hex())"
+    )
+    paths = os.pathsep.join(path for path in sys.path if path)
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | values | {"PYTHONPATH": paths}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert bytes.fromhex(done.stdout) == efforts(pid).tobytes()
+
+
+def test_a_controller_keeps_the_precision_that_it_was_built_with(x64):
+    params = bp.make_params(2, 3.0, ki=1.0)
+    wide = bp.BatchPID(params, 1, 0.01, backend="jax")
+    expected = [np.array(wide(1.0, np.full((1, 2), 0.1))) for _ in range(2)]
+    assert expected[0].dtype == np.float64
+    other = bp.BatchPID(params, 1, 0.01, backend="jax")
+    np.testing.assert_array_equal(other(1.0, np.full((1, 2), 0.1)), expected[0])
+    with changed(jax_enable_x64=False):
+        np.testing.assert_array_equal(other(1.0, np.full((1, 2), 0.1)), expected[1])
+
+
+def test_a_change_of_settings_compiles_nothing_again(caplog):
+    pid = bp.BatchPID(bp.make_params(2, 3.0, dtype=np.float32), 1, 0.01, backend="jax")
+    pid(1.0, np.zeros((1, 2)))
+    with changed(**SETTINGS), caplog.at_level("WARNING"):
+        pid(1.0, np.zeros((1, 2)))
+    assert not [record for record in caplog.records if "Compiling" in record.message]
+
+
+def test_the_callers_own_programs_keep_the_callers_settings():
+    pid = bp.BatchPID(bp.make_params(2, 3.0), 1, 0.01, backend="jax")
+    with changed(jax_debug_nans=True, jax_numpy_rank_promotion="raise", jax_transfer_guard_host_to_device="disallow"):
+        pid(1.0, np.full((1, 2), np.nan))
+        assert jax.config.jax_debug_nans
+        assert jax.config.jax_numpy_rank_promotion == "raise"
+        assert jax.config.jax_transfer_guard_host_to_device == "disallow"
+        with jax.transfer_guard("allow"):
+            rows = jnp.zeros((1, 2))
+            with pytest.raises(FloatingPointError):
+                jax.jit(bp.step, static_argnames="dt")(*stepped(rows))
+
+
+def stepped(rows):
+    """Return arguments of bp.step, with a NaN."""
+    params = bp.make_params(2, 3.0, ki=1.0, dtype=np.float32)
+    return params, bp.init(params, rows), rows, rows * np.float32(np.nan), 0.01
+
+
+def test_every_setting_that_is_needed_has_a_context():
+    for name, values in NEEDED.items():
+        with getattr(jax, name.removeprefix("jax_"))(values[0]):
+            assert getattr(jax.config, name) in values
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_pure_functions_obey_the_strict_modes(wide):
+    """All functions that programs of the caller may trace; those of float32 stay so under 64-bit types."""
+
+    def run(rows, mask, mass):
+        dtype = rows.dtype
+        params = bp.make_params(3, 5.0, ki=1.0, kd=0.1, effort_limit=3.0, integral_limit=2.0, dtype=dtype)
+        start = bp.init(params, rows)
+        state, target = bp.drive_target(params, start, rows, rows, 0.01)
+        found = [state, target, bp.track(params, state, rows, rows, rows), bp.reset(params, state, rows, mask)]
+        model = friction.Friction(*(rows[:1] ** 2 for _ in range(3)))
+        rubbing = friction.init(model, rows, rows, mass, 0.01)
+        found += [friction.advance(model, rubbing, rows, rows), friction.reset(rubbing, rubbing, mask)]
+        found += [friction.compensation(rows[0] ** 2, rows, rows, rows[0] ** 2)]
+        motors = bp.make_actuators(
+            3, command_delay=0.02, sensor_delay=0.01, strength=0.9, effort_limit=6.0, velocity_noise=1e-2, seed=1,
+            saturation_effort=8.0, no_load_speed=4.0, position_limit=([-1.0, 0.0], [4.0, 7.0]), dtype=dtype,
+        )  # fmt: skip
+        motors = jax.tree.map(jnp.asarray, motors)
+        begun = actuators.init(motors, rows, 0.01, episode=jnp.arange(len(rows)), samples=4)
+        k = actuators.discretise(motors, begun, 0.01, len(rows))
+        found += [
+            actuators.advance_effort(k, begun, rows, rows, rows),
+            actuators.advance_measurement(k, begun, rows, rows),
+        ]
+        return [*found, actuators.reset(begun, begun, mask)]
+
+    rows = np.linspace(-1.0, 1.0, 12, dtype=np.float32).reshape(4, 3)
+    strict = {"jax_numpy_rank_promotion": "raise", "jax_numpy_dtype_promotion": "strict"}
+    mass = np.broadcast_to(np.eye(3, dtype=np.float32), (4, 3, 3))
+    with changed(**strict, jax_enable_x64=wide):
+        found = jax.jit(run)(rows, np.array([True, False, True, False]), mass)
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(found)} == {"float32", "uint32"}

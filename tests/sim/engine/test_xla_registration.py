@@ -1,0 +1,39 @@
+"""Registration of the extension's functions in JAX."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from sim.engine import native
+from sim.engine.native import xla
+
+jax = pytest.importorskip("jax")
+
+
+@pytest.mark.skipif(not native.status().active, reason="there are no native calls")
+def test_two_threads_register_the_functions_once(monkeypatch):
+    xla.status()
+    taken, gate = list[str](), threading.Barrier(2)
+
+    def register(name, *_, **__):
+        time.sleep(0.01)  # lets the other thread run
+        if name in taken:
+            raise ValueError(f"{name} is registered")
+        taken.append(name)
+
+    def ask():
+        gate.wait()
+        found.append(xla.status())
+
+    found = []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", register)
+    xla._registered.cache_clear()
+    threads = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [status.active for status in found] == [True, True]

@@ -1,0 +1,94 @@
+"""Debugging settings of JAX change no motion of a Runner, in the calling process and in workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from identical import assert_identical
+from jax_debugging import SETTINGS, changed
+from robots import RUBBING, load_bundled
+
+import batchpid as bp
+from sim import Runner
+
+jax = pytest.importorskip("jax")
+jnp = jax.numpy
+pytestmark = pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+
+
+class Integrator:
+    """Efforts from a state that init makes by JAX; NaN where the setpoint is beyond 0.5."""
+
+    def init(self, robot, num_envs):
+        return {"sum": jnp.zeros((num_envs, robot.dof)), "calls": jnp.zeros(num_envs, jnp.int32)}
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        total = state["sum"] + (setpoint - qpos)
+        effort = jnp.where(setpoint > 0.5, jnp.nan, 5.0 * (setpoint - qpos) + 0.1 * total + passive)
+        return {"sum": total, "calls": state["calls"] + 1}, effort
+
+
+OPTIONS = {
+    "pid": {},
+    "mass matrix": {"params": {"gain_units": "mass_matrix", "kd": 20.0, "effort_limit": 80.0}},
+    "controller": {"control": Integrator()},
+    "pid, a call each step": {"actuators": {"lag": 0.01}},
+    "controller, a call each step": {"control": Integrator(), "actuators": {"lag": 0.01}},
+}
+
+
+def motion(case, workers=0):
+    """Return a rollout with a reset and a restored snapshot; the env 1 of a controller fails."""
+    robot, options = load_bundled(RUBBING), dict(OPTIONS[case])
+    for name, make in {"params": bp.make_params, "actuators": bp.make_actuators}.items():
+        if name in options:
+            options[name] = make(robot.dof, *([100.0] if name == "params" else []), **options[name])
+    setpoint = np.tile(robot.start, (4, 3, 1))
+    setpoint[2:, 1, 0] = 0.7
+    with Runner(robot, 3, backend="jax", workers=workers, substeps=3, **options) as runner:
+        runner.step(setpoint[0])
+        snapshot = runner.snapshot()
+        runner.step(setpoint[1])
+        runner.restore(snapshot)
+        runner.reset(mask=np.array([True, False, False]))
+        rollout = runner.rollout(setpoint)
+        assert ("control" in options) == bool(runner.faults)
+        return rollout
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """Motions under the default settings, by case."""
+    return {case: motion(case) for case in OPTIONS}
+
+
+LOGS = {"jax_log_compiles", "jax_explain_cache_misses"}
+
+
+@pytest.mark.parametrize("name", sorted(SETTINGS.keys() - LOGS))
+@pytest.mark.parametrize("case", ["pid", "controller"])
+def test_no_setting_changes_a_motion(expected, case, name):
+    with changed(**{name: SETTINGS[name]}):
+        assert_identical(motion(case), expected[case])
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_all_of_them_at_once(expected, case):
+    with changed(**SETTINGS):
+        assert_identical(motion(case), expected[case])
+
+
+@pytest.mark.parametrize("case", ["pid", "controller"])
+def test_workers_under_settings_of_their_environment(monkeypatch, expected, case):
+    for name, value in SETTINGS.items():
+        monkeypatch.setenv(name.upper(), "1" if value is True else value)
+    assert_identical(motion(case, workers=1), expected[case])
+
+
+def test_the_state_of_a_controller_has_the_precision_of_the_runner():
+    for wide in (False, True):
+        with (
+            changed(jax_enable_x64=wide),
+            Runner(load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0, dtype="float64") as runner,
+        ):
+            assert runner.snapshot().states.controller["sum"].dtype == np.float64
