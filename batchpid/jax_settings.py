@@ -33,7 +33,8 @@ def own_settings(dtype: Any = None) -> Iterator[None]:
     """
     import jax
 
-    config, others = jax.config, []
+    config: Any = jax.config
+    others = []
     for name, values in NEEDED.items():
         if getattr(config, name) not in values:
             others.append((getattr(jax, name.removeprefix("jax_")), values[0]))

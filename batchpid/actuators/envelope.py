@@ -77,7 +77,7 @@ def command_envelope(actuators: Actuators) -> Envelope:
     k, strength, bias = envelope(actuators), actuators.strength, actuators.bias
     if strength is None and bias is None:
         return k
-    divisor = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))
+    divisor: Any = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))
     shift = 0.0 if bias is None else bias
     ends = {name: getattr(k, name) for name in ("stall", "reverse", "limit", "least", "offset", "least_offset")}
     ends = {name: (end - shift) / divisor for name, end in ends.items() if end is not None}

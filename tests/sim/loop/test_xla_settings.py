@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from identical import assert_identical
@@ -56,10 +58,10 @@ def motion(case, workers=0):
         return rollout
 
 
-@pytest.fixture(scope="module")
-def expected():
-    """Motions under the default settings, by case."""
-    return {case: motion(case) for case in OPTIONS}
+@cache
+def expected(case):
+    """Return the motion under the default settings."""
+    return motion(case)
 
 
 LOGS = {"jax_log_compiles", "jax_explain_cache_misses"}
@@ -67,22 +69,25 @@ LOGS = {"jax_log_compiles", "jax_explain_cache_misses"}
 
 @pytest.mark.parametrize("name", sorted(SETTINGS.keys() - LOGS))
 @pytest.mark.parametrize("case", ["pid", "controller"])
-def test_no_setting_changes_a_motion(expected, case, name):
+def test_no_setting_changes_a_motion(case, name):
+    wanted = expected(case)
     with changed(**{name: SETTINGS[name]}):
-        assert_identical(motion(case), expected[case])
+        assert_identical(motion(case), wanted)
 
 
 @pytest.mark.parametrize("case", OPTIONS)
-def test_all_of_them_at_once(expected, case):
+def test_all_of_them_at_once(case):
+    wanted = expected(case)
     with changed(**SETTINGS):
-        assert_identical(motion(case), expected[case])
+        assert_identical(motion(case), wanted)
 
 
 @pytest.mark.parametrize("case", ["pid", "controller"])
-def test_workers_under_settings_of_their_environment(monkeypatch, expected, case):
+def test_workers_under_settings_of_their_environment(monkeypatch, case):
+    wanted = expected(case)
     for name, value in SETTINGS.items():
         monkeypatch.setenv(name.upper(), "1" if value is True else value)
-    assert_identical(motion(case, workers=1), expected[case])
+    assert_identical(motion(case, workers=1), wanted)
 
 
 def test_the_state_of_a_controller_has_the_precision_of_the_runner():
