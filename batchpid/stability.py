@@ -16,7 +16,7 @@ and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I
 kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
 stretched upright), joints that turn against each other move much less than the diagonal of M says.
 
-The integral, which is slow, is not in the ratio; :func:`spectral_radius` includes it.
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation` include it.
 E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
 """
 
@@ -40,6 +40,17 @@ class StabilityBound(NamedTuple):
     """(...): below 1 the loop is stable, above 1 it diverges, with alternating signs from step to step."""
     participation: Float64
     """(..., joints): share of each joint in the least stable mode; sums to 1."""
+
+
+class Oscillation(NamedTuple):
+    """Least damped oscillation of the sampled loop among those that last; of a loop without any the ratio is 1."""
+
+    damping_ratio: Float64
+    """(...): zeta; after a period exp(-2 pi zeta / sqrt(1 - zeta^2)) of the amplitude is left."""
+    frequency: Float64
+    """(...) [Hz]; 0 without oscillation."""
+    participation: Float64
+    """(..., joints): share of each joint in it; sums to 1."""
 
 
 def stability_bound(
@@ -95,7 +106,54 @@ def spectral_radius(
     (q, q - q', I, d). Arguments are those of :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
     kp. Where ki is 0 its pole at 1 is left out.
     """
-    m, p, i, c, tau, b = _columns(mass_matrix, dt, kp=kp, ki=ki, kd=kd, filter_time=filter_time, damping=damping)
+    gains = {"kp": kp, "ki": ki, "kd": kd}
+    return np.abs(np.linalg.eigvals(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))).max(
+        -1
+    )
+
+
+def oscillation(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    ki: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+    lasting: float = 1.0,
+) -> Oscillation:
+    """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or longer to fall to 2 %.
+
+    Modes that decay faster are not seen in a motion. The other arguments are those of :func:`spectral_radius`. With the
+    eigenvalue z of a mode, its continuous one is s = log(z) / dt, zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
+    """
+    gains = {"kp": kp, "ki": ki, "kd": kd}
+    values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))
+    joints = values.shape[-1] // 4
+    turns = np.abs(values.imag) > 1e-9
+    s = np.log(np.where(turns, values, 1j)) / dt
+    lasts = turns & (-s.real * positive("lasting", lasting, "s") < -np.log(0.02))
+    ratio = np.where(lasts, -s.real / np.abs(s), 1.0)
+    worst = ratio.argmin(-1)[..., None]
+    found = np.take_along_axis(lasts, worst, -1)
+    shape = np.take_along_axis(vectors, worst[..., None], -1)[..., :joints, 0]
+    # Kinetic energy, apart from the coupling of joints.
+    energy = np.abs(shape) ** 2 * np.diagonal(read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1)
+    energy = np.where(found, energy, 1.0)
+    frequency = np.abs(np.take_along_axis(s, worst, -1).imag) / (2 * np.pi)
+    return Oscillation(
+        damping_ratio=np.take_along_axis(ratio, worst, -1)[..., 0],
+        frequency=np.where(found, frequency, 0.0)[..., 0],
+        participation=energy / energy.sum(-1, keepdims=True),
+    )
+
+
+def _one_step(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> Float64:
+    """Return the matrix (..., 4 joints, 4 joints) of one step on the state (q, q - q', I, d)."""
+    m, p, i, c, tau, b = _columns(
+        mass_matrix, dt, **{name: columns[name] for name in ("kp", "ki", "kd", "filter_time", "damping")}
+    )
     shape = m.shape[:-1]
     one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
 
@@ -111,8 +169,7 @@ def spectral_radius(
     step[1] = step[1] + implicit @ m
     integral = [diagonal(-i * dt), zero, diagonal(np.where(i > 0, 1.0, 0.0)), zero]
     position = [s + e for s, e in zip(step, [one, zero, zero, zero], strict=True)]
-    matrix = np.block([position, step, integral, rate])
-    return np.abs(np.linalg.eigvals(matrix)).max(-1)
+    return np.block([position, step, integral, rate])
 
 
 def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:

@@ -32,6 +32,7 @@ from sim.robot.limits import SetpointWarning
 from sim.robot.parts import LinkMass
 from sim.robot.robot import Robot
 from sim.robot.self_collision import SelfContact
+from sim.robot.stability import StabilityWarning
 
 if TYPE_CHECKING:
     from sim.engine.physics import Physics
@@ -63,6 +64,7 @@ __all__ = [
     "RunnerOptions",
     "SetpointWarning",
     "Snapshot",
+    "StabilityWarning",
     "Uniform",
     "read_recording",
     "write_recording",

@@ -47,6 +47,7 @@ from sim.randomization.draws import NOTHING, Draws
 from sim.randomization.randomization import Randomization
 from sim.robot.limits import SetpointCheck
 from sim.robot.robot import Robot
+from sim.robot.stability import StabilityCheck
 from sim.workers.ledger import Commit, Ledger
 from sim.workers.node import NodeInfo
 from sim.workers.pool import WorkerPool
@@ -185,6 +186,7 @@ class Runner(SingleOwner):
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
         self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
+        self._stability = StabilityCheck(robot, self.timestep) if self.control == "pid" else None
         self._checks_setpoints = options.sets_positions and options.guard is False
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
@@ -203,6 +205,8 @@ class Runner(SingleOwner):
         try:
             self._pool.open()
             self.reset(seed=None if randomization is None else 0)
+            if self._stability is not None:
+                self._stability.check(params, options.actuators)
         except BaseException:
             self.close()
             raise
@@ -432,6 +436,8 @@ class Runner(SingleOwner):
         self._settle()
         checked = self.options.check_params(params)
         self._execute(SetParams(checked), lambda books, _: (books._replace(params=checked), None))
+        if self._stability is not None:
+            self._stability.check(checked, self._books.actuators)
 
     @property
     def actuators(self) -> bp.Actuators | None:

@@ -23,9 +23,10 @@ from sim.robot.inertia import DENSITY
 from sim.robot.joint_repair import GIVE_RANGE
 from sim.robot.parts import Joint
 from sim.robot.plausibility import implausible_figures
-from sim.robot.stability import stability_report
+from sim.robot.stability import slow_oscillation, stability_report
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
+RINGING = 0.2  # damping ratio below which gains are reported: more than a quarter is left after each period
 NEAR_BOUND = 0.5  # share of the stability range above which gains are reported: other poses may have less inertia
 
 
@@ -180,6 +181,8 @@ def _stability(
     robot: RobotDescription, params: bp.PIDParams, start: NDArray[np.float64], timestep: float
 ) -> Iterator[Finding]:
     report = stability_report(robot, params, start, timestep)
+    if report.robot_ratio < 1:
+        yield from _ringing(robot, params, start, timestep, report.env)
     if report.robot_ratio < NEAR_BOUND:
         return
     unstable = report.robot_ratio >= 1
@@ -196,6 +199,24 @@ def _stability(
             f"{report.inertia[index]:.2g} {unit}: {ratio:.2g} times the bound of this joint alone"
         )
         yield Finding(severity, code, text, f"use at most {0.5 / ratio:.1g} times its kd and kp", joint.name)
+
+
+def _ringing(
+    robot: RobotDescription, params: bp.PIDParams, start: NDArray[np.float64], timestep: float, env: int
+) -> Iterator[Finding]:
+    found = slow_oscillation(robot, params, start, timestep, env)
+    zeta = float(found.damping_ratio)
+    if zeta >= RINGING:
+        return
+    left = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
+    text = (
+        f"the PID loop rings at {found.frequency:.2g} Hz with a damping ratio of {zeta:.2g} at the start pose: after "
+        f"each period {100 * left:.0f} % of the amplitude is left"
+    )
+    joint = robot.joint_names[int(np.argmax(found.participation))]
+    yield Finding(
+        "note" if zeta > 0 else "warning", "ringing", text, "raise its kd, lower its ki, or use robot.designed()", joint
+    )
 
 
 def _params(robot: RobotDescription, params: bp.PIDParams, control: str) -> Iterator[Finding]:

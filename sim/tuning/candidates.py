@@ -15,6 +15,7 @@ joint out of reach from deciding alone.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.stability import stability_bound
 from sim.robot.robot import Robot
+from sim.robot.stability import StabilityWarning
 from sim.runner import Runner
 from sim.tuning.evaluation import absolute_band, arm_joints, run_moves, settling_limits
 from sim.tuning.moves import Moves, smooth_variation
@@ -121,7 +123,9 @@ class Candidates:
         count, moves, params = len(points), self.moves, self.params(points)
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
-        runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", StabilityWarning)  # a candidate may be beyond the bound, which costs it
+            runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
         each = np.tile(np.arange(len(moves.start)), count)
         rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each)
         w = self.weights

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.stability import spectral_radius, stability_bound
+from batchpid.stability import oscillation, spectral_radius, stability_bound
 
 DT = 1 / 2000
 
@@ -89,3 +89,29 @@ def test_stacks_and_bad_arguments():
             stability_bound(mass, 1.0, 1.0, DT)
     with pytest.raises(InvalidArgumentError, match="broadcast"):
         stability_bound(np.eye(2), [1.0, 2.0, 3.0], 1.0, DT)
+
+
+@given(st.floats(0.02, 0.6), st.floats(0.3, 3.0), st.floats(0.01, 10.0))
+def test_the_least_damped_oscillation_of_one_joint(zeta, hertz, inertia):
+    """Of I q'' = -I w^2 q - 2 zeta w I q', as long as it lasts."""
+    w = 2 * np.pi * hertz
+    found = oscillation([[inertia]], inertia * w**2, 0.0, 2 * zeta * w * inertia, 1e-4)
+    if -np.log(0.02) / (zeta * w) > 1.01:
+        assert found.damping_ratio == pytest.approx(zeta, abs=2e-3)
+        assert found.frequency == pytest.approx(hertz * np.sqrt(1 - zeta**2), rel=5e-3)
+    elif -np.log(0.02) / (zeta * w) < 0.99:
+        assert (found.damping_ratio, found.frequency) == (1, 0)
+    assert found.participation.sum() == pytest.approx(1)
+
+
+def test_the_oscillation_is_that_of_its_joint():
+    mass = np.tile(np.diag([1.0, 2.0]), (3, 1, 1))
+    found = oscillation(mass, [40.0, 40.0], [0.0, 0.0], [[12.0, 0.5], [0.5, 12.0], [12.0, 12.0]], 1e-3)
+    np.testing.assert_allclose(found.participation[:2], [[0, 1], [1, 0]], atol=1e-9)
+    assert (found.damping_ratio[:2] < 0.05).all()
+    assert found.damping_ratio[2] > 0.5
+
+
+def test_an_integral_that_is_too_fast_rings_and_grows():
+    ratios = [oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)]
+    assert ratios[0] > ratios[1] > 0 > ratios[2]

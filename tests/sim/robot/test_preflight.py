@@ -95,12 +95,13 @@ def test_links_without_mass_cost_time_only_where_they_are_not_merged(tmp_path):
 
 def test_a_sound_robot_has_no_findings(tmp_path, panda):
     assert Robot.load(write(tmp_path, one_joint())).check() == []
-    assert panda.check(setpoint=panda.settings.target) == []
+    assert panda.check(params=panda.tuned(), setpoint=panda.settings.target) == []
 
 
 def test_poses_beyond_limits_are_reported_by_joint(panda):
     findings = panda.check(qpos=np.zeros(9), setpoint=np.ones(9))
-    assert [(f.code, f.joint) for f in findings if "start pose" in f.text] == [("out-of-limits", "panda_joint4")]
+    outside = [finding for finding in findings if finding.code == "out-of-limits"]
+    assert [finding.joint for finding in outside if "start pose" in finding.text] == ["panda_joint4"]
     assert {f.joint for f in findings if "setpoint" in f.text} == {
         "panda_joint4",
         "panda_finger_joint1",
@@ -134,7 +135,7 @@ def test_params_that_disagree_with_the_urdf_on_continuous_joints_are_reported(tm
     hinge = Robot.load(write(tmp_path, one_joint()))
     wrapped = bp.make_params(1, **GAINS, continuous=[True])
     assert "short way round" in codes(hinge.check(params=wrapped))["continuous"].text
-    assert hinge.check(params=hinge.params(**GAINS)) == []
+    assert "continuous" not in codes(hinge.check(params=hinge.params(**GAINS)))
 
 
 def test_the_most_severe_findings_come_first(jaco2):
@@ -188,7 +189,30 @@ def test_the_tutorials_gains_are_unstable_on_the_jaco2s_light_links(jaco2):
     assert "unstable" not in slower
 
 
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
+    """The tutorial's gains on the panda: the simulated motion has the reported period and decay."""
+    (found,) = (finding for finding in panda.check(params=panda.params()) if finding.code == "ringing")
+    assert (found.severity, found.joint) == ("note", "panda_joint2")
+    assert "rings at 0.54 Hz with a damping ratio of 0.068" in found.text
+    assert "65 % of the amplitude" in found.text
+    target = panda.start + np.where(np.arange(9) == 1, 0.1, 0.0)
+    with Runner(panda, 1, workers=0, params=panda.params(), collisions=False, substeps=20) as runner:
+        rollout = runner.rollout(np.broadcast_to(target, (500, 9)))
+    error = rollout.qpos[:, 0, 1] - target[1]
+    peaks = 1 + np.flatnonzero((error[1:-1] > error[:-2]) & (error[1:-1] >= error[2:]) & (error[1:-1] > 0.01))
+    assert len(peaks) >= 2
+    assert rollout.time[peaks[1]] - rollout.time[peaks[0]] == pytest.approx(1 / 0.54, rel=0.05)
+    assert error[peaks[1]] / error[peaks[0]] == pytest.approx(0.65, abs=0.05)
+
+
+@pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
+def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, units):
+    for robot in (panda, jaco2):
+        for params in (robot.designed(units), robot.tuned()):
+            assert not {"ringing", "unstable"} & {finding.code for finding in robot.check(params=params)}
+
+
+@pytest.mark.filterwarnings("ignore::sim.FaultWarning", "ignore::sim.StabilityWarning")
 @pytest.mark.parametrize("filter_time", [0.0, 1e-3])
 @pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
 @pytest.mark.parametrize(("factor", "stays"), [(0.9, True), (1.1, False)])
