@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sim.engine.calls import EngineCalls, PythonCalls
 from sim.engine.native.library import callback_table, functions
 from sim.engine.native.loading import extension
-from sim.engine.native.verdict import SWITCH, NativeStatus, environment, python_calls, status, verify
+from sim.engine.native.verdict import SWITCH, NativeStatus, environment, python_calls, status, take_verdict, verify
 
 __all__ = [
     "SWITCH",
@@ -32,6 +32,7 @@ __all__ = [
     "pointer",
     "python_calls",
     "status",
+    "take_verdict",
     "verify",
 ]
 

@@ -87,6 +87,11 @@ def environment() -> dict[str, str]:
     return {_VERIFIED: _fingerprint()} if known.active else {_REFUSED: known.reason}
 
 
+def take_verdict(environment: dict[str, str]) -> None:
+    """Take the :func:`environment` of a parent process, in a process that could not be started with it."""
+    os.environ.update(environment)
+
+
 def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
     """Return whether the extensions work here: a verdict kept in ``folder``, or that of the self-test.
 

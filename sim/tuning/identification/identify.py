@@ -144,7 +144,7 @@ def identify(
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
     if processes > 1:
-        verdict: Any = {"initializer": os.environ.update, "initargs": (native.environment(),)}
+        verdict: Any = {"initializer": native.take_verdict, "initargs": (native.environment(),)}
         pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), **verdict)
     with pool as executor:
         problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in variants]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import pickle
 import re
 import shutil
 import subprocess
@@ -248,3 +249,9 @@ def test_two_threads_run_the_self_test_once(monkeypatch, tmp_path):
     for thread in threads:
         thread.join()
     assert len(runs) == 1
+
+
+def test_a_process_of_a_pool_takes_the_verdict_of_its_parent(monkeypatch, tmp_path):
+    monkeypatch.setenv("BATCHPID_NATIVE_REFUSED", "")
+    pickle.loads(pickle.dumps(native.take_verdict))({"BATCHPID_NATIVE_REFUSED": "the parent's reason"})
+    assert native.verify(tmp_path) == (False, "the parent's reason", "")
