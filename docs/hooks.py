@@ -12,20 +12,20 @@ from typing import Any
 from mkdocs.structure.files import File
 
 OUTSIDE = ("SECURITY.md",)
-"""Pages of the site that stand in the root of the repository, where hosts of repositories look for them."""
+"""Pages of the site in the root of the repository, where GitHub and other hosts look for them."""
 _LINK = re.compile(rf"\]\(((?:\.\./)*)\.\./({'|'.join(map(re.escape, OUTSIDE))})")
 _ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>[~!]?([^<]+)</code>")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Return the files of the site with those of OUTSIDE."""
+    """Add the pages in OUTSIDE to the files of the site."""
     for name in OUTSIDE:
         files.append(File.generated(config, name, abs_src_path=str(Path(__file__).parents[1] / name)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return the page with its links to and from OUTSIDE as they are in the site, whose root is docs/."""
+    """Return the page with links to and from the pages in OUTSIDE rewritten for the site, whose root is docs/."""
     return markdown.replace("](docs/", "](") if page.file.src_uri in OUTSIDE else _LINK.sub(r"](\1\2", markdown)
 
 
