@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class _Choice(NamedTuple):
-    """Choice, equal to those of its own type alone: as keys of a cache, empty tuples would be one and the same."""
+    """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would all be equal."""
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other)

@@ -1,7 +1,7 @@
 """Digest of the content of values: equal for equal content, in any process and memory layout.
 
-It is a SHA-256 over the digests of a value's parts, each with its type, so that no two values run into each other. A
-type that is not known is refused: its ``repr`` may leave out content, or hold an address.
+It is a SHA-256 over the digests of a value's parts, each with its type, so that the bytes of different values differ.
+Values of unknown types are refused: their ``repr`` may omit content, or contain an address.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from batchpid.errors import InvalidArgumentError
 _KINDS = "biufcSU"
 """Kinds of dtypes whose bytes are their content: no objects, no padding."""
 _WIDEST = {"f": 8, "c": 16}
-"""Bytes of the widest dtype of a kind; wider ones are padded."""
+"""Size [bytes] of the widest dtype of a kind without padding."""
 
 
 def digest(*values: Any) -> str:
     """Return the digest of ``values``, 64 hexadecimal digits.
 
-    They are None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named tuples and dataclasses
-    of these. Numbers of other types, and arrays of other dtypes, differ; byte order and strides do not matter, nor the
-    order of sets and mappings.
+    Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named tuples and
+    dataclasses of these. Numbers of different types, and arrays of different dtypes, have different digests. Byte
+    order, strides, and the order of sets and mappings do not matter.
 
     Raises
     ------
@@ -93,5 +93,5 @@ def _of_bytes(kind: str, content: bytes) -> bytes:
 
 
 def _of_parts(kind: str, parts: list[bytes]) -> bytes:
-    """Return the digest of digests; all have one length, so that none runs into the next."""
+    """Return the digest of digests, which all have the same length, so that no separator is needed."""
     return _of_bytes(kind, b"".join(parts))

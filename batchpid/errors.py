@@ -48,9 +48,9 @@ class InvalidArgumentError(BatchPIDError, ValueError):
 class ControllerError(InvalidArgumentError):
     """The caller's own controller raised, or returned an unusable state or effort, in a sim step.
 
-    It closes the runner. ``step`` is the number of the sim step: within its tick, or since the start of the runner
-    after :meth:`at`. The controller's own error, if there is one, is the ``__cause__``; from a worker process, its
-    traceback is a note.
+    It closes the runner. ``step`` counts sim steps within the tick, or, in an error returned by :meth:`at`, since the
+    start of the runner. The controller's own error, if there is one, is the ``__cause__``; an error from a worker
+    process has the traceback as a note.
     """
 
     def __init__(self, name: str, error: Exception, step: int) -> None:
@@ -100,7 +100,7 @@ class ClosedError(BatchPIDError, RuntimeError):
 
 
 class CallOrderError(BatchPIDError, RuntimeError):
-    """Calls in an order without meaning, such as ``recv`` without ``send``."""
+    """Calls in an invalid order, such as ``recv`` without ``send``."""
 
 
 class NotCopyableError(BatchPIDError, TypeError):

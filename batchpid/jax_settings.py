@@ -1,8 +1,9 @@
-"""Settings of JAX under which the programs of batchpid run, whatever those of the caller are.
+"""Settings of JAX for the programs of batchpid, independent of the caller's settings.
 
-JAX's debugging settings hold for a thread or a process, and so for the programs that batchpid compiles and calls. These
-take NumPy arrays as arguments, broadcast (joints,) to (envs, joints), and keep the NaN of a failed env in its rows. The
-pure functions, such as :func:`batchpid.step`, run in the caller's own programs: they keep to the caller's settings.
+JAX's debugging settings apply to a thread or a process, and thus to the programs that batchpid compiles and calls, too.
+Some of them forbid operations of these programs: to take NumPy arrays as arguments, to broadcast (joints,) to (envs,
+joints), and to compute with the NaN of a failed env. The pure functions, such as :func:`batchpid.step`, run in the
+caller's own programs, under the caller's settings.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ NEEDED: dict[str, tuple[Any, ...]] = {
     "jax_transfer_guard_device_to_host": ("allow", None),
     "jax_transfer_guard_device_to_device": ("allow", None),
 }
-"""Values that programs of batchpid can run with, by setting; the first is set in place of any other."""
+"""Accepted values of each setting; any other value is replaced by the first of them."""
 
 
 @contextmanager
 def own_settings(dtype: Any = None) -> Iterator[None]:
     """Run a block under the settings that batchpid needs, with ``dtype`` "float64" or "float32" for its arrays.
 
-    Settings that fit are left alone: entering the context of each would cost more than a call of a small program.
+    Settings with an accepted value are not touched: to enter a context for each takes longer than a small program.
     """
     import jax
 

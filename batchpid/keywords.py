@@ -24,7 +24,7 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
 
 
 def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate ``function``, which others pass their ``**options`` to, so that it checks the names of keywords."""
+    """Decorate ``function``, which is called with the ``**options`` of others, to check the names of its keywords."""
     known = tuple(inspect.signature(function).parameters)
 
     @functools.wraps(function)

@@ -26,9 +26,9 @@ Leaves = TypeVar("Leaves", bound=tuple[Any, ...])
 
 
 def frozen(leaves: Leaves) -> Leaves:
-    """Return a named tuple whose NumPy arrays are read-only, so that later writes by the caller do not reach it.
+    """Return a named tuple with read-only NumPy arrays, which later writes by the caller do not change.
 
-    Arrays that can be written to, by this name or another, are copied. Without any, ``leaves`` itself is returned.
+    Writeable arrays and views are copied. If there are none, ``leaves`` itself is returned.
     """
     kept = [_read_only(np.array(leaf)) if _can_be_written(leaf) else leaf for leaf in leaves]
     return leaves if all(map(operator.is_, kept, leaves)) else type(leaves)(*kept)

@@ -1,4 +1,4 @@
-"""Read-only arrays, for what belongs to an object and is handed out without a copy."""
+"""Read-only views of arrays that an object owns and returns without a copy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def read_only(array: T) -> T:
-    """Return a view of a NumPy array that cannot be written to; anything else as it is."""
+    """Return a read-only view of a NumPy array; return any other object unchanged."""
     if not isinstance(array, np.ndarray):
         return array
     view: Any = array.view()

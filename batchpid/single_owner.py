@@ -11,7 +11,7 @@ class SingleOwner:
     """Base of objects that can be neither copied nor pickled: two would close each other's processes and files."""
 
     instead: ClassVar[str] = "make another one"
-    """Advice in place of a copy."""
+    """Alternative to a copy, for the error message."""
 
     def __reduce__(self) -> Any:
         """Refuse; copy.copy, copy.deepcopy and pickle call it.

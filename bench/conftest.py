@@ -1,7 +1,7 @@
-"""Fixtures of the benchmarks: the size of a run, and its last lines, which say what was compared with what.
+"""Fixtures of the benchmarks: the size of a run, and the summary of comparisons at its end.
 
-With ``--benchmark-disable`` (``make test``) every case runs once on the tiny workload ``SMOKE``, the checks of
-``make bench-check`` too, and no ratio has to keep its floor: such a run shows that the benchmarks work.
+With ``--benchmark-disable`` (``make test``) every case, and every check of ``make bench-check``, runs once on the tiny
+workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from pytest_benchmark.stats import Stats
 
 
 class Size(NamedTuple):
-    """Most that a run measures; a benchmark takes the lesser of this and its own."""
+    """Upper bounds on the workload of a run; a benchmark uses the smaller of the bound and its own value."""
 
     envs: float = math.inf
     rows: float = math.inf
-    """Envs of the law alone."""
+    """Number of envs in benchmarks of the law alone."""
     workers: float = math.inf
     ticks: float = math.inf
     rounds: float = math.inf
     seconds: float = math.inf
-    """Of a measurement that repeats a call for so long."""
+    """Duration of a measurement that repeats a call [s]."""
     floors: bool = True
     """Whether ratios have to keep their floors."""
 
@@ -35,7 +35,7 @@ SMOKE = Size(envs=2, rows=2048, workers=0, ticks=20, rounds=1, seconds=0.0, floo
 
 
 class Comparison(NamedTuple):
-    """Speed of ``case`` over that of ``over``, and the least ratio that passes, if any."""
+    """Ratio of the speeds of ``case`` and ``over``, and its floor, if it has one."""
 
     setup: str
     case: str
@@ -59,7 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Choose the checks, too, in a smoke run."""
+    """Select the tests marked ``check``, too, in a smoke run."""
     if is_smoke(config):
         for item in items:
             item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
@@ -73,7 +73,7 @@ def most(pytestconfig: pytest.Config) -> Size:
 
 @pytest.fixture
 def benchmark(benchmark: Any) -> Any:
-    """pytest-benchmark's fixture, whose ``pedantic`` also has the statistics of its only round in a smoke run."""
+    """pytest-benchmark's fixture; in a smoke run, its ``pedantic`` records the time of the only round, too."""
     if benchmark.disabled:
         stats, pedantic = Stats(), benchmark.pedantic
 
@@ -92,7 +92,7 @@ def benchmark(benchmark: Any) -> Any:
 
 @pytest.fixture
 def report(benchmark: Any) -> Callable[[list[float]], None]:
-    """Function that replaces the seconds of the rounds by these, per env step, so that OPS is env-steps per second."""
+    """Function that replaces the times of the rounds by times per env step [s]: OPS becomes env-steps per second."""
 
     def replace(seconds: list[float]) -> None:
         stats = benchmark.stats.stats
@@ -104,7 +104,7 @@ def report(benchmark: Any) -> Callable[[list[float]], None]:
 
 @pytest.fixture
 def compare(pytestconfig: pytest.Config, most: Size) -> Callable[..., None]:
-    """Function that notes a comparison for the last lines, and fails where its ratio is below ``least``."""
+    """Function that records a comparison for the summary, and fails if its ratio is below ``least``."""
 
     def note(setup: str, case: str, over: str, ratio: float, least: float | None = None) -> None:
         assert math.isfinite(ratio)

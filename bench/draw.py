@@ -67,7 +67,7 @@ class Options:
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of new measurements; default: none."""
     docs: Path = DOCS
-    """Folder of the page; the README.md beside it has some of the tables, too."""
+    """Folder of performance.md. The README.md in its parent folder has some of the tables, too."""
 
 
 def main(options: Options) -> None:

@@ -1,4 +1,4 @@
-"""Rate of the Gymnasium env over that of the plain Runner at the same substeps."""
+"""Ratio of the rates of the Gymnasium env and the plain Runner, with the same substeps."""
 
 import time
 
@@ -13,7 +13,7 @@ NUM_ENVS, TICKS = 64, 12
 
 
 def test_env_keeps_nine_tenths_of_the_runners_rate(benchmark, compare, most):
-    """64 pandas, 40 sim steps an action; blocks of both alternate, so that a busy machine slows them alike."""
+    """64 pandas, 40 sim steps per action. Blocks of both alternate, so that a busy machine slows both alike."""
     options = {} if most.workers else {"workers": 0}
     env = ReachVectorEnv(min(NUM_ENVS, most.envs), max_episode_steps=None, **options)
     first, _ = env.reset(seed=0)

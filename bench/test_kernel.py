@@ -48,7 +48,7 @@ def inputs(num_envs):
 
 @pytest.fixture(scope="module", autouse=True)
 def devices(most):
-    """A device of JAX for each core; a smoke run, which other tests share, keeps those that it has."""
+    """One JAX device per core. A smoke run shares its process with other tests and keeps the devices there are."""
     if most.floors:
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
 
@@ -77,7 +77,7 @@ def _triad(a, b, c, s):
 
 @pytest.fixture(scope="module")
 def machine_bandwidth(best):
-    """Function that returns bytes per second of the triad (CPU, all cores) or of a copy (GPU), measured once a size."""
+    """Function that returns bytes per second of the triad (CPU, all cores) or of a copy (GPU), cached by size."""
 
     @cache
     def machine_bandwidth(num_envs):
@@ -220,7 +220,7 @@ SCALARS = {"tutorial": scalar_step(tutorial), "simple-pid": scalar_step(simple)}
 
 @pytest.fixture(scope="module")
 def found():
-    """First effort and least time [s] by number of envs and kernel, of the tests so far."""
+    """First effort and least time [s] of the tests so far, by number of envs and kernel."""
     return {}
 
 

@@ -22,7 +22,7 @@ TICKS, ROUNDS = 50, 3
     ids=", ".join,
 )
 def setup(request, most):
-    """Name of robot and physics, and the results of all cases; of peers, which have no presets, beside "accurate"."""
+    """Name of robot and physics, and the results of all cases. Peers have no presets: they run with "accurate" only."""
     name, physics = request.param
     envs, workers, rounds = min(64, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
@@ -34,7 +34,7 @@ def setup(request, most):
 def test_case(benchmark, report, compare, setup, case):
     benchmark.group, results = setup
     if case not in results:
-        pytest.skip("beside accurate, if installed")
+        pytest.skip("peers run with physics 'accurate' only, if installed")
     result = results[case]
     benchmark.pedantic(lambda: result, rounds=1)
     report([1 / rate for rate in result.rates])

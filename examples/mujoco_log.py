@@ -4,8 +4,8 @@
 
 It needs the package ``mujoco``. Joints have reflected inertia, viscous and Coulomb friction; of the effort that the PID
 law asks for, a share arrives, late. MuJoCo compensates gravity and Coriolis forces, as robots do that are commanded
-without them. The true values are printed, and written beside the log as an actuators file, to compare with those that
-``identify`` finds.
+without them. The true values are printed, and written to an actuators file next to the log, for comparison with the
+result of ``identify``.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, 
 
 
 def as_actuators(robot: Robot, truth: Truth) -> bp.Actuators:
-    """Return the actuators that an identification should find: friction is that beyond the robot's description."""
+    """Return the actuators that an identification should find; their friction adds to that of the robot."""
     return bp.make_actuators(
         robot.dof,
         command_delay=truth.delay,
@@ -164,7 +164,7 @@ def as_actuators(robot: Robot, truth: Truth) -> bp.Actuators:
 
 
 def table(robot: Robot, truth: Truth) -> str:
-    """Return the true values in the form in which ``batchpid identify`` prints its estimates."""
+    """Return the true values in the format of the estimates of ``batchpid identify``."""
     kinds = ("armature", "damping", "friction", "strength", "bias")
     width = max(map(len, robot.joint_names))
     lines = [" ".join([f"{'truth, SI units':{width}}", *(f"{kind:>10}" for kind in kinds)])]

@@ -59,7 +59,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
     - *Info*: "success", "error" (largest |goal - qpos|), "diverged".
 
     A continuous joint has the range [-pi, pi]. Its qpos and goal are observed in that range, its error is the short way
-    round, and increments turn it on past pi where the law does so (control "pid" with ``continuous`` in its params).
+    round, and increments move it past pi if the law can (control "pid" with ``continuous`` in its params).
     Another joint without limits has the range of half a turn, or pi m, on either side of its start.
 
     Parameters
@@ -234,7 +234,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
         try:
             observation = self.runner.recv()
-        except BatchPIDError:  # there is no such step any more; an interrupted call can be repeated
+        except BatchPIDError:  # the step has ended; after an interrupt, in contrast, the call can be repeated
             self._is_stepping = False
             raise
         self._is_stepping = False
@@ -303,7 +303,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         self._success = observed.ok & (self._error <= self.tolerance).all(1)
 
     def _expect_no_step(self, call: str) -> None:
-        """Raise CallOrderError if a step is under way."""
+        """Raise CallOrderError if a step has begun and has not been waited for."""
         if self._is_stepping:
             raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
@@ -315,9 +315,9 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
 
 
 OWN_OPTIONS = tuple(inspect.signature(ReachVectorEnv).parameters)[:-1]
-"""Arguments of :class:`ReachVectorEnv`, apart from those of the runner."""
+"""Arguments of :class:`ReachVectorEnv`, without the options of the runner."""
 RUNNER_OPTIONS = tuple({*inspect.signature(Runner).parameters} - {"robot", "num_envs", "substeps"})
-"""Options of the runner, whose substeps are those of ``rate_hz``."""
+"""Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
 
 
 class ReachEnv(SingleOwner, gymnasium.Env):

@@ -311,8 +311,8 @@ class Runner(SingleOwner):
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
 
         The two are bit-identical to one :meth:`step`, and take its arguments. Other calls in between, and attributes
-        such as :attr:`time`, first wait for the tick to end; those that change the observation are an error. With
-        ``workers=0`` the tick runs in this call.
+        such as :attr:`time`, first wait for the tick to end. Calls that change the observation raise CallOrderError.
+        With ``workers=0`` the tick runs in this call.
 
         Raises
         ------
@@ -391,7 +391,7 @@ class Runner(SingleOwner):
         times = (steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
-        for tick in range(ticks):  # whatever ``progress`` makes of it
+        for tick in range(ticks):  # not over ``shown``, which may yield anything
             next(shown, None)
             if tick == done:
                 done = min(ticks, tick + self._max_ticks())
@@ -727,7 +727,7 @@ class Runner(SingleOwner):
         return ledger.books
 
     def _received(self, call: str) -> _Books:
-        """Settle before a call that changes the observation, which must not come between a send and its recv."""
+        """Settle before a call that changes the observation; raise CallOrderError between a send and its recv."""
         books = self._settle()
         if books.received is not None:
             problem = "the observation of the last tick that was sent has not been received"

@@ -163,12 +163,12 @@ def _not_identified(found: Identification) -> list[str]:
         if {*kinds} == {*PER_JOINT}:
             remedy = "it hardly moves; move it more (batchpid excite)"
         elif "strength" in kinds:
-            remedy = "only ratios to the strength show; record without compensation, or with more load"
+            remedy = "only ratios to the strength are identifiable; record without compensation, or with more load"
         else:
-            remedy = "too small beside its other efforts; move it faster or longer"
+            remedy = "too small compared with its other efforts; move it faster or longer"
         lines.append(f"  {joint}: {', '.join(kinds)}: {remedy}")
     if "delay" in others:
         lines.append("  delay: log every control step, and move faster")
     if "payload" in others:
-        lines.append("  payload: none shows; move the arm against gravity if it carries one")
+        lines.append("  payload: no effect in the logs; move the arm against gravity if it carries one")
     return lines

@@ -31,7 +31,7 @@ NO_GROUND = "No ground: links other than the fixed base reach it at the start po
 
 @dataclass(frozen=True)
 class InspectCommand:
-    """List what is odd about a robot and about gains, its joints in the order of qpos, and the masses of its links."""
+    """List findings about a robot and gains, its joints in the order of qpos, and the masses of its links."""
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
@@ -98,7 +98,7 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
 
 
 def mass_table(robot: Robot, *, light_too: bool) -> str:
-    """Return a table of the links' masses with their sources, but for links that are light, and the total."""
+    """Return a table of the masses of links and their sources, without light links, and the total."""
     from sim.cli.report import table
 
     masses = robot.link_masses

@@ -1,6 +1,6 @@
 """Output files of the commands: default names, and the checks of every one before the run.
 
-A run may take hours, so nothing is left for its end that can be known before. No file is replaced without ``--force``.
+A run may take hours, so every possible check is made before it. No file is replaced without ``--force``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Outputs:
     force
         Whether existing files are replaced.
     inputs
-        Files that the command reads, which are never replaced; None for those that were not given.
+        Files that the command reads, which are never replaced. None entries are ignored.
     """
 
     def __init__(self, *, force: bool, inputs: Iterable[Path | None] = ()) -> None:
@@ -33,9 +33,9 @@ class Outputs:
         self._taken = {os.path.realpath(path): "is a file to read" for path in inputs if path is not None}
 
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
-        """Return ``path`` after a trial whether a file can be written there; None is returned as None.
+        """Return ``path`` after a check that a file can be written there; None is returned as None.
 
-        The folder of ``path`` is made when the file is written, and nothing before.
+        The check leaves nothing behind; the folder of ``path`` is made when the file is written.
 
         Raises
         ------
@@ -49,9 +49,9 @@ class Outputs:
         return path
 
     def history(self, path: Path, *, resume: bool) -> Path:
-        """Return the ``path`` of the state that a search keeps until its end; with ``resume`` the file may exist.
+        """Return the ``path`` of the state of a search or fit after a check; with ``resume`` the file may exist.
 
-        Without it the state of a stopped search is removed if existing files are replaced.
+        Without ``resume``, but with ``--force``, the state of a stopped run is removed.
 
         Raises
         ------
@@ -80,10 +80,10 @@ class Outputs:
 
 
 def stem(path: Path) -> str:
-    """Return the name of a file without its suffix, and that of a recording which is not complete."""
+    """Return the name of a file without its suffix, and without the ".partial" of an incomplete recording."""
     return Path(path.name.removesuffix(".partial")).stem
 
 
 def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
-    """Return the default name of a picture or film next to ``path``, with what is ``shown``: NAME-SHOWN.png."""
+    """Return the default path of a picture or film of ``path``, in the same folder: NAME-SHOWN.png."""
     return path.with_name(f"{stem(path)}-{shown}{suffix}")

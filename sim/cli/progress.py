@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}{postfix}"
-"""Format of a bar whose work mostly ends long before its last step, so that no remaining time can be told."""
+"""Format of a bar without remaining time, for work that usually ends long before the last step."""
 _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 
 

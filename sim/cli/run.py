@@ -86,13 +86,14 @@ def read_variation(
 def read_run(path: Path, robot: str | None, missing_meshes: str, usage: str) -> tuple[Rollout, Robot]:
     """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
 
-    ``usage`` is the command with the robot named, for the message. A recording may come from a stranger, so it does not
-    say which file to open.
+    ``usage`` is a command that names the robot, for the error message. A recording is untrusted input, so no path in it
+    is opened.
 
     Raises
     ------
     InvalidArgumentError
-        The file cannot be read, or no robot is named and the recorded one is not bundled, or another of that name.
+        The file cannot be read; or no robot is named, and the recorded one is not a bundled robot, or differs from the
+        bundled robot of the same name.
     """
     rollout = read_recording(path)
     name, description = rollout.info.robot, rollout.info.urdf

@@ -139,7 +139,7 @@ class TuneCommand:
         print(f"next: {self._next_command(out)}")
 
     def _next_command(self, params: Path) -> str:
-        """Return the command that runs the robot under the gains in the file ``params``, with the options of this."""
+        """Return the command that runs the robot under the gains in the file ``params``, with the same options."""
         words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
         defaults = {each.name: each.default for each in fields(self)}
         for name in ("randomize", "physics", "collisions", "cluster", "actuators", "missing_meshes"):

@@ -1,8 +1,8 @@
-"""Functions of arrays as programs of a native extension, which makes all their operations in one call.
+"""Array functions as programs of a native extension, which executes all their operations in one call.
 
-At a few envs a call of NumPy costs a hundred times what it computes. A function is traced, called once with symbols in
-place of arrays, and the operations on them are the program. Each is rounded as NumPy's, so that results are
-bit-identical.
+With few envs, the overhead of a NumPy call is a hundred times its computation. A function is traced: it is called once
+with symbols in place of arrays, and the recorded operations are the program. Each operation is rounded as in NumPy, so
+that results are bit-identical.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from sim.engine.native.interface import OPERATIONS
 
 
 class Namespace:
-    """Array namespace of symbols; it notes the operations on them in order."""
+    """Array namespace of symbols; it records the operations on them in order."""
 
     inf = np.inf
 
     def __init__(self) -> None:
         self.noted: list[tuple[str, tuple[Symbol, ...], Symbol]] = []
         self.literals: dict[str, tuple[float, Symbol]] = {}
-        """By their digits, which tell -0.0 from 0.0."""
+        """Numbers and their symbols, by ``repr``, which distinguishes -0.0 from 0.0."""
 
     def symbol(self, value: Any) -> Symbol:
-        """Return ``value`` as a symbol: itself, or that of a number."""
+        """Return the symbol of a number; a symbol is returned unchanged."""
         if isinstance(value, Symbol):
             return value
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
     def apply(self, name: str, *values: Any) -> Symbol:
-        """Note an operation; return its result."""
+        """Record an operation; return its result."""
         result = Symbol(self)
         self.noted.append((name, tuple(map(self.symbol, values)), result))
         return result
@@ -66,15 +66,15 @@ class Symbol:
     dtype = np.dtype(np.float64)
 
     def astype(self, _: Any) -> Symbol:
-        """Return it: masks are 1.0 and 0.0."""
+        """Return the same symbol: masks are 1.0 and 0.0."""
         return self
 
     def copy(self) -> Symbol:
-        """Return it: the results of a program are new arrays."""
+        """Return the same symbol: the results of a program are new arrays."""
         return self
 
     def min(self, axis: int, keepdims: bool) -> Symbol:
-        """Return the least number of each row, in all its columns."""
+        """Return the minimum of each row, repeated in all columns."""
         assert (axis, keepdims) == (-1, True)
         return self._namespace.apply("row_minimum", self)
 
@@ -147,11 +147,14 @@ class Trace(NamedTuple):
     """Register of each result."""
     registers: int
     literals: tuple[float, ...]
-    """Numbers, constants after those that were given."""
+    """Literal numbers: further constants, after the given ones."""
 
 
 def trace(function: Callable[..., Any], constants: int, inputs: int) -> Trace:
-    """Return the operations of a function of so many constants and inputs, that returns a list of arrays."""
+    """Return the trace of a function with this number of ``constants`` and ``inputs``, which returns a list of arrays.
+
+    The constants are its first arguments.
+    """
     namespace = Namespace()
     given = [Symbol(namespace) for _ in range(constants + inputs)]
     results = [namespace.symbol(result) for result in function(*given)]
@@ -192,7 +195,7 @@ class ArrayProgram:
         self._outputs = len(trace.results) // np.int32().itemsize
 
     def __call__(self, *arrays: NDArray[Any], masks: int = 0) -> list[NDArray[Any]]:
-        """Return the results for the other inputs, new arrays; the last ``masks`` of them of bool.
+        """Return the results for the other inputs as new arrays; the last ``masks`` of them have dtype bool.
 
         An input is (rows, columns), or (rows, columns, columns) for products of matrices and vectors.
         """

@@ -28,7 +28,7 @@ from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
 
 _building = RLock()
-"""Held by the thread that builds: SAPIEN's settings are those of the process, and builders are shared."""
+"""Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
 
 with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fifths of the start of a worker
     # Its packages suppress a Ctrl-C while they are imported: not amid a run.
@@ -200,8 +200,8 @@ def _in_memory(text: str) -> Iterator[str]:
 def engine_settings(spec: SceneSpec) -> Iterator[None]:
     """Apply ``spec`` to SAPIEN's process-wide settings, and restore the caller's at the end.
 
-    Every setting is overwritten, so that a result does not depend on what the caller's process did before. One thread
-    at a time is within.
+    Every setting is overwritten, so that results do not depend on earlier settings of the process. Only one thread at a
+    time enters the context.
     """
     with _building:
         yield from _engine_settings(spec)

@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 def _one_at_a_time(method: Callable[Concatenate[Dynamics, P], T]) -> Callable[Concatenate[Dynamics, P], T]:
-    """Let one thread at a time into the methods of an object, which set its pose first and then read from it."""
+    """Decorate a method to hold the lock of its object: methods set the pose of the robot and then read from it."""
 
     @wraps(method)
     def locked(self: Dynamics, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -52,7 +52,7 @@ class Dynamics:
     """Dynamics and contacts of one robot alone, at poses qpos (n, dof).
 
     The dynamics are Pinocchio's, on the model that SAPIEN derives, with ``payload`` [kg] at the center of mass of
-    ``link`` if one is given. Friction and damping are left out. It may be used by several threads.
+    ``link`` if one is given. Friction and damping are left out. Several threads may use one object.
     """
 
     def __init__(self, spec: SceneSpec, payload: float = 0.0, link: str | None = None) -> None:

@@ -1,7 +1,7 @@
-"""Self-test of the native extensions, in a process to itself: the results of Python, or an exit status.
+"""Self-test of the native extensions, in a separate process: a result that differs from Python's is a failure.
 
-Calls into SAPIEN, sim steps and programs are compared bit by bit. Pinocchio, with which the dynamics of many robots are
-compared, rounds otherwise.
+Calls into SAPIEN, sim steps and programs are compared bit by bit. The dynamics of many robots are compared with
+Pinocchio, which rounds differently, within a tolerance.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ Float64 = NDArray[np.float64]
 
 
 def main() -> None:
-    """Compare the results of the extensions with those of Python; raise what is found.
+    """Compare the results of the extensions with Python's; raise an error if they differ.
 
-    The process takes the extensions: their fingerprint is in its environment.
+    This process uses the extensions without a test, since their fingerprint is in its environment.
     """
     _compare_programs()
     _compare_calls()
@@ -112,7 +112,7 @@ def _assert_identical(ours: list[Any], theirs: list[Any]) -> None:
 
 
 def _compare_dynamics() -> None:
-    """Compare the dynamics and a step of robots with payloads with Pinocchio's, and with those of each robot alone."""
+    """Compare the dynamics and a step of robots with payloads: with Pinocchio, and with a call for each robot alone."""
     spec = replace(_spec(), ground=False)
 
     def models(payload: float) -> Dynamics:

@@ -52,7 +52,7 @@ class Control:
     drive
         Damping and stiffness of the engine's drives [N m s/rad, N m/rad].
     returned
-        Last effort of a controller of the caller's own (M, dof); None for the other controls.
+        Last effort that the caller's own controller returned (M, dof); None for the other controls.
     """
 
     reads_qpos_each_step = True

@@ -56,7 +56,7 @@ class CustomControl(Control):
 
     def _call(self, *inputs: Float64) -> Any:
         """Return the controller's effort, and keep its state."""
-        own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, and not write to them
+        own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
         state, wanted = self._controller(self._of_controller, *own)
         self._of_controller = unflatten(self._of_controller, _like(self._like, flatten(state, read=np.array)))
         return wanted
@@ -125,7 +125,7 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDA
 
 @contextmanager
 def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
-    """Turn every error of a controller, in sim step ``step`` of a tick, into a ControllerError; None: no controller."""
+    """Convert errors in sim step ``step`` of a tick to ControllerErrors, unless ``controller`` is None."""
     try:
         yield
     except Exception as error:
@@ -141,11 +141,11 @@ def own_controller(options: RunnerOptions) -> Controller:
 
 
 def _begin(options: RunnerOptions, envs: int) -> Any:
-    """Return the state of the caller's own controller of so many envs at their start."""
+    """Return the state of the caller's own controller at the start of ``envs`` envs."""
     start = partial(own_controller(options).init, options.robot, envs)
     if options.backend != "jax":
         return start()
-    with own_settings(options.dtype):  # its arrays are of that type, whatever JAX's default in this process is
+    with own_settings(options.dtype):  # its arrays have this dtype, not JAX's default in this process
         return unflatten(state := start(), flatten(state))
 
 

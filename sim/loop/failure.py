@@ -9,23 +9,23 @@ from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 
 
 class Failure(NamedTuple):
-    """Error of a loop during a request; what it has done by then is undefined, apart from whole ticks.
+    """Error of a loop during a request. Whole ticks before it are valid; the state of the loop after it is undefined.
 
     Of several failures, the first by :func:`order` is reported.
     """
 
     step: int
-    """Sim step since the start of the runner; its tick's first where it is not known."""
+    """Sim step since the start of the runner; the first one of the tick if it is not known."""
     env: int
     """First env of the group that failed."""
     ticks: int
-    """Ticks of the request that ended before."""
+    """Ticks of the request that were completed before the error."""
     error: Exception
 
     def portable(self) -> Failure:
-        """Return the failure with an error that another process can raise: of this project, with its traceback.
+        """Return the failure with an error class of this project, which another process can raise, and the traceback.
 
-        The message of a WorkerError lacks the name of the worker, in front.
+        :meth:`of_worker` puts the name of the worker in front of the message of a WorkerError.
         """
         error, text = self.error, "".join(traceback.format_exception(self.error))
         if isinstance(error, ControllerError):
@@ -35,7 +35,7 @@ class Failure(NamedTuple):
         return self._replace(error=error)
 
     def of_worker(self, name: str) -> Failure:
-        """Return the failure, of a worker of that name, with the name in the message of a WorkerError."""
+        """Return the failure with the name of its worker in front of the message of a WorkerError."""
         is_ours = type(self.error) is WorkerError
         return self._replace(error=WorkerError(f"{name} {self.error}")) if is_ours else self
 
@@ -54,5 +54,5 @@ class RunError(Exception):
 
 
 def failure_of(error: Exception) -> Failure:
-    """Return the failure that an exception of a loop stands for."""
+    """Return the failure in a RunError; for another exception of a loop, a failure at step 0."""
     return error.failure if isinstance(error, RunError) else Failure(0, 0, 0, error)

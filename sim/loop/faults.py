@@ -20,11 +20,12 @@ from sim.options import FaultAction
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
 """Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite.
 
-"effort" is what a controller of the caller's own returned. Snapshots hold the index, so that new causes come last.
+"effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes, so new causes are
+appended at the end.
 """
 
 LONGEST = 10_000
-"""Faults that a log keeps."""
+"""Largest number of faults in a log."""
 
 Bool = NDArray[np.bool_]
 
@@ -60,7 +61,7 @@ class FaultWarning(UserWarning):
 
 
 class FaultLog:
-    """Faults of a runner's envs, the last :data:`LONGEST`. It is not changed: methods return a log that is."""
+    """Last :data:`LONGEST` faults of a runner's envs. Immutable; methods return a modified copy."""
 
     def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
         self.faults: tuple[Fault, ...] = ()

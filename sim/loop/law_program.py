@@ -1,7 +1,7 @@
 """The law of the control "pid" as a native program (:mod:`sim.engine.array_program`).
 
-The law makes some thirty calls of NumPy in a sim step. There is one definition of it all the same:
-:meth:`sim.loop.pid_law.PIDLaw.advance` is traced.
+In a sim step the law makes some thirty calls of NumPy. The program is traced from
+:meth:`sim.loop.pid_law.PIDLaw.advance`, so that there is only one definition of the law.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ class Loop:
         Raises
         ------
         RunError
-            A group failed. The others have run on, so that the first failure does not depend on the grouping.
+            A group failed. The other groups complete the run, so that the first failure does not depend on grouping.
         """
         began = time.perf_counter()
         failures = []
@@ -121,7 +121,7 @@ class Loop:
         return time.perf_counter() - began
 
     def _failure(self, error: Exception, group: EnvGroup, ticks: int, steps: int) -> Failure:
-        """Return the failure of a group after so many whole ticks of a run, and ``steps`` in all."""
+        """Return the failure of a group after ``ticks`` whole ticks of a run; ``steps`` counts from the start."""
         step = steps + 1
         if isinstance(error, ControllerError):
             step = steps + error.step

@@ -38,10 +38,10 @@ def read_hdf5(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the datasets ``names`` of a file, where it has them, and its attributes.
 
-    Without ``names`` those of a log: "time", and the columns of :data:`LOG_QUANTITIES`.
+    Without ``names`` the file is read as a log: "time", and the columns of :data:`LOG_QUANTITIES`.
 
-    Every n-th of the rows before the first one whose "checksum" is not written yet, or in older files its "time"; of a
-    log every n-th of all.
+    Every n-th row is read. A recording ends before the first row whose "checksum" (in older files: "time") is not
+    written yet; a log is read to its end.
 
     Raises
     ------

@@ -70,8 +70,8 @@ class RobotDescription(Urdf):
     ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
     among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
     that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled. ``package_dirs`` are the
-    folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are
+    its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -256,7 +256,7 @@ class RobotDescription(Urdf):
 
     @cached_property
     def link_masses(self) -> Mapping[str, LinkMass]:
-        """Mass of every link of the URDF as it is simulated, by name. Loads SAPIEN at the first use."""
+        """Simulated mass of every link of the URDF, by name. Loads SAPIEN at the first use."""
         return _engine[0].link_masses(self)
 
     @property
@@ -270,10 +270,10 @@ class RobotDescription(Urdf):
         return not self.self_contact.reaches_ground
 
     def about(self) -> dict[str, Any]:
-        """Return what makes up the simulated robot, as plain values: equal for robots of equal content.
+        """Return a description of the simulated robot as plain values, equal for robots of equal content.
 
-        Digests stand for the URDF after all repairs, with the content of its collision meshes, for the .srdf, and for
-        the settings of a bundled robot. The actuators are left out.
+        The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot are given by their
+        digests. The actuators are left out.
         """
         return {
             "robot": self.name,

@@ -58,7 +58,7 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 
 
 def _sentence(same: Sequence[Finding]) -> str:
-    """Return the sentence of findings that differ in joint or link, and detail, alone."""
+    """Return the sentence for findings that differ only in joint or link, and detail."""
     first = same[0]
     names = list(dict.fromkeys(f"{each._name} ({each.detail})" if each.detail else each._name for each in same))
     if len(names) == 1:

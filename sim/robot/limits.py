@@ -31,7 +31,7 @@ class SetpointCheck:
     ) -> None:
         """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits, ``stacklevel`` frames up.
 
-        One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) are to be checked.
+        One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) masks those to check.
         """
         below, above = positions < self._low, positions > self._high
         if not (np.count_nonzero(below) or np.count_nonzero(above)):

@@ -46,18 +46,18 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
 
 
 _in_use: dict[str, str] = {}
-"""Digests of the mesh files that SAPIEN has read in this process; it keeps the first content under a path for good."""
+"""Digests of the mesh files that SAPIEN has read in this process; it never reads the same path again."""
 
 
 def note_meshes(paths: Iterable[str]) -> None:
-    """Note that SAPIEN reads these mesh files."""
+    """Record the digests of mesh files that SAPIEN reads."""
     for path in {*paths} - _in_use.keys():
         with suppress(OSError):  # SAPIEN's error says more
             _in_use[path] = digest(Path(path).read_bytes())
 
 
 def check_unchanged(path: Path) -> None:
-    """Raise RobotError if a mesh file is not as SAPIEN has read it in this process."""
+    """Raise RobotError if a mesh file has changed since SAPIEN read it in this process."""
     if (known := _in_use.get(str(path))) is not None and digest(path.read_bytes()) != known:
         problem = f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that it read first"
         raise RobotError(f"{problem}; start Python again, or save the mesh under another name")

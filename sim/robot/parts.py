@@ -89,7 +89,7 @@ class Link:
 
 
 class LinkMass(NamedTuple):
-    """Mass of a link of the URDF as it is simulated.
+    """Simulated mass of a link of the URDF.
 
     ``mass`` [kg]; ``source``: "inertial", "repaired", "shapes" (the collision shapes, at SAPIEN's density) or "none";
     ``gyration``: largest radius of gyration about the center of mass [m], sqrt(I/m); ``size``: diagonal [m] of the box

@@ -1,17 +1,17 @@
-"""Figures that no robot has: meshes in millimetres, masses in grams, inertia tensors in kg mm^2, ...
+"""Implausible figures of a robot: meshes in millimetres, masses in grams, inertia tensors in kg mm^2, ...
 
-Every figure is compared with the reach of the robot: the length L [m] of its longest chain of joints, which is seldom
-wrong, because the robot would be drawn apart. The limits are far from sound robots. In brackets are the farthest
-figures of the 66 robots of example-robot-data 6.0.0 and of the bundled ones:
+Every figure is compared with the reach of the robot: the length L [m] of its longest chain of joints. The reach itself
+is seldom wrong, because the robot would be drawn in pieces. The limits are far from the figures of sound robots. In
+brackets are the most extreme figures of the 66 robots of example-robot-data 6.0.0 and of the bundled ones:
 
 - the shapes of a link are larger than 20 L (3.2 L), or all are smaller than L/200 (L/5);
-- a link with a mass of its own has less than 0.1 (2.6) or more than 30,000 (1030) kg per cubic metre of its size, the
-  diagonal of its shapes or the distance to the next joint;
-- its radius of gyration exceeds 2 L and 2 of its sizes (0.6);
-- a joint bears as much as 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia.
+- the mass of a link, if given by ``<inertial>``, over its cubed size is below 0.1 (2.6) or above 30,000 (1030) kg/m^3;
+  the size is the diagonal of its shapes, or the distance to the next joint if that is longer;
+- its radius of gyration exceeds twice L and twice its size (0.6);
+- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia.
 
-Links with less than a hundredth of the mass are not judged by it, nor is a fixed base: sensors, frames and stands are
-often given any figures.
+Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the total mass: sensors,
+frames and stands often have arbitrary figures.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ GYRATION = 2.0
 LOAD = 1000.0
 """Bound of the mass at the end of the reach that a joint bears, over the cubic reach [kg/m^3]."""
 SHORT = 0.3
-"""Reach [m] of robots with less, e.g. with all joints at one point."""
+"""Least reach [m] that is assumed, e.g. for robots with all joints at one point."""
 JUDGED = 0.01
-"""Share of the mass that a link must have to be judged by its mass."""
+"""Share of the total mass from which the mass and inertia of a link are checked."""
 
 _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"
 
 
 def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield the sizes, masses, inertias and loads that no robot has."""
+    """Yield a finding for each implausible size, mass, inertia and load."""
     masses, (reach, next_joint, fixed) = robot.link_masses, _distances(robot)
     length = max(reach, SHORT)
     sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
@@ -74,7 +74,7 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
 
 
 def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[Finding]:
-    """Yield the joints that bear more than a robot of this ``length`` [m] can weigh."""
+    """Yield a finding for each joint with a load beyond the weight of any robot of this ``length`` [m]."""
     poses = robot.sample(POSES, seed=0)
     gravity = np.abs(robot.holding_efforts(poses)).max(0)
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)

@@ -135,7 +135,7 @@ def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
         text = f"friction of the URDF is replaced by SAPIEN's default {dissipation.joint_friction:g}"
         yield found("note", "friction", text, "load with dissipation='urdf' to keep it", friction)
     if (mimic := joint.mimic) is not None:
-        text = "mimics another, one degree of freedom with it: own setpoints and gains have no effect"
+        text = "mimics another joint, one degree of freedom with it: its own setpoints and gains have no effect"
         offset = f" {mimic.offset:+g} {joint.unit}" if mimic.offset else ""
         yield found("note", "mimic", text, "command the leader", f"{mimic.multiplier:g} x {mimic.joint!r}{offset}")
     if joint.continuous:
@@ -227,7 +227,7 @@ def _params(robot: RobotDescription, params: bp.PIDParams, control: str) -> Iter
     dead = any_env(None if params.ki is None else np.asarray(params.ki) * (np.asarray(params.kp) == 0))
     for joint, wraps, no_effect in zip(robot.joints, any_env(params.continuous), dead, strict=True):
         if joint.continuous and not wraps and control == "pid":
-            text = "continuous, which params do not say: the error jumps by a turn where qpos wraps"
+            text = "continuous in the URDF, not in params: the error jumps by a turn where qpos wraps"
             remedy = "pass continuous= to make_params, or use robot.params()"
             yield Finding("warning", "continuous", text, remedy, joint.name)
         if wraps and not joint.continuous:

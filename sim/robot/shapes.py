@@ -114,7 +114,7 @@ class _UnreadableMesh(Exception):
         self.name, self.reason, self.remedy = name, reason, remedy
 
     def finding(self, link: str, shown: str) -> Finding:
-        """Return the finding of a ``link`` in whose place ``shown`` is drawn."""
+        """Return the finding for a ``link``; ``shown`` says what is drawn instead."""
         text = f"mesh {self.reason}: {shown}"
         return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=repr(self.name))
 
@@ -130,7 +130,7 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
     problem = "no triangles"
     try:
         loaded: Any = load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh has an error of its own for each fault of a file
+    except Exception as error:  # trimesh raises errors of many types
         loaded, problem = None, f"{type(error).__name__}: {error}"
         if path.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
             reason, remedy = "in COLLADA needs the package pycollada", "pip install 'batchpid[view]'"
@@ -144,7 +144,7 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
 
 
 def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, where: str) -> Any:
-    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None for one without shape.
+    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None if it has no shape.
 
     Raises _UnreadableMesh.
     """

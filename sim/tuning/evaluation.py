@@ -70,7 +70,7 @@ class Evaluation(NamedTuple):
         return [text for _, text in sorted(found, reverse=True)]
 
     def drawback(self, other: Evaluation, joints: NDArray[np.bool_]) -> str | None:
-        """Return the criterion in which these gains are worse than ``other``, with both figures; None if in none.
+        """Return the criterion by which these gains are worse than ``other``, with both figures, or None.
 
         The first of :data:`CRITERIA` in which the two differ decides, over the :meth:`demands` on ``joints`` (dof,).
         """

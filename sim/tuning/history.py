@@ -29,7 +29,7 @@ class HistoryFile:
         Raises
         ------
         InvalidArgumentError
-            The file is damaged, or it is of other settings, which the message names.
+            The file is damaged, or its settings differ; the message names these.
         """
         if self._path is None or not self._path.exists():
             return None
@@ -55,7 +55,7 @@ class HistoryFile:
             write_atomically(self._path, json.dumps(document))
 
     def damaged(self, problem: str) -> InvalidArgumentError:
-        """Return the error of a state that no work of these settings can have."""
+        """Return the error for a state that is impossible under these settings."""
         return self._error(f"is no history of a {self._kind}: {problem}")
 
     def _error(self, problem: str) -> InvalidArgumentError:

@@ -75,7 +75,7 @@ class Tuning(NamedTuple):
     settings: dict[str, Any]
     """Seed, moves, options and versions, for the record."""
     rejected: str | None = None
-    """The criterion by which ``params`` are the designed gains and no candidate's, with both figures, or None."""
+    """Criterion by which the designed gains beat all candidates, with both figures; None if a candidate was best."""
 
 
 def tune(

@@ -223,7 +223,7 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
 
 
 def add_floor(scene: Any, layout: RobotLayout, ground: bool, material: Any) -> None:
-    """Add a floor to a SAPIEN scene: a plane for the ``ground`` of physics, otherwise a grid of lines."""
+    """Add a floor to a SAPIEN scene: a plane if physics has a ``ground``, otherwise a grid of lines."""
     if ground:
         scene.add_ground(layout.floor, render_material=material, render_half_size=[20, 20])
         return

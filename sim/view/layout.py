@@ -49,7 +49,7 @@ class RobotLayout(NamedTuple):
 def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group: int, ground: bool) -> RobotLayout:
     """Return a layout of ``groups`` adjacent blocks of ``per_group`` robots around the origin, roughly square.
 
-    ``ground`` says whether physics has one, which is the floor; otherwise the floor is at the lowest link.
+    The floor is at height 0 if physics has a ``ground``, otherwise at the height of the lowest link.
     """
     # The 95th percentile over seeded poses: a single stretched pose should not push all robots apart.
     distance = np.linalg.norm(kinematics.poses(robot.sample(200, seed=0)).position[..., :2], axis=-1).max(1)

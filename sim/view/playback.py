@@ -84,7 +84,7 @@ class Playback:
 
 
 def had_ground(rollout: Rollout, robot: Robot) -> bool:
-    """Return whether the scenes of ``rollout`` had a ground; an older recording does not say, and counts as default."""
+    """Return whether the scenes of ``rollout`` had a ground; for an older recording, the default of the robot."""
     return robot.has_ground if rollout.info.ground is None else rollout.info.ground
 
 

@@ -34,7 +34,7 @@ _SETPOINT_STYLE = {"batched_colors": _SETPOINT_COLOUR, "opacity": 0.22, **_NO_SH
 class RobotScene:
     """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``.
 
-    The floor is tiled where physics has a ``ground``, otherwise a grid at the lowest link.
+    The floor is tiled if physics has a ``ground``; otherwise it is a grid at the height of the lowest link.
     """
 
     def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:
@@ -42,7 +42,7 @@ class RobotScene:
         self._layout = arrange_robots(self._kinematics, robot, len(groups), per_group, ground)
         count = len(self._layout.positions)
         self.findings: list[Finding] = []
-        """Meshes that cannot be read, whose links are drawn by their collision shapes or not at all."""
+        """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at all."""
         self._robots: list[Any] = []
         self._setpoints: list[Any] = []
         self._links: list[int] = []

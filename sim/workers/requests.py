@@ -30,9 +30,9 @@ class Request(ABC):
     idle_limit = 10.0
     """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
     changes_loop = True
-    """True if a replacement of a lost worker repeats it, and an error in it closes the pool."""
+    """True if the replacement of a lost worker repeats the request, and an error in it closes the pool."""
     counts_ticks = False
-    """True if the ticks before an error count: they are the same for every env."""
+    """True if the ticks that every env completed before an error are kept."""
 
     @property
     def observed_tick(self) -> int | None:

@@ -85,7 +85,7 @@ class Worker(SingleOwner, ABC):
 
     @abstractmethod
     def successor(self) -> Self:
-        """Return a worker, not open yet, to replace this one: started by the same message, pickled once."""
+        """Return a replacement of this worker, which is not open yet and reuses the pickled start message."""
 
     def fileno(self) -> int | None:
         """Return the file descriptor that becomes readable with the result; None: it is there when ``send`` returns."""

@@ -25,7 +25,7 @@ class Sources(NamedTuple):
 
 _GATEWAY_HEADERS = ("buffer.h", "extension.h", "gateway.h", "rigid_body.h", "sim_step.h", "xla_call.h")
 _ROUNDED = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno")
-"""No operations are fused, so that each is rounded as NumPy's."""
+"""Operations are not fused, so that each is rounded as in NumPy."""
 EXTENSIONS = {
     "_gateway": Sources("gateway.cpp", _GATEWAY_HEADERS, ("-std=c++17", "-O2")),
     "_batch_dynamics": Sources(
@@ -58,7 +58,7 @@ OPERATIONS = (
 OPERATION = ("code", "out", "first", "second", "third")
 """int32 numbers of an operation: its code, and registers; as Operation in law_program.cpp."""
 MOST_SUMMED = 128
-"""Numbers up to which a sum is in NumPy's order."""
+"""Largest number of terms for which a sum has NumPy's order."""
 
 
 class Group(ctypes.Structure):
@@ -90,7 +90,7 @@ def tables_digest(name: str) -> str:
 
 
 def sources_digest(name: str, folder: Path = FOLDER) -> str | None:
-    """Return a digest of an extension's C++ files; None if they are not all there, as they are for a build only."""
+    """Return a digest of an extension's C++ files; None if some are missing: only a build needs them."""
     unit, headers, _ = EXTENSIONS[name]
     try:
         return _digest(*((folder / file).read_bytes() for file in (unit, *headers)))

@@ -1,4 +1,4 @@
-"""Native extensions, loaded only if they were built from the tables and sources that are here."""
+"""Native extensions, loaded only if they were built from the present tables and sources."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def extensions() -> dict[str, Any]:
 
 
 def remedy() -> str:
-    """Return what to do about a stale extension."""
+    """Return the remedy for a stale extension, for messages."""
     if (ROOT / "setup.py").is_file() and (FOLDER / EXTENSIONS["_gateway"].unit).is_file():
         return f"run 'python setup.py build_ext --inplace --force' in {ROOT}"
     return "install batchpid again"
 
 
 def _changed(name: str, module: ModuleType) -> str | None:
-    """Return whether an extension was built from other "tables" or "sources"; None if from the present ones."""
+    """Return "tables" or "sources" if these have changed since an extension was built, or None."""
     if getattr(module, "tables", None) != tables_digest(name):
         return "tables"
     sources = sources_digest(name)

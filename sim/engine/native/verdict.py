@@ -48,7 +48,7 @@ class NativeStatus(NamedTuple):
     active: bool
     reason: str = ""
     warning: str = ""
-    """Message for a reason that is a fault of the installation."""
+    """Text of a warning, if the reason is a fault of the installation."""
 
     def __str__(self) -> str:
         return "native calls into SAPIEN" if self.active else f"Python calls into SAPIEN ({self.reason})"
@@ -73,7 +73,7 @@ def status() -> NativeStatus:
 
 @contextlib.contextmanager
 def python_calls() -> Iterator[None]:
-    """Switch the native calls off for packs and processes that this thread makes within."""
+    """Switch the native calls off for packs and processes that this thread makes in the ``with`` block."""
     token = _python_calls.set(True)
     try:
         yield
@@ -82,7 +82,7 @@ def python_calls() -> Iterator[None]:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment that hands the verdict on to a child process."""
+    """Return the environment variables that pass the verdict to a child process."""
     known = status()
     return {_VERIFIED: _fingerprint()} if known.active else {_REFUSED: known.reason}
 
@@ -93,7 +93,7 @@ def take_verdict(environment: dict[str, str]) -> None:
 
 
 def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
-    """Return whether the extensions work here: a verdict kept in ``folder``, or that of the self-test.
+    """Return whether the extensions work here, by a verdict stored in ``folder`` or by the self-test.
 
     ``program`` runs in a child process, with sys.path as JSON in its first argument; it passes by exit status 0.
     """
@@ -144,7 +144,7 @@ def _processor() -> list[str]:
 
 
 def _run(program: str, fingerprint: str) -> str | None:
-    """Run a Python program in a child process that takes the extensions; return what went wrong, None for nothing."""
+    """Run a Python program in a child process that uses the extensions without a test; return the problem, or None."""
     command = [sys.executable, "-P", "-c", program, json.dumps(sys.path)]
     environment = {name: value for name, value in os.environ.items() if name != SWITCH} | {_VERIFIED: fingerprint}
     options: dict[str, Any] = {"env": environment, "stdin": subprocess.DEVNULL, "capture_output": True, "text": True}

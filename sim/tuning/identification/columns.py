@@ -87,7 +87,7 @@ def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
     columns = {}
     for name, array in arrays.items():
         if name.strip() in columns:
-            raise error(str(path), f"has the column {name.strip()!r} twice, but for blanks", "keep one of them")
+            raise error(str(path), f"has the column {name.strip()!r} twice, apart from blanks", "keep one of them")
         if array.ndim > 1 or not len(array):
             problem = f"has {name!r} of shape {array.shape}, which is no column"
             raise error(str(path), problem, "give each dataset one number per row")

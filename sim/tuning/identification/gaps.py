@@ -1,7 +1,7 @@
 """Gaps in the times of a log, and the stretches between them.
 
-Nothing is known about the commands within a gap, so that a simulation cannot bridge it, and would take time and memory
-in proportion to it.
+The commands within a gap are unknown, so a simulation cannot bridge it. It would also take time and memory in
+proportion to the length of the gap.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Float64 = NDArray[np.float64]
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
 GAP, PERIODS = 0.1, 5.0
-"""Least length of a gap, in seconds and in typical periods of the rows; the longer of both counts."""
+"""Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
 DROPOUT = 10.0
-"""Longest gap [s] beside which a stretch that is too short is left out; beyond, its times are wrong."""
+"""Longest gap [s] next to which a short stretch is left out. Next to a longer one its times are probably wrong."""
 
 
 class Stretches(NamedTuple):
@@ -43,8 +43,7 @@ def stretches(source: str, time: Float64, row: Callable[[int], str]) -> Stretche
     Raises
     ------
     InvalidArgumentError
-        The rows do not fill the time that they span: a stretch is too short, and the gap beside it is no dropout, or
-        all stretches are too short.
+        A stretch is too short, and a gap next to it is longer than :data:`DROPOUT`; or all stretches are too short.
     """
     with np.errstate(over="ignore"):
         periods = np.diff(time)
@@ -86,7 +85,7 @@ def divided(log: Log, row: Callable[[int], str]) -> list[Log]:
     parts = []
     for rows in found.rows:
         time, given = log.time[rows], log.command_time
-        # Commands between the gaps, and those that act at the first row and are interpolated to after the last.
+        # Commands of the stretch, with the one that acts at its first row and, for interpolation, one after its last.
         first = min(np.searchsorted(given, time[0] - found.gap / 2), np.searchsorted(given, time[0], "right") - 1)
         stop = max(np.searchsorted(given, time[-1] + found.gap / 2, "right"), np.searchsorted(given, time[-1]) + 1)
         commands = slice(max(int(first), 0), int(stop))

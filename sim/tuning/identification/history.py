@@ -27,7 +27,7 @@ class History:
     Raises
     ------
     InvalidArgumentError
-        The file exists, and is damaged or of other settings.
+        The file exists, and is damaged or has other settings.
     """
 
     def __init__(self, path: Path | str | None, settings: Mapping[str, Any]) -> None:
@@ -35,9 +35,9 @@ class History:
         self._found = self._file.read()
 
     def state(self, unknowns: int, evaluations: int, problems: int) -> State | None:
-        """Return the state in the file, of a fit of so many of each; None if there was no file.
+        """Return the state in the file, or None if there was no file.
 
-        Raises InvalidArgumentError if no such fit can have it.
+        Raises InvalidArgumentError if it does not fit the numbers of ``unknowns``, ``evaluations`` and ``problems``.
         """
         if (found := self._found) is None:
             return None

@@ -13,7 +13,7 @@ CommandKind = Literal["setpoint", "effort"]
 
 
 class LogWarning(UserWarning):
-    """A log holds what the model of the robot does not, or stretches that are too short."""
+    """A log shows an effect that the model of the robot lacks, or has stretches that are too short."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,9 +21,9 @@ class Log:
     """Commands and measured positions of some joints of one robot."""
 
     source: str
-    """File that it is from, and the env of a recording."""
+    """Name of its file, and the env of a recording."""
     joints: tuple[int, ...]
-    """Numbers of the joints that it holds, in the robot's order; followers are left out."""
+    """Numbers of its joints, in the robot's order; followers are left out."""
     kind: CommandKind
     time: Float64
     """Times of the measurements (rows,) [s], increasing."""
@@ -44,7 +44,7 @@ class Log:
         return float(self.time[-1] - self.time[0])
 
     def commands_at(self, time: Float64) -> Float64:
-        """Return the commands that act at ``time`` (n,), as (n, joints); before the first one that is the first."""
+        """Return the commands that act at ``time`` (n,), as (n, joints); the first one also acts before its time."""
         if self.held:
             index = np.searchsorted(self.command_time, time + 1e-9, side="right") - 1
             return self.command[np.clip(index, 0, len(self.command) - 1)]

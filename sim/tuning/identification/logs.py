@@ -141,7 +141,7 @@ def _build(
         if colon and quantity in by:
             choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
             if joint in by[quantity]:
-                raise error(source, f"has the column '{quantity}:{joint}' twice, but for blanks", "keep one of them")
+                raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
             by[quantity][joint] = values
     if not by["qpos"]:
         raise error(

@@ -57,7 +57,7 @@ class Identification(NamedTuple):
     """Errors along each stretch of the logs that was simulated."""
 
     def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
-        """Return estimate, lower and upper end of the 95 % interval, None for what the logs do not identify.
+        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
 
         ``kind`` is "armature", "damping", "friction", "strength" or "bias" of a ``joint``, by its number among
         :attr:`joints`; or "delay", "stopping" or "payload", without joint.
@@ -98,7 +98,7 @@ class Identification(NamedTuple):
         return of_joints, others
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with where they are from and what was not identified."""
+        """Write :meth:`actuators` to a .yaml or .json file, with the names of the logs and of unidentified values."""
         of_joints, others = self.missing()
         logged = {self.robot.joint_names[number] for number in self.joints}
         own = zip(self.robot.joint_names, self.robot.independent, strict=True)

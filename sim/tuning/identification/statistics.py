@@ -96,7 +96,7 @@ def _autocovariances(problem: Problem, point: Solution, lags: int) -> Float64:
     weights = _sizes_of_rows(problem, point)
     parts = [e.white[w.fitted] / s for e, w, s in zip(point.windows, problem.windows, weights, strict=True)]
     parts = [part for part in parts if len(part)]
-    lags = max(2, min(lags, max(map(len, parts)) // 2))  # a short stretch must not shorten the memory
+    lags = max(2, min(lags, max(map(len, parts)) // 2))  # a short stretch must not reduce the lags
     total = np.zeros((lags, parts[0].shape[1]))
     for part in parts:
         length = 2 ** int(np.ceil(np.log2(len(part) + lags)))

@@ -23,7 +23,7 @@ SETTLE = 0.3
 START, RESTS = 0.03, 0.05
 """Length of the part of a log that gives its initial state [s]; initial speed by prior, over its root mean square."""
 MOVES = 4.0
-"""Initial speed, over its standard deviation and that by prior, beyond which the robot does not rest at first."""
+"""Initial speed from which a joint counts as moving, over the combined standard deviations of estimate and prior."""
 HELD_OUT = 0.25
 """Share of each log, at its end, that is kept to judge."""
 
@@ -69,16 +69,16 @@ class Subject(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, joints: tuple[int, ...], drive: Drive) -> Subject:
-        """Return them with their digest."""
+        """Return the subject with its digest."""
         return cls(robot, joints, drive, digest(robot.about(), joints, drive))
 
 
 _kept = local()
-"""Last plant of each thread: a worker process has the tasks of one subject after the other."""
+"""Last plant of each thread. A worker process gets many tasks of one subject in a row."""
 
 
 def plant_of(subject: Subject) -> Plant:
-    """Return the plant of ``subject``, the same object for equal ones in a row."""
+    """Return the plant of ``subject``; successive calls with equal subjects return the same object."""
     if getattr(_kept, "key", None) != subject.key:
         _kept.plant, _kept.key = Plant(*subject[:-1]), subject.key
     return _kept.plant
@@ -154,8 +154,8 @@ def _window(
 def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
     """Return position, velocity and its standard deviation (joints,) at the start of a log.
 
-    The filter of ``motion`` is not to be trusted there: a parabola through the first rows is, with the prior that the
-    robot rests. A joint that moves too fast for that has no prior, as where a gap in time ended amid a motion.
+    The filter of ``motion`` is unreliable there. A parabola is fitted to the first rows instead, with the prior that
+    the robot rests. A joint that moves too fast for the prior, for example after a gap in time, is fitted without it.
     """
     time = log.time - log.time[0]
     count = max(4, int((time <= START).sum()))
