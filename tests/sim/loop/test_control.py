@@ -51,7 +51,7 @@ def test_efforts_are_applied_within_the_limits(panda):
 
 
 def test_the_limit_holds_for_the_effort_with_compensation_and_feedforward(panda):
-    with Runner(panda, 1, workers=0, params=panda.params(kp=1e5, ki=0.0, kd=0.0), substeps=1) as runner:
+    with Runner(panda, 1, workers=0, params=panda.params(kp=5e4, ki=0.0, kd=0.0), substeps=1) as runner:
         runner.reset(POSE)
         obs = runner.step(POSE + np.r_[np.full(7, 0.3), 0, 0], feedforward=np.full(9, 5.0))
     np.testing.assert_array_equal(obs.effort[0, ARM], panda.effort_limit[ARM])

@@ -27,7 +27,7 @@ def commands(robot, ticks, seed=0):
 
 def params(robot, **options):
     options = {
-        "derivative_filter_time": 2e-3,
+        "derivative_filter_time": 4e-3,
         "anti_windup": "back_calculation",
         "setpoint_weight": 0.7,
     } | options
@@ -92,7 +92,7 @@ def test_checkpoints_are_bit_identical_for_any_number_of_workers(jaco2):
     table = commands(jaco2, 30)
     results = []
     for workers in (0, 1, 2):
-        with Runner(jaco2, N, params=jaco2.params(), workers=workers, checkpoint_steps=100) as runner:
+        with Runner(jaco2, N, params=params(jaco2), workers=workers, checkpoint_steps=100) as runner:
             results.append(runner.rollout(table))
     assert_identical(results[0], results[1])
     assert_identical(results[0], results[2])

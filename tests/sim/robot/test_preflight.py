@@ -207,9 +207,9 @@ def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
 
 @pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
 def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, units):
-    for bundled in (panda, jaco2):
-        for params in (bundled.designed(units), bundled.tuned()):
-            assert not {"ringing", "unstable"} & {finding.code for finding in bundled.check(params=params)}
+    for each in (panda, jaco2):
+        for params in (each.designed(units), each.tuned()):
+            assert not {"ringing", "unstable"} & {finding.code for finding in each.check(params=params)}
 
 
 @pytest.mark.filterwarnings("ignore::sim.FaultWarning", "ignore::sim.StabilityWarning")
