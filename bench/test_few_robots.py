@@ -13,7 +13,7 @@ from sim import Robot
 from sim.benchmark.tutorial import TutorialLoop
 from sim.benchmark.workload import Workload
 
-TICKS, ROUNDS = 50, 5
+TICKS, ROUNDS = 50, 3
 COUNTS = (1, 4, 16)
 
 

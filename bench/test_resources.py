@@ -63,7 +63,7 @@ def test_memory_and_build(benchmark, make_runner, workload, most):
         build(few)
         build(many)
 
-    benchmark.pedantic(build_few_and_many, rounds=min(3, most.rounds), warmup_rounds=1)
+    benchmark.pedantic(build_few_and_many, rounds=min(2, most.rounds), warmup_rounds=1)
     more = many - few
     slope = (median(memory[many]) - median(memory[few])) / more
     each = (median(seconds[many]) - median(seconds[few])) / more
@@ -123,7 +123,7 @@ def test_cost_of_many_envs(benchmark, compare, make_runner, workload, most):
                 runner.reset(workload.start)
             ratios.append(cost(many, 1) / cost(few, 20))
 
-        benchmark.pedantic(step_few_and_many, rounds=min(5, most.rounds), warmup_rounds=1)
+        benchmark.pedantic(step_few_and_many, rounds=min(3, most.rounds), warmup_rounds=1)
         obs = many.observe()
     assert obs.ok.all()
     benchmark.extra_info["cost_2048_over_64"] = round(median(ratios), 3)
@@ -143,5 +143,5 @@ def test_tick(benchmark, make_runner, workload, most):
                 runner.step(workload.target)
                 over.append(time.perf_counter() - began - runner.work_seconds.max())
 
-        benchmark.pedantic(run, rounds=min(5, most.rounds), warmup_rounds=1)
+        benchmark.pedantic(run, rounds=min(3, most.rounds), warmup_rounds=1)
     benchmark.extra_info["us_over_work"] = round(1e6 * median(over), 1)

@@ -13,7 +13,7 @@ from sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_rates
 from sim.benchmark.peers import PEERS
 from sim.benchmark.workload import Workload
 
-TICKS, ROUNDS = 50, 3
+ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 
 
 @pytest.fixture(
@@ -24,7 +24,7 @@ TICKS, ROUNDS = 50, 3
 def setup(request, most):
     """Name of robot and physics, and the results of all cases. Peers have no presets: they run with "accurate" only."""
     name, physics = request.param
-    envs, workers, rounds = min(64, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
+    envs, workers, rounds = min(ENVS, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
     peers = [each for each in PEERS if physics == "accurate" and importlib.util.find_spec(PEERS[each].package)]
     return ", ".join(request.param), measure_rates(workload, peers=peers, names=CASES | XLA_CASES)
