@@ -8,6 +8,7 @@ import pytest
 from law_cases import ENVS, JOINTS
 
 import batchpid as bp
+from batchpid.choices import Everywhere
 
 
 def test_scalars_and_vectors_broadcast():
@@ -53,7 +54,7 @@ def test_replace_changes_the_given_options_alone():
 def test_uniform_strategies_need_no_mask():
     uniform = bp.make_params(2, 1.0, 1.0, effort_limit=1.0, anti_windup="conditional")
     mixed = bp.make_params(2, 1.0, 1.0, effort_limit=1.0, anti_windup=["conditional", "none"])
-    assert uniform.conditional == ()
+    assert isinstance(uniform.conditional, Everywhere)
     assert mixed.conditional.tolist() == [[1, 0]]
 
 
