@@ -99,7 +99,7 @@ class EnvStates:
         InvalidArgumentError
             They are not.
         """
-        table, row = np.zeros((num_envs, dof), np.float32), np.zeros(num_envs, bool)
+        table, double, row = np.zeros((num_envs, dof), np.float32), np.zeros((num_envs, dof)), np.zeros(num_envs, bool)
         expected = EnvStates(
             qpos=table,
             qvel=table,
@@ -109,9 +109,9 @@ class EnvStates:
             isolated=row,
             saturated=table > 0,
             controller=controller,
-            friction={**dict.fromkeys(FrictionState._fields, table), AGE: row.astype(np.int64)} if friction else {},
+            friction={**dict.fromkeys(FrictionState._fields, double), AGE: row.astype(np.int64)} if friction else {},
             actuators=actuators,
-            guard={**dict.fromkeys(GuardState._fields, table), CHANGED: table > 0} if guard else {},
+            guard={**dict.fromkeys(GuardState._fields, double), CHANGED: table > 0} if guard else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
         )
         ours, theirs = flatten(vars(expected)), flatten(vars(self))
@@ -120,7 +120,7 @@ class EnvStates:
                 problem = f"no {name}"
             elif name not in ours:
                 problem = f"an unknown {name}"
-            elif theirs[name].shape != ours[name].shape or theirs[name].dtype.kind != ours[name].dtype.kind:
+            elif theirs[name].shape != ours[name].shape or theirs[name].dtype != ours[name].dtype:
                 kinds = [f"{rows.dtype} {rows.shape}" for rows in (theirs[name], ours[name])]
                 problem = f"{name} of {kinds[0]}, not {kinds[1]}"
             else:

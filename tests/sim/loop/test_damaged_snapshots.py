@@ -200,3 +200,12 @@ def test_encrypted_files_folders_and_pipes_are_refused(good, tmp_path):
             Snapshot.load(tmp_path / name)
     with pytest.raises(InvalidArgumentError, match="cannot be read"):
         Snapshot.load("x" * 5000)
+
+
+def test_a_table_of_another_precision_is_refused(good, tmp_path):
+    with np.load(good) as file:
+        tables = dict(file)
+    for name in (each for each in tables if tables[each].dtype == np.float64 and each.startswith("controller")):
+        np.savez(tmp_path / "edited.npz", **tables | {name: tables[name].astype(np.float32)})
+        with pytest.raises(InvalidArgumentError, match=f"has {name} of float32"):
+            Snapshot.load(tmp_path / "edited.npz")
