@@ -188,7 +188,7 @@ def _stability(
     unstable = report.robot_ratio >= 1
     severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
     effect = "it diverges, alternating from step to step" if unstable else "it may diverge in other poses"
-    text = f"the sampled PID loop is at {report.robot_ratio:.2g} times its stability bound at the start pose: {effect}"
+    text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
     times = f"use at most {0.5 / report.robot_ratio:.1g} times"
     yield Finding(severity, code, text, f"{times} these gains, a derivative_filter_time, or gain_units='inertia'")
     for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):

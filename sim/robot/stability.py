@@ -149,7 +149,7 @@ class StabilityCheck:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = f", env {report.env}" if params.num_envs > 1 else ""
             warnings.warn(
-                f"params: the gains are {report.robot_ratio:.2g} times the stability bound of the sampled PID loop, "
+                f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
                 f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: efforts "
                 f"alternate from step to step, and the joint chatters or diverges; use at most "
                 f"{0.5 / report.robot_ratio:.1g} times these gains, a derivative_filter_time, or robot.designed()",
