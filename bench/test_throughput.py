@@ -22,19 +22,20 @@ ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
     ids=", ".join,
 )
 def setup(request, most):
-    """Name of robot and physics, and the results of all cases. Peers have no presets: they run with "accurate" only."""
+    """Name of robot and physics, and the results of all cases. XLA and the peers run with "accurate" only."""
     name, physics = request.param
     envs, workers, rounds = min(ENVS, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
     peers = [each for each in PEERS if physics == "accurate" and importlib.util.find_spec(PEERS[each].package)]
-    return ", ".join(request.param), measure_rates(workload, peers=peers, names=CASES | XLA_CASES)
+    names = CASES | XLA_CASES if physics == "accurate" else CASES
+    return ", ".join(request.param), measure_rates(workload, peers=peers, names=names)
 
 
 @pytest.mark.parametrize("case", CASES | XLA_CASES | PEERS)
 def test_case(benchmark, report, compare, setup, case):
     benchmark.group, results = setup
     if case not in results:
-        pytest.skip("peers run with physics 'accurate' only, if installed")
+        pytest.skip("XLA and peers run with physics 'accurate' only, if installed")
     result = results[case]
     benchmark.pedantic(lambda: result, rounds=1)
     report([1 / rate for rate in result.rates])

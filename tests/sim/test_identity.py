@@ -10,7 +10,7 @@ from robots import RUBBING, load_bundled
 from sim import FaultWarning, Runner
 from sim.options import default_params
 
-TICKS = 50  # of 20 sim steps: 0.5 s
+TICKS = 25  # of 20 sim steps: 0.25 s
 
 
 def start_poses(robot, num_envs):

@@ -48,7 +48,7 @@ def test_phase_margin_is_that_of_the_frequency_response(p, w, delay):
     )
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(DELAY)
 def test_first_candidates_have_the_phase_margin_and_real_poles(delay):
     for gains in first_gains(delay):
