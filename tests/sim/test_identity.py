@@ -62,6 +62,7 @@ def test_other_controls(control):
     assert_identical(run(ticks=20, workers=2, pack_size=8, control=control), expected)
 
 
+@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
 def test_another_robot():
     assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), reference("jaco2", ticks=20))
 

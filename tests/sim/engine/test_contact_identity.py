@@ -133,6 +133,7 @@ def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
         assert_identical(episodes[2], episodes[0], skip=["time"])
 
 
+@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
 @pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_robots_in_free_motion_share_systems(name, packs):
     robot = load_bundled(name)

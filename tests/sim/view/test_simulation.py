@@ -137,6 +137,7 @@ def test_pid_and_drive_run_in_two_groups_under_the_same_setpoints(jaco2):
     live.close()
 
 
+@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
 def test_a_diverged_robot_stays_finite_until_a_reset(live):
     for joint in range(9):
         live.gains["pid"].set("kd", joint, 5000.0)
