@@ -26,8 +26,7 @@ def main(robot: tyro.conf.Positional[str] = "panda", stiffness: float = 0.0) -> 
             f"effort: {joint.effort_limit:g}  child link: {joint.child_link}  parent link: {joint.parent_link}"
         )
     print("active joints:", ", ".join(loaded.joint_names))
-    params = loaded.params() if loaded.settings else loaded.params(kp=0.0)
-    with Runner(loaded, 1, workers=0, params=params) as runner:
+    with Runner(loaded, 1, workers=0, control="effort") as runner:
         print("qpos:", np.round(runner.observe().qpos[0], 4))
 
 
