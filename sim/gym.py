@@ -3,6 +3,8 @@
 ``import sim.gym`` registers ``batchpid/Reach-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``;
 ``make_vec("sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every step:
 ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
+
+Longer than 300 lines because one class is the whole environment: spaces, episodes, steps and autoreset.
 """
 
 from __future__ import annotations
