@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
+from processes import shared_memory
 from robots import load_bundled
 
 from sim import Ray, Runner
@@ -27,7 +26,7 @@ class Machines:
     def __init__(self):
         from ray.cluster_utils import Cluster
 
-        self._shared = set(os.listdir("/dev/shm"))
+        self._shared = shared_memory()
         head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = []
@@ -60,12 +59,7 @@ class Machines:
 
         ray.shutdown()
         self.cluster.shutdown()
-        assert left_in_memory(self._shared) == set()
-
-
-def left_in_memory(before):
-    """Return the files in shared memory that were not there before; semaphores are of other programs."""
-    return {name for name in set(os.listdir("/dev/shm")) - before if not name.startswith("sem.")}
+        assert shared_memory() <= self._shared
 
 
 def setpoints(ticks, seed=1):

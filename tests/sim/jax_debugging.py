@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
@@ -26,7 +27,9 @@ SETTINGS = {
 @contextlib.contextmanager
 def changed(**values):
     """Change settings of the process, as jax.config.update does, within a block."""
-    before = {name: getattr(jax.config, name) for name in values}
+    # In another thread, where the contexts of this one do not hide the settings of the process.
+    with ThreadPoolExecutor(1) as thread:
+        before = thread.submit(lambda: {name: getattr(jax.config, name) for name in values}).result()
     try:
         for name, value in values.items():
             jax.config.update(name, value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable
 
@@ -24,6 +25,11 @@ def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:
             return True
         time.sleep(0.02)
     return False
+
+
+def shared_memory() -> set[str]:
+    """Return the names of the files in shared memory; semaphores are of libraries in other tests."""
+    return {name for name in os.listdir("/dev/shm") if not name.startswith("sem.")}
 
 
 def _runs(pid: int) -> bool:

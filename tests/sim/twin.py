@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 from identical import assert_identical
-from processes import children, have_ended
+from processes import children, have_ended, shared_memory
 from robots import load_bundled
 
 import sim.runner
@@ -279,9 +279,9 @@ def assert_same_snapshot(ours: Snapshot, theirs: Snapshot) -> None:
 def nothing_left() -> Iterator[None]:
     """Raise AssertionError if the block leaves a process, or more than two file descriptors."""
     me = psutil.Process()
-    others, descriptors, shared = children(), me.num_fds(), set(os.listdir("/dev/shm"))
+    others, descriptors, shared = children(), me.num_fds(), shared_memory()
     yield
     gc.collect()  # an mmap keeps its descriptor until the arrays on it are collected
     assert children() <= others
     assert me.num_fds() <= descriptors + 2
-    assert set(os.listdir("/dev/shm")) <= shared
+    assert shared_memory() <= shared

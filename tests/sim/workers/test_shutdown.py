@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import PATIENCE, have_ended
+from processes import PATIENCE, have_ended, shared_memory
 
 from sim import Runner
 
@@ -53,14 +53,14 @@ ENDS += [pytest.param(*end, marks=pytest.mark.slow) for end in MORE_ENDS]
 
 @pytest.mark.parametrize(("number", "body"), ENDS)
 def test_workers_end_with_a_parent_that_gets_a_signal(number, body):
-    shared = set(os.listdir("/dev/shm"))
+    shared = shared_memory()
     process, pids = start(body)
     with process:
         time.sleep(0.3)
         process.send_signal(number)
         error = process.communicate(timeout=PATIENCE)[1]
     assert have_ended(pids)
-    assert set(os.listdir("/dev/shm")) <= shared
+    assert shared_memory() <= shared
     if number == signal.SIGINT:
         assert error.rstrip().endswith("KeyboardInterrupt")
 

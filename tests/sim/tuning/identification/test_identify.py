@@ -226,7 +226,7 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
 
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
-    time, qpos, command = (table[:400] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    time, qpos, command = (table[:420] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
     options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 6}
     seen = []
