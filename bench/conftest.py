@@ -116,6 +116,7 @@ def compare(pytestconfig: pytest.Config, most: Size) -> Callable[..., None]:
     return note
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     """Print the comparisons."""
     found = config.stash[COMPARISONS]

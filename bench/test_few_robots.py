@@ -48,4 +48,4 @@ def test_few_robots(benchmark, report, compare, most, name, physics, num_envs):
     report([ours for ours, _ in seconds])
     ratio = statistics.median(theirs / ours for ours, theirs in seconds)
     benchmark.extra_info["over_tutorial"] = round(ratio, 3)
-    compare(f"{name}, {physics}, in one process", f"{num_envs} robots", "tutorial", ratio)
+    compare(f"{name}, {physics}, in one process", f"closed loop, {num_envs} envs", "tutorial", ratio)
