@@ -27,7 +27,7 @@ def test_env_keeps_nine_tenths_of_the_runners_rate(benchmark, compare, most):
         ratios.append(plain / with_env)
 
     ticks = min(TICKS, most.ticks)
-    benchmark.pedantic(both, rounds=min(5, most.rounds), warmup_rounds=1)
+    benchmark.pedantic(both, rounds=min(3, most.rounds), warmup_rounds=1)
     obs = env.step(-action)[0]
     assert np.abs(obs[:, :9] - first[:, :9]).max() > 1e-3, "the robots did not move"
     env.close()

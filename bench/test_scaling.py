@@ -8,7 +8,7 @@ import pytest
 from sim import Robot, Runner
 from sim.benchmark.workload import Workload
 
-ROUNDS = 3
+ROUNDS = 2
 
 
 @pytest.fixture

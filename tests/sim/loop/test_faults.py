@@ -182,7 +182,7 @@ def test_by_default_a_command_that_is_not_finite_raises_and_changes_nothing(name
 
 
 def check_random_fault(case):
-    """Make one env of 64 fail at a random tick and joint: the others are bit-identical; return whether it failed."""
+    """Make one env of 64 fail at a random tick and joint: the others must be bit-identical."""
     random = np.random.default_rng(case)
     num_envs, ticks = 64, 4
     env, tick, joint = int(random.integers(num_envs)), int(random.integers(ticks)), int(random.integers(9))
@@ -198,22 +198,20 @@ def check_random_fault(case):
         with make(num_envs, **options) as runner:
             broken = runner.rollout(commands["setpoint"], feedforwards=commands["feedforward"])
     assert_others_identical(clean, broken, env)
-    if cause == "state" and not runner.faults:  # some states stay finite
-        return False
     assert [(fault.env, fault.cause) for fault in runner.faults] == [(env, cause)]
     assert broken.ok[:, env].tolist() == [k < tick for k in range(ticks)]
     if cause != "state":
         assert runner.faults[0].joint == PANDA.joint_names[joint]
     assert np.isfinite(broken.qpos).all()
     assert np.isfinite(broken.effort).all()
-    return True
 
 
 @pytest.mark.parametrize("case", range(6))
 def test_the_other_63_of_64_envs_are_bit_identical(case):
-    assert check_random_fault(case)
+    check_random_fault(case)
 
 
 @pytest.mark.slow
 def test_the_other_63_of_64_envs_are_bit_identical_in_many_cases():
-    assert np.mean([check_random_fault(case) for case in range(6, CASES)]) > 0.9
+    for case in range(6, CASES):
+        check_random_fault(case)
