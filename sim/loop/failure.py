@@ -29,7 +29,8 @@ class Failure(NamedTuple):
         """
         error, text = self.error, "".join(traceback.format_exception(self.error))
         if isinstance(error, ControllerError):
-            error.add_note(text)
+            if not hasattr(error, "__notes__"):  # a node of a cluster passes on the failure of its worker
+                error.add_note(text)
         elif not isinstance(error, BatchPIDError):
             error = WorkerError(f"raised:\n{text}")
         return self._replace(error=error)
