@@ -157,6 +157,7 @@ def test_an_extension_that_cannot_be_loaded_is_named(monkeypatch, tmp_path):
 
 
 def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path):
+    monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
     monkeypatch.delitem(sys.modules, "sim.engine.native._law_program", raising=False)
     monkeypatch.setattr(native, "__path__", [str(tmp_path)])
     importlib.invalidate_caches()
