@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import batchpid as bp
+from batchpid.actuators import advance_effort, advance_measurement, discretise
 from sim import Robot
 from sim.benchmark.workload import Workload
-from sim.loop.actuators import JointActuators
+from sim.loop.noise_blocks import NoiseBlocks
+from sim.loop.stage_program import compiled_stages
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {
@@ -72,13 +74,17 @@ def speeds_over_ideal(physics, most, rounds):
 def test_all_effects(benchmark, most):
     qpos, qvel, effort = np.random.default_rng(0).uniform(0.1, 1.0, (3, ENVS, JOINTS))
     steps = int(min(STEPS, most.ticks))
-    actuators = JointActuators(bp.make_actuators(JOINTS, **EFFECTS), qpos, 1 / 2000, 0)
+    actuators = bp.make_actuators(JOINTS, **EFFECTS)
+    start = bp.actuators.init(actuators, qpos, 1 / 2000)
+    k = discretise(actuators, start, 1 / 2000, ENVS)
+    stages, noise = compiled_stages(k, qpos.shape), NoiseBlocks()
 
     def run():
+        state = start
         for _ in range(steps):
-            measured, rate = actuators.measure(qpos, qvel)
-            limits = actuators.limits(measured, rate)
-            delivered = actuators.deliver(effort, qpos, qvel)
+            state, measured, rate = advance_measurement(k, state, qpos, qvel, noise(k, state, qpos), stages)
+            limits = stages.limits(k, measured, rate)
+            state, delivered = advance_effort(k, state, effort, qpos, qvel, stages)
         return measured, delivered, limits
 
     measured, delivered, (_, most) = benchmark.pedantic(run, rounds=100, warmup_rounds=1)

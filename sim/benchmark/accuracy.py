@@ -19,14 +19,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid as bp
+from batchpid.friction import Friction
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.engine.physics import PHYSICS, Physics
 from sim.loop.arrays import Command
-from sim.loop.control import PIDControl
-from sim.loop.friction import JointFriction
+from sim.loop.control_step import Constants, Layout, Measured, Model, Step, StepState, apply_friction, control_step
+from sim.loop.pid_law import PIDLaw
+from sim.loop.step_constants import acting_gains
+from sim.loop.step_state import reset_friction
 from sim.robot.description import Dynamics
 from sim.robot.robot import Robot
 from sim.tuning.moves import Moves, draw_moves, random_moves
@@ -52,7 +56,7 @@ _LINE = 60
 class EquationOfMotion:
     """Robots without contact and joint limits, by steps of the Runge-Kutta method of order 4; arrays are (M, dof).
 
-    It stands in for a :class:`sim.engine.pack.Pack` in the loop.
+    It has the methods of a :class:`sim.engine.pack.Pack` that a control step takes.
     """
 
     def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
@@ -142,18 +146,28 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     else:
         plant = Pack(finer, len(moves.start), system_size=4)
         plant.write_state(range(plant.size), moves.start, np.zeros_like(moves.start))
-    control = PIDControl(spec, robot.tuned(), plant)
-    control.begin(Command(moves.target), steps)
+    params = robot.tuned()
+    law, damping = PIDLaw.of(params), robot.damping if robot.damping.any() else None
+    model = Model(robot.dynamics().mass_matrix, plant.joint_mass_matrix if isinstance(plant, Pack) else None)
+    layout = Layout("pid", law, robot.coupling, model=model)
+    k = bp.discretise(acting_gains(params, robot.coupling), TIMESTEP, len(moves.start))
+    limits = params.effort_min, params.effort_max
+    control = Constants(TIMESTEP, limits, k, damping=damping if law.whole else None)
+    joints = Constants(finer.timestep, limits, friction=plant.friction if isinstance(plant, Pack) else Friction())
+    state, command = StepState(bp.init(params, moves.start)), Command(moves.target)
+    if isinstance(plant, Pack):
+        state = reset_friction(layout, joints, state, plant, np.ones(plant.size, bool))
     table = np.empty((steps, *moves.start.shape))
-    friction = JointFriction(plant) if isinstance(plant, Pack) else None
-    for step in range(steps):
-        passive = plant.passive_force(True, True)
-        effort = control.effort(plant.read_qpos(), passive, step)
+    for index in range(steps):
+        measured = Measured(plant.read_qpos(), plant.read_qvel(), plant.passive_force(True, True))
+        state, outputs = control_step(layout, control, state, command, measured, Step(index, steps))
         for _ in range(refinement):
-            total = effort if friction is None else friction.effort(effort, plant.read_qvel())
-            plant.write_qf(total)
+            measured = measured._replace(qpos=plant.read_qpos(), qvel=plant.read_qvel())
+            friction, age, qf = apply_friction(layout, joints, state, outputs.motor, measured)
+            state = state._replace(friction=friction, age=age)
+            plant.write_qf(qf)
             plant.step()
-        table[step] = plant.read_qpos()
+        table[index] = plant.read_qpos()
     return table
 
 

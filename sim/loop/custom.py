@@ -14,55 +14,68 @@ import batchpid as bp
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.jax_settings import own_settings
 from batchpid.read_only import read_only
-from sim.engine.building import SceneSpec
-from sim.loop.control import Control, Plant
-from sim.options import Controller, RunnerOptions
+from sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 
 
-class CustomControl(Control):
-    """qf = sat(the controller's effort), with the limits of the params; see :class:`sim.options.Controller`."""
+class OwnController:
+    """Caller's own controller (:class:`sim.options.Controller`), checked; its state is a dictionary of arrays by name.
 
-    def __init__(self, options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams, plant: Plant) -> None:
-        self.options, self._controller = options, own_controller(options)
-        super().__init__(scene, params, plant)
-        self._of_controller = self._init()
-        self._like = flatten(self._of_controller)
-        self.returned = np.zeros(self.saturated.shape)
+    All groups of envs share it, so that they share its program of JAX.
+    """
 
-    def _init(self) -> Any:
-        """Return a copy of the controller's state at the start, checked."""
-        state = _begin(self.options, len(self.saturated))
+    def __init__(self, options: RunnerOptions) -> None:
+        assert not isinstance(options.control, str)
+        self._options, self._controller = options, options.control
+        self._structure: Any = None
+        self._like: dict[str, Any] = {}
+
+    def init(self, envs: int) -> dict[str, NDArray[Any]]:
+        """Return a copy of the controller's state at the start of ``envs`` envs, checked.
+
+        Raises
+        ------
+        InvalidArgumentError
+            An array of it does not have the envs as its first axis, or it differs from an earlier state at the start.
+        """
+        state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
         for name, leaf in leaves.items():
-            if leaf.shape[:1] != self.saturated.shape[:1]:
+            if leaf.shape[:1] != (envs,):
                 raise InvalidArgumentError(
                     "control",
-                    f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {len(self.saturated)} envs",
+                    f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {envs} envs",
                     remedy="let every array of the state have the envs as its first axis",
                 )
-        return unflatten(state, leaves)
+        return leaves
 
-    def reset(self, qpos: Float64, mask: NDArray[np.bool_]) -> None:
-        """Reset the state of the envs of ``mask`` (M,), which are at ``qpos``."""
-        self.saturated[mask] = False
+    def reset(self, state: Mapping[str, Any], mask: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+        """Return ``state`` with the envs of ``mask`` (M,) at their start."""
+        rows = {name: np.array(leaf) for name, leaf in state.items()}
         with controller_errors(self._controller):
-            fresh = _like(self._like, flatten(self._init()))
-        leaves = {name: np.array(leaf) for name, leaf in flatten(self._of_controller).items()}
-        for name, leaf in leaves.items():
+            fresh = _like(rows, self.init(len(mask)))
+        for name, leaf in rows.items():
             leaf[mask] = fresh[name][mask]
-        self._of_controller = unflatten(self._of_controller, leaves)
+        return rows
 
-    def _call(self, *inputs: Float64) -> Any:
-        """Return the controller's effort, and keep its state."""
+    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[dict[str, Any], Float64]:
+        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
+
+        Raises
+        ------
+        InvalidArgumentError
+            It returned something unusable.
+        """
         own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
-        state, wanted = self._controller(self._of_controller, *own)
-        self._of_controller = unflatten(self._of_controller, _like(self._like, flatten(state, read=np.array)))
-        return wanted
+        new, wanted = self._controller(unflatten(self._structure, state), *own)
+        leaves = _like(state, flatten(new, read=np.array))
+        effort = np.array(wanted, np.float64)
+        _check_effort(effort, inputs[1])
+        return leaves, effort
 
-    def call(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
-        """Call the controller in a program of JAX; return its state by name, and the effort.
+    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
+        """Call the controller in a program of JAX; otherwise as :meth:`__call__`.
 
         Raises
         ------
@@ -73,7 +86,7 @@ class CustomControl(Control):
 
         qpos = inputs[1]
         try:
-            state, wanted = self._controller(unflatten(self._of_controller, leaves), *inputs)
+            state, wanted = self._controller(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
             effort = jax.numpy.asarray(wanted, qpos.dtype)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
@@ -84,36 +97,6 @@ class CustomControl(Control):
             ) from error
         _check_effort(effort, qpos)
         return new, effort
-
-    def effort(self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None) -> Float64:
-        """Call the controller, and saturate.
-
-        Raises
-        ------
-        ControllerError
-            The controller raised, or returned something unusable.
-        """
-        qvel = self._plant.read_qvel() if qvel is None else qvel
-        passive = np.zeros_like(qpos) if feedforward is None else feedforward
-        setpoint = self._command.setpoint
-        with controller_errors(self._controller, step + 1):
-            total = np.array(self._call(setpoint, qpos, qvel, passive), np.float64)
-            _check_effort(total, qpos)
-        self.returned = total
-        if self._coupling is not None:
-            total = self._coupling.efforts(total)
-        effort = self.saturate(total)
-        if step + 1 == self._substeps:
-            self.saturated = effort != total
-        return effort
-
-    def read(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of the controller's state by name."""
-        return flatten(self._of_controller)
-
-    def write(self, state: dict[str, NDArray[Any]], saturated: NDArray[np.bool_]) -> None:
-        """Set the controller's state, and :attr:`saturated`."""
-        self._of_controller, self.saturated = unflatten(self._of_controller, state), saturated
 
 
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:
@@ -134,15 +117,10 @@ def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
         raise ControllerError(type(controller).__name__, error, step) from error
 
 
-def own_controller(options: RunnerOptions) -> Controller:
-    """Return the caller's own controller."""
-    assert not isinstance(options.control, str)
-    return options.control
-
-
 def _begin(options: RunnerOptions, envs: int) -> Any:
     """Return the state of the caller's own controller at the start of ``envs`` envs."""
-    start = partial(own_controller(options).init, options.robot, envs)
+    assert not isinstance(options.control, str)
+    start = partial(options.control.init, options.robot, envs)
     if options.backend != "jax":
         return start()
     with own_settings(options.dtype):  # its arrays have this dtype, not JAX's default in this process

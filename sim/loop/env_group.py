@@ -1,7 +1,4 @@
-"""Group of envs that advance together, and their closed loop.
-
-Longer than 300 lines because everything that a sim step does, faults included, is read in one place.
-"""
+"""Group of envs that advance together: their state, and what resets, params, actuators and failures do to it."""
 
 from __future__ import annotations
 
@@ -11,96 +8,126 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from sim.engine.dynamics import model_force
+from batchpid.actuators import ActuatorState, advance_measurement
+from batchpid.elementwise import clip
+from batchpid.friction import FrictionState
+from batchpid.guard import GuardState
 from sim.engine.missed_contact import MissedContacts
 from sim.engine.pack import Pack
 from sim.engine.variation import VariedPack
-from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
-from sim.loop.compiled_tick import CompiledTick, compiled_tick
+from sim.loop.backend import obstacle
+from sim.loop.control_step import StepState
+from sim.loop.custom import OwnController
 from sim.loop.faults import FaultContainment, far, finite, near
-from sim.loop.friction import JointFriction
-from sim.loop.guard import SetpointGuard
-from sim.loop.jitted import make_control
-from sim.loop.snapshot import EnvStates
+from sim.loop.numpy_executor import NumPyExecutor, passive_forces, with_model
+from sim.loop.pid_law import PIDLaw
+from sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
+from sim.loop.step_constants import make_constants, make_layout
+from sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
 from sim.loop.variation import acting_actuators, acting_params, variation
+from sim.loop.xla_executor import XLAExecutor
 from sim.options import RunnerOptions
 from sim.randomization.draws import Draws
-from sim.robot.actuators import known_joints
 
 Float64 = NDArray[np.float64]
-
-COUPLING_STEPS = 4
-"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
 
 
 class EnvGroup:
     """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
 
-    ``envs`` are its rows of the loop's arrays, ``params`` those of these envs.
+    ``envs`` are its rows of the loop's arrays, ``params`` those of these envs, ``controller`` is the caller's own or
+    None.
     """
 
-    def __init__(self, pack: Pack, envs: slice, params: bp.PIDParams, options: RunnerOptions) -> None:
-        self.pack, self.envs, self._options = pack, envs, options
-        compensated = options.compensate.split("+")
-        self._gravity, self._coriolis = "gravity" in compensated, "coriolis" in compensated
-        self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
-        self._coupling = options.robot.coupling
+    def __init__(
+        self,
+        pack: Pack,
+        envs: slice,
+        params: bp.PIDParams,
+        options: RunnerOptions,
+        controller: OwnController | None = None,
+    ) -> None:
+        self.pack, self.envs, self._options, self._controller = pack, envs, options, controller
         self.draws: Draws | None = None
         """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
-        self._params = params  # before the randomization
-        self._own_actuators: bp.Actuators | None = None  # likewise
-        self._control = make_control(options, pack.spec, params, pack)
+        self._params = self._acting_params = params  # before and after the randomization
+        self._own_actuators: bp.Actuators | None = None  # before the randomization
+        self._actuators: bp.Actuators | None = None  # after it, with effects on efforts or measurements
+        self._episode = np.zeros(pack.size, np.int64)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
-        self._friction = JointFriction(pack, self._control.drive, known_joints(self._options.robot).coulomb)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
-        self._qpos = pack.read_qpos()
-        self._compensates = self._friction.compensates and "friction" in compensated and options.sets_positions
+        self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._steps = 0
-        self._actuators: JointActuators | None = None  # with effects on efforts or measurements
-        self._guard: SetpointGuard | None = None
-        if isinstance(options.guard, bp.Guard):
-            limits = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
-            self._guard = SetpointGuard(limits, self._coupling, self._qpos, options.timestep)
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
-        self._compiled = self._make_compiled()
+        qpos = pack.read_qpos()
+        self._state = StepState(bp.init(params, qpos) if controller is None else controller.init(pack.size))
+        self._prepare()
+        everyone = np.ones(pack.size, bool)
+        self._state = reset_guard(self._constants, self._state, qpos, everyone)
+        self._state = reset_friction(self._layout, self._constants, self._state, pack, everyone)
+        self._write_drives()
 
-    def _make_compiled(self) -> CompiledTick | None:
-        """Return the sim steps of a tick as one program, where the options ask for it and it can be."""
-        compensated = self._gravity, self._coriolis, self._compensates
-        return compiled_tick(self._options, self.pack, self._control, self._friction, self._actuators, compensated)
+    def _prepare(self) -> None:
+        """Make constants and executor anew, for the present robots, params and actuators."""
+        options, pack, motors = self._options, self.pack, self._state.motors
+        constants = make_constants(options, pack, self._acting_params, self._actuators, motors)
+        layout = make_layout(options, self._acting_params, self._actuators)
+        layout = with_model(options, pack, layout, constants, self._controller)
+        self._layout, self._constants = layout, constants
+        self._executor: NumPyExecutor | XLAExecutor = NumPyExecutor(options, pack, layout, constants)
+        if options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators):
+            self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
+        self._measured = self._executor.measure()
 
-    def _release(self) -> None:
-        """Let the state of control, friction and robots be changed from here."""
-        if self._compiled is not None:
-            self._compiled.release()
+    def _write_drives(self) -> None:
+        """Set the engine's drives, under control "drive"."""
+        if self._options.control == "drive":
+            damping, stiffness = self._constants.drive
+            limit = self._acting_params.effort_max
+            self.pack.write_drive(stiffness, damping, np.full_like(stiffness, np.inf) if limit is None else limit)
+
+    @property
+    def _qpos(self) -> Float64:
+        return self._executor.rows(self._measured.qpos)
+
+    def _take_state(self) -> StepState:
+        """Return the state of the control in arrays of NumPy, to be changed."""
+        self._state = self._executor.numpy_state(self._state)
+        return self._state
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
-        self._release()
-        self._params = params
-        self._control.set_params(acting_params(self._options, params, self.draws))
-        self._friction.drive = self._control.drive
+        state, before, constants = self._take_state(), self._acting_params, self._constants
+        self._params, self._acting_params = params, acting_params(self._options, params, self.draws)
+        self._prepare()
+        if not PIDLaw.of(before).whole:
+            constants = self._constants
+        qpos = self.pack.read_qpos()
+        self._state = with_params(self._layout, constants, state, before, self._acting_params, qpos)
+        self._write_drives()
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight; their state carries on."""
-        self._release()
         if actuators is not None or self._own_actuators is not None:
+            self._take_state()
             self._own_actuators = actuators
             self.pack.write_joints(self._take_actuators())
-            self._friction.update()
-            self._compiled = self._make_compiled()
+            self._prepare()
+            self._state = with_friction(self._layout, self._constants, self._state, self.pack)
 
     def _take_actuators(self) -> bp.Actuators | None:
         """Let efforts and measurements be those of the actuators with the draws applied; return these."""
         actuators = acting_actuators(self._options, self._own_actuators, self.draws)
-        if actuators is None or not (actuators.measures or actuators.delivers):
-            self._actuators, self._control.limits = None, (None, None)
-        elif self._actuators is None:
-            self._actuators = JointActuators(actuators, self._qpos, self._options.timestep, self.pack.first_env)
-        else:
-            self._actuators.set_actuators(actuators, self._qpos)
+        old, motors = self._state.motors, None
+        self._actuators = actuators if actuators is not None and (actuators.measures or actuators.delivers) else None
+        if self._actuators is not None:
+            if old is None:
+                self._episode[:] = 0
+            fresh = init_motors(self._actuators, self.pack, self._qpos, self._episode)
+            motors = fresh if old is None else old.matched_to(fresh)
+        self._state = self._state._replace(motors=motors)
         return actuators
 
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
@@ -108,7 +135,6 @@ class EnvGroup:
 
         An env whose ``qpos`` or ``qvel`` (M, dof) is not finite starts where it did last, and has failed.
         """
-        self._release()
         containment = self._containment
         containment.clear(mask)
         self._vary(mask)
@@ -122,16 +148,29 @@ class EnvGroup:
 
     def run(self, steps: int, substeps: int, command: Command) -> None:
         """Run ``substeps`` sim steps under ``command``, after ``steps`` in the past."""
-        containment = self._containment
+        containment, done = self._containment, 0
         self._steps, containment.failed = steps, containment.suspended.copy()
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
         with np.errstate(all="ignore"):  # overflow and invalid values become faults
-            self._run_substeps(substeps, command)
+            while done < substeps:
+                ran = self._executor.run(self._state, self._measured, command, done, substeps)
+                self._state, outputs, self._measured, before, done, failed = ran
+                rows = self._executor.rows
+                if done == substeps:
+                    self._motor[...] = rows(outputs.motor)
+                    self._saturated = self._mask(outputs.saturated)
+                    self._guarded = self._mask(outputs.guarded)
+                if failed:
+                    self._contain(rows(before), done, outputs.returned)
             if not (near(self._qpos) and finite(self.pack.read_qvel())):
-                self._contain(self._qpos, substeps)
+                self._contain(self._qpos, substeps, None)
+            self._state = self._state._replace(matrix=None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
+
+    def _mask(self, array: Any) -> NDArray[np.bool_]:
+        return np.zeros(self._motor.shape, bool) if array is None else np.array(self._executor.rows(array))
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
@@ -139,8 +178,8 @@ class EnvGroup:
         observation.qpos[...] = self._qpos
         observation.qvel[...] = self.pack.read_qvel(np.float32)
         observation.effort[...] = self._motor
-        observation.saturated[...] = self._control.saturated
-        observation.guarded[...] = False if self._guard is None else self._guard.changed
+        observation.saturated[...] = self._saturated
+        observation.guarded[...] = self._guarded
         observation.ok[...] = ~containment.failed
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
@@ -153,8 +192,8 @@ class EnvGroup:
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
-        pack = self.pack
-        self._release()
+        pack, state = self.pack, self._take_state()
+        friction = {} if state.age is None else {**state.friction._asdict(), AGE: state.age}
         return EnvStates(
             qpos=pack.read_qpos(np.float32),
             qvel=pack.read_qvel(np.float32),
@@ -162,11 +201,11 @@ class EnvGroup:
             root=pack.read_root(),
             content=pack.read_content(),
             isolated=pack.isolated.copy(),
-            saturated=self._control.saturated,
-            controller=self._control.read(),
-            friction=self._friction.read(),
-            actuators={} if self._actuators is None else self._actuators.read(),
-            guard={} if self._guard is None else self._guard.read(),
+            saturated=self._saturated.copy(),
+            controller=state.law.leaves() if isinstance(state.law, bp.PIDState) else dict(state.law),
+            friction=friction,
+            actuators={} if state.motors is None else {**state.motors.leaves(), EPISODE: self._episode.copy()},
+            guard={} if state.guard is None else {**state.guard._asdict(), CHANGED: self._guarded.copy()},
             containment=self._containment.read(),
         )
 
@@ -175,143 +214,62 @@ class EnvGroup:
         self.pack = pack
         if self._own_actuators is not None:
             pack.write_joints(self._take_actuators())
-        if self._actuators is not None:
-            self._actuators.write(states.actuators)
-        self._control = make_control(self._options, pack.spec, self._control.params, pack)
         pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
         pack.write_content(states.content)
         pack.isolate(np.flatnonzero(states.isolated).tolist())
         self._containment.write(states.containment)
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
-        self._control.write(states.controller, states.saturated)
-        self._friction = JointFriction(pack, self._control.drive, known_joints(self._options.robot).coulomb)
-        self._friction.write(states.friction)
-        if self._guard is not None:
-            self._guard.write(states.guard)
-        self._motor[...] = states.effort
-        self._qpos = pack.read_qpos()
+        state = StepState(states.controller if self._controller else bp.PIDState(**states.controller))
+        self._saturated, self._motor[...] = states.saturated, states.effort
+        if states.friction:
+            leaves = (states.friction[name] for name in FrictionState._fields)
+            state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
+        if self._actuators is not None:
+            motors = dict(states.actuators)
+            self._episode = motors.pop(EPISODE).copy()
+            state = state._replace(motors=ActuatorState(**motors))
+        if states.guard:
+            self._guarded = states.guard[CHANGED]
+            state = state._replace(guard=GuardState(*(states.guard[name] for name in GuardState._fields)))
+        self._state = state
+        self._prepare()
+        self._write_drives()
         if self._contacts is not None:
             self._contacts.place(np.ones(pack.size, bool))
-        self._compiled = self._make_compiled()
 
     def _vary(self, mask: NDArray[np.bool_]) -> None:
         """Put the draws of the envs of ``mask`` (M,), which are to be placed, into effect."""
         rows = np.flatnonzero(mask).tolist()
         if self._options.randomization is None or self.draws is None or not rows:
             return
+        self._take_state()
         if isinstance(self.pack, VariedPack):
             self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
         self.pack.write_joints(self._take_actuators(), rows)
         self.set_params(self._params)
 
-    # -- the closed loop ---------------------------------------------------------------------------------------
-
-    def _run_substeps(self, substeps: int, command: Command) -> None:
-        """Run the sim steps of a tick, each of them: compensate, control, write, step, read."""
-        if self._compiled is not None:
-            self._run_compiled(self._compiled, substeps, command)
-            return
-        pack, control, friction = self.pack, self._control, self._friction
-        control.begin(command, substeps)
-        actuators, guard, asked = self._actuators, self._guard, command
-        for step in range(substeps):
-            qvel: Any = None
-            if guard is not None:
-                command = guard.advance(asked)
-                control.begin(command, substeps)
-            if actuators is None:
-                forward = self._feedforward(command, self._qpos)
-                if friction.acts:
-                    qvel = pack.read_qvel()
-                effort = control.effort(self._qpos, forward, step, qvel)
-            else:
-                qvel = pack.read_qvel()
-                effort = self._actuated(actuators, command, step, qvel)
-            if effort is not None and step + 1 == substeps:
-                self._motor[...] = effort
-            if friction.acts:
-                motor = np.zeros_like(self._qpos) if effort is None else effort
-                effort = friction.effort(motor, qvel)
-            if effort is not None:
-                pack.write_qf(effort)
-            pack.step(step % COUPLING_STEPS == 0)
-            qpos = pack.read_qpos()
-            if self._sound(qpos):
-                self._qpos = qpos
-            else:
-                self._contain(qpos, step + 1)
-
-    def _run_compiled(self, compiled: CompiledTick, substeps: int, command: Command) -> None:
-        """Run the sim steps of a tick by the program, and do here what it stops for."""
-        done = 0
-        while done < substeps:
-            done, status = compiled.run(command, done, substeps)
-            self._motor[...] = compiled.read("motor")
-            self._control.saturated = compiled.read("saturated", bool)
-            if not status:
-                continue
-            self.pack.look(compiled.left())
-            qpos = self.pack.read_qpos()
-            if not self._sound(qpos):
-                if self._control.returned is not None:
-                    self._control.returned = self._motor
-                self._qpos = compiled.read("qpos_before")
-                self._contain(qpos, done)
-        self._qpos = self.pack.read_qpos()
-
-    def _actuated(
-        self, actuators: JointActuators, command: Command, step: int, qvel: NDArray[Any]
-    ) -> NDArray[Any] | None:
-        """Return the efforts that real motors deliver under a control that sees what real sensors measure."""
-        seen = actuators.measure(self._qpos, qvel)
-        self._control.limits = actuators.limits(*seen)
-        forward = self._feedforward(command, *(seen if actuators.measures else (self._qpos,)))
-        effort = self._control.effort(seen[0], forward, step, seen[1])
-        return None if effort is None else actuators.deliver(effort, self._qpos, qvel)
-
-    def _feedforward(self, command: Command, qpos: Float64, qvel: Float64 | None = None) -> Float64 | None:
-        """Return the compensation plus the caller's feedforward, those of followers on their leaders; None for zero.
-
-        The passive force is the engine's, or with ``qvel`` that of the model at ``qpos`` and ``qvel``.
-        """
-        forward = command.feedforward
-        if self._gravity:
-            which = self._gravity, self._coriolis
-            pack = self.pack
-            passive = pack.passive_force(*which) if qvel is None else model_force(pack.spec, qpos, qvel, *which)
-            forward = passive if forward is None else passive + forward
-        if forward is not None and self._coupling is not None:
-            forward = self._coupling.efforts(forward)
-        if self._compensates:
-            friction = self._friction.feedforward(command, qpos)
-            forward = friction if forward is None else friction + forward
-        return forward
-
     # -- envs that fail ----------------------------------------------------------------------------------------
 
-    def _sound(self, qpos: Float64) -> bool:
-        """Return whether certainly no robot has failed."""
-        limit = self._speed_limit
-        return near(qpos) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
+    def _contain(self, before: Float64, done: int, returned: Any) -> None:
+        """Suspend or reset the envs that failed ``done`` substeps into a tick, after positions ``before`` (M, dof).
 
-    def _contain(self, qpos: Float64, done: int) -> None:
-        """Suspend or reset the envs that failed, ``done`` substeps into a tick."""
+        ``returned`` is the effort of the caller's own controller, or None.
+        """
         containment, step = self._containment, self._steps + done
-        qvel = self.pack.read_qvel()
+        qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
         bad = far(qpos) | ~np.isfinite(qvel)
         # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed
-        if self._control.returned is not None:
-            wrong = ~np.isfinite(self._control.saturate(self._control.returned)) & failed
+        if returned is not None:
+            wanted = clip(self._executor.rows(returned), *self._constants.limits, np)
+            wrong = ~np.isfinite(wanted) & failed
             wrong = np.where(wrong.any(1, keepdims=True), wrong, source)  # actuators may have delayed it
-            containment.fail(wrong, "effort", step, self._qpos)
-        containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, self._qpos)
-        if self._speed_limit is not None:
-            fast = (np.abs(qvel) > self._speed_limit) & ~failed
-            containment.fail(fast, "speed", step, self._qpos)
-        self._qpos = np.where(bad, self._qpos, qpos)
+            containment.fail(wrong, "effort", step, before)
+        containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
+        if (limit := self._options.speed_limit) is not None:
+            containment.fail((np.abs(qvel) > limit) & ~failed, "speed", step, before)
         self._place_failed()
 
     def _without_faults(self, command: Command) -> Command:
@@ -338,22 +296,31 @@ class EnvGroup:
             self._place(failed, containment.start_qpos, containment.start_qvel)
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
-        self._release()
-        rows = np.flatnonzero(mask)
-        self.pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
-        self.pack.suspend(self._containment.suspended)
-        self._motor[mask] = 0.0
-        self._qpos = self.pack.read_qpos()
+        """Place the envs of ``mask`` (M,), and restart their control."""
+        rows, pack, state = np.flatnonzero(mask), self.pack, self._take_state()
+        pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
+        pack.suspend(self._containment.suspended)
+        self._motor[mask], self._saturated[mask], self._guarded[mask] = 0.0, False, False
+        self._measured = self._executor.measure()
         if self._contacts is not None:
             self._contacts.place(mask)
-        qpos = self._qpos
-        if self._actuators is not None:
-            holding = self.pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
-            if holding is not None and self._coupling is not None:
-                holding = self._coupling.efforts(holding)
-            self._actuators.reset(mask, qpos, (qvel := self.pack.read_qvel()), holding)
-            qpos, _ = self._actuators.measured(qpos, qvel)
-        self._control.reset(qpos, mask)
-        self._friction.reset(mask)
-        if self._guard is not None:
-            self._guard.reset(mask, self._qpos)
+        layout, qpos = self._layout, self._qpos
+        state = reset_guard(self._constants, state, qpos, mask)
+        if self._actuators is not None and state.motors is not None:
+            self._episode[mask] += 1
+            gravity, coriolis = passive_forces(self._options)
+            holding = pack.passive_force(gravity, coriolis) if gravity else None
+            if holding is not None and layout.coupling is not None:
+                holding = layout.coupling.efforts(holding)
+            qvel = pack.read_qvel()
+            fresh = init_motors(self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding)
+            motors = bp.actuators.reset(state.motors, fresh, mask)
+            state = state._replace(motors=motors)
+            model = layout.model
+            noise = model.noise(self._constants.motors, motors, qpos)
+            _, qpos, _ = advance_measurement(self._constants.motors, motors, qpos, qvel, noise, model.stages)
+        if self._controller is None:
+            state = state._replace(law=bp.reset(self._acting_params, state.law, qpos, mask))
+        else:
+            state = state._replace(law=self._controller.reset(state.law, mask))
+        self._state = reset_friction(layout, self._constants, state, pack, mask)

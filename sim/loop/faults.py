@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sim.engine.native.interface import FARTHEST
 from sim.loop.arrays import Arrays
+from sim.loop.control_step import Measured
 from sim.options import FaultAction
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
@@ -171,6 +172,11 @@ def near(qpos: NDArray[np.float64]) -> bool:
 def far(qpos: NDArray[np.float64]) -> Bool:
     """Return which positions are not finite, or beyond :data:`FARTHEST`."""
     return ~(np.abs(qpos) <= FARTHEST)
+
+
+def sound(measured: Measured, speed_limit: Any) -> bool:
+    """Return whether certainly no robot has failed."""
+    return near(measured.qpos) and (speed_limit is None or bool((np.abs(measured.qvel) <= speed_limit).all()))
 
 
 def finite(*arrays: NDArray[Any] | None) -> bool:

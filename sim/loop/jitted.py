@@ -9,18 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid as bp
-from batchpid.coefficients import Coefficients
 from batchpid.jax_settings import own_settings
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.loop.control import CONTROLS, Control, PIDControl
-from sim.loop.custom import CustomControl
+from sim.loop.custom import OwnController
 from sim.loop.pid_law import PIDLaw
-from sim.options import Precision, RunnerOptions
-from sim.robot.actuators import known_joints
+from sim.options import Precision
 
-Float64 = NDArray[np.float64]
 ROWS = 16
 """The first axis of arrays in a program of JAX is a multiple of this, whatever the number of envs in a group.
 
@@ -47,64 +40,21 @@ def put(tree: Any) -> Any:
     return jax.device_put(tree, jax.local_devices(backend="cpu")[0])
 
 
-def make_control(options: RunnerOptions, scene: SceneSpec, params: bp.PIDParams, plant: Pack) -> Control:
-    """Return the control that ``options`` ask for, of the robots ``plant``."""
-    jitted = options.backend == "jax"
-    if not isinstance(options.control, str):
-        kind = JittedCustomControl if jitted else CustomControl
-        control: Control = kind(options, scene, params, plant)
-    else:
-        known = None if options.robot.actuators is None else known_joints(options.robot)
-        of_name = CONTROLS | {"pid": JittedPIDControl} if jitted else CONTROLS
-        control = of_name[options.control](scene, params, plant, known)
-    if isinstance(control, JittedPIDControl):
-        control.options = options
-    return control
+def jitted_law(dtype: Precision, envs: int, law: PIDLaw, *inputs: Any, observed: bool) -> Any:
+    """Return the result of :meth:`PIDLaw.advance`, compiled by JAX, for so many envs."""
+    return _call(_law(law, observed), dtype, envs, *inputs)
 
 
-class JittedPIDControl(PIDControl):
-    """PID control, with the law compiled by JAX."""
-
-    options: RunnerOptions
-
-    def _advance(self, k: Coefficients, *inputs: Any, terms: bool) -> Any:
-        arguments = (k, self._state, *inputs)
-        new, effort, *shown = _call(_law(self.law, terms), self.options.dtype, len(self.saturated), *arguments)
-        return new, effort, *(each.saturated for each in shown)
-
-
-class JittedCustomControl(CustomControl):
-    """Control by the caller's own controller, compiled by JAX."""
-
-    def _call(self, *inputs: Float64) -> Any:
-        call, state = _controller(self.options, self), self.read()
-        new, effort = _call(call, self.options.dtype, len(self.saturated), state, *inputs)
-        self.write(new, self.saturated)
-        return effort
-
-
-def shared_call(options: RunnerOptions, control: CustomControl) -> Callable[..., Any]:
-    """Return :meth:`CustomControl.call` of one of a runner's groups, the same for all of them."""
-    first = _first_control(options)
-    if not first:
-        first.append(control)
-    return first[0].call
+def jitted_controller(dtype: Precision, envs: int, controller: OwnController, *inputs: Any) -> Any:
+    """Return the result of :meth:`OwnController.traced`, compiled by JAX, for so many envs."""
+    return _call(_jitted(controller.traced), dtype, envs, *inputs)
 
 
 @lru_cache(maxsize=8)
-def _first_control(options: RunnerOptions) -> list[CustomControl]:
-    return []
-
-
-@lru_cache(maxsize=8)
-def _law(law: PIDLaw, terms: bool) -> Any:
+def _law(law: PIDLaw, observed: bool) -> Any:
     import jax
 
-    return jax.jit(partial(law.advance, terms=terms))
-
-
-def _controller(options: RunnerOptions, control: CustomControl) -> Any:
-    return _jitted(shared_call(options, control))
+    return jax.jit(partial(law.advance, observed=observed))
 
 
 @lru_cache(maxsize=8)

@@ -21,7 +21,7 @@ from sim.loop.pid_law import PIDLaw
 
 
 @lru_cache(maxsize=256)
-def _trace_law(law: PIDLaw, structures: tuple[tuple[Any, ...], ...], terms: bool) -> tuple[Trace, list[int]]:
+def _trace_law(law: PIDLaw, structures: tuple[tuple[Any, ...], ...], observed: bool) -> tuple[Trace, list[int]]:
     """Return the law's trace, and the leaves of the new state that it returns, before effort and saturation.
 
     ``structures`` are those of coefficients, state and other inputs: ... for an array, and what is none as it is.
@@ -32,11 +32,11 @@ def _trace_law(law: PIDLaw, structures: tuple[tuple[Any, ...], ...], terms: bool
         rest = iter(symbols)
         k, state, inputs = ([next(rest) if one is ... else one for one in leaves] for leaves in structures)
         setpoint, rate, *others = inputs
-        new, effort, *shown = partial(law.advance, terms=terms)(
+        new, effort, saturated = partial(law.advance, observed=observed)(
             Coefficients(*k), bp.PIDState(*state), (setpoint, rate), *others
         )
         returned[:] = [at for at, leaf in enumerate(new) if leaf is not None]
-        return [*(new[at] for at in returned), effort, *(each.saturated for each in shown)]
+        return [*(new[at] for at in returned), effort, *([saturated] if observed else [])]
 
     counts = [leaves.count(...) for leaves in structures]
     return trace(function, counts[0], counts[1] + counts[2]), returned
@@ -57,6 +57,10 @@ class LawProgram:
         """Return whether there is an extension that runs the law with such coefficients."""
         return k.kp.dtype == np.float64 and k.kp.shape[1] <= MOST_SUMMED and native.status().active
 
+    def as_advance(self, law: PIDLaw, k: Coefficients, *inputs: Any, observed: bool = False) -> tuple[Any, ...]:
+        """Return the result of :meth:`PIDLaw.advance` for the law and the coefficients of this program."""
+        return self.advance(*inputs, observed=observed)
+
     def advance(
         self,
         state: bp.PIDState,
@@ -64,26 +68,26 @@ class LawProgram:
         qpos: NDArray[np.float64],
         qvel: NDArray[np.float64] | None,
         *others: NDArray[np.float64] | None,
-        terms: bool = False,
+        observed: bool = False,
     ) -> tuple[Any, ...]:
-        """Return the new state and the effort, and with ``terms`` the mask of their saturation.
+        """Return the new state, the effort, and if it is ``observed`` the mask of its saturation, else None.
 
         Arguments as those of :meth:`sim.loop.pid_law.PIDLaw.advance`.
         """
         inputs = (*command, qpos, qvel if self._law.measures_rate else None, *others)
         leaves = (*state, *inputs)
-        key = (terms, *[leaf is None for leaf in leaves])
+        key = (observed, *[leaf is None for leaf in leaves])
         if key not in self._programs:
             structures = (self._k, _structure(state), _structure(inputs))
-            traced, returned = _trace_law(self._law, structures, terms)
+            traced, returned = _trace_law(self._law, structures, observed)
             count = len(leaves) - sum(key[1:])
             self._programs[key] = ArrayProgram(traced, self._constants, count, self._shape), returned
         program, returned = self._programs[key]
-        outputs = program(*[leaf for leaf in leaves if leaf is not None], masks=terms)
+        outputs = program(*[leaf for leaf in leaves if leaf is not None], masks=observed)
         new: list[Any] = [None] * len(state)
         for at, leaf in zip(returned, outputs, strict=False):
             new[at] = leaf
-        return (bp.PIDState._make(new), *outputs[len(returned) :])
+        return bp.PIDState._make(new), outputs[len(returned)], outputs[-1] if observed else None
 
 
 def _structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:

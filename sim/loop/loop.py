@@ -16,6 +16,7 @@ from batchpid.errors import ControllerError
 from sim.engine.building import SceneSpec
 from sim.engine.pack import Pack
 from sim.loop.arrays import Arrays, Command, Ticks
+from sim.loop.custom import OwnController
 from sim.loop.env_group import EnvGroup
 from sim.loop.failure import Failure, RunError, order
 from sim.loop.snapshot import EnvStates, Snapshot
@@ -66,7 +67,10 @@ class Loop:
         count, pack_size = envs.stop - envs.start, options.scenes_per_system
         size = max(GROUP_SIZE // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
-        self.groups = [EnvGroup(self._build(group), group, params.for_envs(group), options) for group in slices]
+        controller = None if isinstance(options.control, str) else OwnController(options)
+        self.groups = [
+            EnvGroup(self._build(group), group, params.for_envs(group), options, controller) for group in slices
+        ]
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 

@@ -31,9 +31,10 @@ class PIDLaw(NamedTuple):
         whole, inertia = (isinstance(params.gain_units, kind) for kind in (PerMassMatrix, PerInertia))
         return cls(whole, inertia, params.measurement_rate is not None)
 
-    def scaled(self, k: Coefficients, inertia: Any) -> Coefficients:
-        """Return the coefficients at the joints' inertia (envs, dof), where the gains are per unit of it."""
-        return per_inertia(k, inertia) if self.per_inertia else k
+    @property
+    def needs_matrix(self) -> bool:
+        """Whether the law takes the mass matrix, or its diagonal."""
+        return self.whole or self.per_inertia
 
     def advance(
         self,
@@ -47,18 +48,17 @@ class PIDLaw(NamedTuple):
         viscous: Any = None,
         low: Any = None,
         high: Any = None,
-        terms: bool = False,
-    ) -> Any:
-        """Return the new state and the effort, and with ``terms`` these.
+        observed: bool = False,
+    ) -> tuple[bp.PIDState, Any, Any]:
+        """Return the new state, the effort, and if it is ``observed`` the mask of its saturation, else None.
 
         Parameters
         ----------
         command
             Setpoint and its rate, which may be None.
-        k
-            Those of :meth:`scaled`.
         matrix
-            M + dt B (envs, dof, dof), where the whole matrix is used.
+            M + dt B (envs, dof, dof) where the whole matrix is used, its diagonal (envs, dof) where gains are per
+            inertia.
         viscous
             B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B) (v+ - v) =
             dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
@@ -66,6 +66,8 @@ class PIDLaw(NamedTuple):
             Least and largest effort of the motors (envs, dof), which saturation and anti-windup take within those of
             the params; None for no limit.
         """
+        if self.per_inertia:
+            k = per_inertia(k, matrix)
         if low is not None:
             xp = namespace(low, high)
             low, high = (clip(end, k.effort_min, k.effort_max, xp) for end in (low, high))
@@ -75,8 +77,10 @@ class PIDLaw(NamedTuple):
         setpoint, setpoint_rate = command
         rates = (qvel if self.measures_rate else None, setpoint_rate, feedforward)
         if self.whole:
-            return advance_with_mass_matrix(k, state, setpoint, qpos, matrix, *rates, terms=terms)
-        return bp.advance(k, state, setpoint, qpos, *rates, terms=terms)
+            new, effort, *shown = advance_with_mass_matrix(k, state, setpoint, qpos, matrix, *rates, terms=observed)
+        else:
+            new, effort, *shown = bp.advance(k, state, setpoint, qpos, *rates, terms=observed)
+        return new, effort, shown[0].saturated if shown else None
 
 
 def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.actuators import STAGES, discretise
+from batchpid.actuators import STAGES, advance_effort, advance_measurement, discretise
 from sim.engine import native
 from sim.loop import stage_program
-from sim.loop.actuators import JointActuators
 from sim.loop.stage_program import compiled_stages
 
 DT, SHAPE = 1 / 2000, (3, 4)
@@ -54,18 +53,19 @@ def built(names, rng):
 @given(st.sets(st.sampled_from(sorted(EFFECTS))), st.integers(0, 100))
 def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
     rng = np.random.default_rng(seed)
-    start = rng.normal(size=SHAPE)
-    both = [JointActuators(built(names, np.random.default_rng(seed)), start, DT, 0) for _ in range(2)]
-    both[1]._stages = STAGES
+    actuators = built(names, np.random.default_rng(seed))
+    first = bp.actuators.init(actuators, rng.normal(size=SHAPE), DT)
+    k = discretise(actuators, first, DT, SHAPE[0])
+    both = {compiled_stages(k, SHAPE): first, STAGES: first}
     for _ in range(12):
         qpos, qvel, effort = rng.normal(size=SHAPE), 3 * rng.normal(size=SHAPE), 80 * rng.normal(size=SHAPE)
         effort[0, 0] = rng.choice([effort[0, 0], np.nan, np.inf, -0.0])
         found = []
-        for each in both:
-            measured = each.measure(qpos, qvel)
+        for stages, state in both.items():
+            state, *measured = advance_measurement(k, state, qpos, qvel, stages=stages)
             with np.errstate(invalid="ignore"):
-                delivered = each.deliver(effort, qpos, qvel)
-            found.append([*measured, *each.limits(*measured), delivered, *each.read().values()])
+                both[stages], delivered = advance_effort(k, state, effort, qpos, qvel, stages)
+            found.append([*measured, *stages.limits(k, *measured), delivered, *both[stages].leaves().values()])
         for ours, expected in zip(*found, strict=True):
             assert (ours is None) == (expected is None)
             if ours is not None:
@@ -75,8 +75,9 @@ def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
 @needs_extension
 def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
     qpos = np.zeros(SHAPE)
-    many = JointActuators(built(EFFECTS.keys() - {"position_limit"}, np.random.default_rng(0)), qpos, DT, 0)
-    k, state = many._coefficients, many._state
+    many = built(EFFECTS.keys() - {"position_limit"}, np.random.default_rng(0))
+    state = bp.actuators.init(many, qpos, DT)
+    k = discretise(many, state, DT, SHAPE[0])
     for stage, inputs in (("delivered", 4), ("limits", 2), ("play", 3)):
         assert stage_program._program(getattr(STAGES, stage), k, SHAPE, (False,) * inputs) is not None, stage
     stages = compiled_stages(k, SHAPE)
@@ -86,5 +87,6 @@ def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
 
 def test_without_the_extension_stages_are_numpys(monkeypatch):
     monkeypatch.setenv(native.SWITCH, "0")
-    k = JointActuators(bp.make_actuators(SHAPE[1], strength=0.5), np.zeros(SHAPE), DT, 0)._coefficients
+    actuators = bp.make_actuators(SHAPE[1], strength=0.5)
+    k = discretise(actuators, bp.actuators.init(actuators, np.zeros(SHAPE), DT), DT, SHAPE[0])
     assert compiled_stages(k, SHAPE) is STAGES

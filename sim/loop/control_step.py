@@ -1,0 +1,358 @@
+r"""One sim step of the control of many robots: a pure function of arrays, for NumPy and JAX.
+
+In this order, with setpoint r, joint positions q and velocities v, and passive force p::
+
+    guard       r    = guard(r)                       limits of position, rate and acceleration
+    sensors     y    = sensors(q), y' = sensors(v)
+    forward     f    = p + feedforward + friction that is known
+    law         u    = saturated(law(r, r', y, y', f))
+    motors      m    = motors(u)
+    friction    qf   = m - friction(m, v)             applied in the next sim step
+
+Executors call :func:`control_step` at every sim step and differ in the arrays that they call it with:
+:mod:`sim.loop.numpy_executor`, :mod:`sim.loop.xla_executor`. Everything that the control of a robot remembers from one
+step to the next is a :class:`StepState`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import batchpid as bp
+from batchpid import friction as friction_model
+from batchpid import guard as guard_model
+from batchpid.actuators import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
+from batchpid.coefficients import Coefficients
+from batchpid.coupling import Coupling
+from batchpid.elementwise import clip, namespace, wrap
+from batchpid.friction import Friction, FrictionState
+from batchpid.guard import GuardState
+from sim.loop.arrays import Command
+from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, half_way
+
+REFRESH_STEPS = 64
+"""Sim steps of an env for which the friction model keeps the inertia that the joints show."""
+
+
+class StepState(NamedTuple):
+    """State of the control of M envs between sim steps; arrays have the envs as their first axis."""
+
+    law: Any
+    """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
+    friction: FrictionState = FrictionState()
+    age: Any = None
+    """Sim steps since the friction model took its inertia (M,); None without Coulomb friction."""
+    motors: ActuatorState | None = None
+    """Motors and sensors; None for ideal ones."""
+    guard: GuardState | None = None
+    matrix: Any = None
+    """Mass matrix of the law (M, dof, dof), or its diagonal (M, dof). Each tick begins with a new one."""
+
+
+class Measured(NamedTuple):
+    """Reading of the robots before a sim step, arrays (M, dof)."""
+
+    qpos: Any
+    qvel: Any
+    """None where nothing needs it."""
+    passive: Any
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without compensation."""
+
+
+class Step(NamedTuple):
+    """Place of a sim step in its tick."""
+
+    index: Any
+    """Sim steps of the tick before this one."""
+    end: Any
+    """Sim steps of the tick."""
+    observed: bool = True
+    """Whether :attr:`Outputs.saturated` is wanted."""
+
+
+class Outputs(NamedTuple):
+    """Results of a sim step, arrays (M, dof)."""
+
+    qf: Any
+    """Effort to apply to the joints in the next step of the engine [N m or N]."""
+    motor: Any
+    """Effort of the motors."""
+    saturated: Any
+    """Joints whose effort was limited; None where it is not wanted."""
+    guarded: Any = None
+    """Setpoints that the guard changed; None without guard."""
+    returned: Any = None
+    """Effort that the caller's own controller returned; None with another control."""
+    target: Any = None
+    """Position target of the engine's drives [rad or m]; None without drives."""
+    target_rate: Any = None
+
+
+class KnownFriction(NamedTuple):
+    """Friction that the compensation cancels, arrays (dof,)."""
+
+    friction: Any
+    """[N m or N]"""
+    band: Any
+    """Half width in which the compensation is less [rad or m]."""
+    turns: Any
+    """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
+
+
+class Constants(NamedTuple):
+    """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not needed."""
+
+    timestep: Any
+    """[s]"""
+    limits: tuple[Any, Any]
+    """Least and largest effort of the params [N m or N]."""
+    k: Coefficients | None = None
+    """Coefficients of the PID law."""
+    armature: Any = None
+    """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
+    damping: Any = None
+    """Viscous damping B that a law with the mass matrix compensates (dof,) [N m s/rad or N s/m]."""
+    friction: Friction = Friction()
+    drive: tuple[Any, Any] = (0.0, 0.0)
+    """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
+    known: KnownFriction | None = None
+    guard: Any = None
+    """:class:`batchpid.Guard`"""
+    motors: Any = None
+    """:class:`batchpid.actuators.Coefficients` of motors and sensors."""
+    driven: bp.PIDParams | None = None
+    """Params of the integral that moves the targets of drives."""
+
+
+def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
+    """Return ``function()`` if ``due``, a bool or an array, has a True entry; else ``otherwise``."""
+    return function() if np.any(due) else otherwise
+
+
+class Model(NamedTuple):
+    """Functions that an executor gives to the control step, with results that do not depend on the executor."""
+
+    mass_matrix: Any = None
+    """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
+    joint_mass_matrix: Any = None
+    """qpos -> mass matrix that the joints show, with the armature of the motors."""
+    passive_force: Any = None
+    """qpos, qvel -> passive force of the description, where the measured state is not the joints' state."""
+    when: Callable[[Any, Callable[[], Any], Any], Any] = when
+    """:func:`when`, or a conditional of JAX."""
+    law: Callable[..., Any] = PIDLaw.advance
+    """:meth:`sim.loop.pid_law.PIDLaw.advance`, perhaps compiled."""
+    controller: Any = None
+    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort)."""
+    noise: Any = None
+    """coefficients and state of the sensors, qpos -> their noise, where it is drawn in advance."""
+    stages: Stages = STAGES
+
+
+class Layout(NamedTuple):
+    """Everything about a control step that is not in an array; hashable."""
+
+    control: str
+    """"pid", "drive", "effort" or "custom"."""
+    law: PIDLaw | None = None
+    """Of control "pid"."""
+    coupling: Coupling | None = None
+    measures: bool = False
+    """Whether the law sees the joints by sensors."""
+    model: Model = Model()
+
+
+def control_step(
+    layout: Layout, constants: Constants, state: StepState, command: Command, measured: Measured, step: Step
+) -> tuple[StepState, Outputs]:
+    """Advance the control by one sim step; return its state and the efforts to apply. Nothing is written to."""
+    qpos, qvel, passive = measured
+    guard, motors, guarded, seen, seen_rate = state.guard, state.motors, None, qpos, qvel
+    limits: tuple[Any, Any] = (None, None)
+    if guard is not None:
+        guard, command, guarded = _guarded(layout, constants, guard, command)
+    if motors is not None:
+        noise = None if layout.model.noise is None else layout.model.noise(constants.motors, motors, qpos)
+        stages = layout.model.stages
+        motors, seen, seen_rate = advance_measurement(constants.motors, motors, qpos, qvel, noise, stages)
+        limits = stages.limits(constants.motors, seen, seen_rate)
+        if layout.measures and layout.model.passive_force is not None:
+            passive = layout.model.passive_force(seen, seen_rate)
+    forward = _feedforward(layout, constants, command, seen, passive)
+    state, outputs = _CONTROLS[layout.control](
+        layout, constants, state, command, Measured(seen, seen_rate, forward), limits, step
+    )
+    motor = outputs.motor
+    if motors is not None:
+        motors, motor = advance_effort(constants.motors, motors, motor, qpos, qvel, layout.model.stages)
+    friction, age, qf = apply_friction(layout, constants, state, motor, measured)
+    new = state._replace(friction=friction, age=age, motors=motors, guard=guard)
+    return new, outputs._replace(qf=qf, motor=motor, guarded=guarded)
+
+
+def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
+    """Return the mass matrix that the law takes (M, dof, dof): M + known armature + dt B, of leaders alone."""
+    xp, matrix = namespace(qpos), layout.model.mass_matrix(qpos)
+    if constants.armature is not None:
+        matrix = matrix + xp.diag(constants.armature)
+    if constants.damping is not None:
+        matrix = matrix + constants.timestep * xp.diag(constants.damping)
+    return matrix if layout.coupling is None else layout.coupling.mass_matrix(matrix)
+
+
+def joint_mass_matrix(layout: Layout, qpos: Any) -> Any:
+    """Return the mass matrix that the friction model takes (M, dof, dof), of leaders alone."""
+    matrix = layout.model.joint_mass_matrix(qpos)
+    return matrix if layout.coupling is None else layout.coupling.mass_matrix(matrix)
+
+
+def _guarded(layout: Layout, constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
+    """Return the guard's state, ``command`` with guarded setpoints and, where it has rates, theirs, and the changes.
+
+    Followers move with their leaders.
+    """
+    xp = namespace(command.setpoint)
+    state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
+    setpoint, rate = state.setpoint, command.setpoint_rate
+    if rate is not None:
+        rate = xp.where(changed, state.rate, rate)
+    if (coupling := layout.coupling) is not None:
+        setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
+        rate = None if rate is None else coupling.rates(rate)
+    return state, command._replace(setpoint=setpoint, setpoint_rate=rate), changed
+
+
+def _feedforward(layout: Layout, constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
+    """Return the passive force plus the caller's feedforward and known friction, of leaders; None for zero."""
+    forward = _sum(passive, command.feedforward)
+    if forward is not None and layout.coupling is not None:
+        forward = layout.coupling.efforts(forward)
+    if (known := constants.known) is None:
+        return forward
+    error = wrap(command.setpoint - qpos, known.turns, namespace(qpos))
+    return _sum(friction_model.compensation(known.friction, error, command.setpoint_rate, known.band), forward)
+
+
+def _pid(
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Command,
+    seen: Measured,
+    limits: tuple[Any, Any],
+    step: Step,
+) -> tuple[StepState, Outputs]:
+    """qf = sat(PID(setpoint, qpos) + feedforward), with a mass matrix that is kept for MASS_MATRIX_STEPS."""
+    law, matrix, qvel = layout.law, state.matrix, seen.qvel
+    assert law is not None
+
+    def fresh() -> Any:
+        xp = namespace(seen.qpos)
+        steps = xp.minimum(MASS_MATRIX_STEPS, step.end - step.index).astype(seen.qpos.dtype)
+        found = mass_matrix(layout, constants, half_way(seen.qpos, qvel, steps, constants.timestep))
+        return found if law.whole else xp.einsum("ejj->ej", found).copy()
+
+    if law.needs_matrix:
+        matrix = layout.model.when(step.index % MASS_MATRIX_STEPS == 0, fresh, matrix)
+    viscous = None if constants.damping is None else constants.damping * qvel
+    if viscous is not None and layout.coupling is not None:
+        viscous = layout.coupling.efforts(viscous)
+    inputs = ((command.setpoint, command.setpoint_rate), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
+    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
+    return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
+
+
+def _drive(
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Command,
+    seen: Measured,
+    limits: tuple[Any, Any],
+    step: Step,
+) -> tuple[StepState, Outputs]:
+    """PhysX's internal drive with stiffness kp and damping kd; qf = feedforward.
+
+    With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
+    a PID whose P and D the engine integrates implicitly.
+    """
+    target, rate, _ = command
+    xp = namespace(seen.qpos)
+    if constants.driven is not None:
+        rates = {"setpoint_rate": rate, "feedforward": seen.passive}
+        law, target = bp.drive_target(constants.driven, state.law, target, seen.qpos, constants.timestep, **rates)
+        state = state._replace(law=law)
+    effort = xp.zeros_like(seen.qpos) if seen.passive is None else seen.passive
+    return state, Outputs(effort, effort, None, target=target, target_rate=rate)
+
+
+def _effort(
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Command,
+    seen: Measured,
+    limits: tuple[Any, Any],
+    step: Step,
+) -> tuple[StepState, Outputs]:
+    """qf = sat(the caller's effort + feedforward); the setpoint is the effort. That of followers acts on leaders."""
+    total = command.setpoint if layout.coupling is None else layout.coupling.efforts(command.setpoint)
+    return state, _saturated(constants, _sum(total, seen.passive), limits, step)
+
+
+def _custom(
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Command,
+    seen: Measured,
+    limits: tuple[Any, Any],
+    step: Step,
+) -> tuple[StepState, Outputs]:
+    """qf = sat(the effort of the caller's own controller), which is given the feedforward."""
+    passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
+    law, returned = layout.model.controller(state.law, command.setpoint, seen.qpos, seen.qvel, passive)
+    total = returned if layout.coupling is None else layout.coupling.efforts(returned)
+    return state._replace(law=law), _saturated(constants, total, limits, step)._replace(returned=returned)
+
+
+_CONTROLS: dict[str, Callable[..., tuple[StepState, Outputs]]] = {
+    "pid": _pid,
+    "drive": _drive,
+    "effort": _effort,
+    "custom": _custom,
+}
+
+
+def apply_friction(
+    layout: Layout, constants: Constants, state: StepState, motor: Any, measured: Measured
+) -> tuple[FrictionState, Any, Any]:
+    """Return the state of the friction model, its age, and the effort to apply after that of the ``motor`` (M, dof)."""
+    model, friction, age = constants.friction, state.friction, state.age
+    if model.coulomb is not None:
+        xp, due = namespace(age), age == REFRESH_STEPS
+
+        def fresh() -> FrictionState:
+            matrix = joint_mass_matrix(layout, measured.qpos)
+            new = friction_model.refresh(model, friction, matrix, constants.timestep, *constants.drive)
+            return friction_model.reset(friction, new, due)
+
+        friction = layout.model.when(due, fresh, friction)
+        age = xp.where(due, 0, age) + 1
+    friction, qf = friction_model.advance(model, friction, motor, measured.qvel)
+    return friction, age, qf
+
+
+def _saturated(constants: Constants, total: Any, limits: tuple[Any, Any], step: Step) -> Outputs:
+    """Return ``total`` within the limits of motors and params."""
+    xp = namespace(total, *limits)
+    effort = clip(clip(total, *limits, xp), *constants.limits, xp)
+    return Outputs(effort, effort, effort != total if step.observed else None)
+
+
+def _sum(first: Any, second: Any) -> Any:
+    """Return the sum of two arrays, either of which may be None for zero."""
+    return first if second is None else second if first is None else first + second

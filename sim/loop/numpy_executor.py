@@ -1,0 +1,143 @@
+"""Sim steps of a tick in NumPy: control step, efforts, step of the engine, reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.errors import ControllerError
+from sim.engine.dynamics import Dynamics, model_force, scene_dynamics
+from sim.engine.pack import Pack
+from sim.loop.arrays import Command
+from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from sim.loop.custom import OwnController
+from sim.loop.faults import sound
+from sim.loop.jitted import jitted_controller, jitted_law
+from sim.loop.law_program import LawProgram
+from sim.loop.noise_blocks import NoiseBlocks
+from sim.loop.stage_program import compiled_stages
+from sim.loop.step_constants import needs_qvel
+from sim.options import RunnerOptions
+
+Float64 = NDArray[np.float64]
+
+COUPLING_STEPS = 4
+"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
+
+
+class Ran(NamedTuple):
+    """Result of some sim steps of a tick, in the arrays of the executor."""
+
+    state: StepState
+    outputs: Outputs
+    """Of the last step."""
+    measured: Measured
+    """After the last step."""
+    before: Any
+    """qpos before the last step."""
+    done: int
+    """Sim steps of the tick that are done: fewer than wanted where Python has to look."""
+    failed: bool
+    """Whether an env may have failed."""
+
+
+def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
+    """Return whether gravity is compensated, and whether Coriolis and centrifugal forces are."""
+    parts = options.compensate.split("+")
+    return "gravity" in parts, "coriolis" in parts
+
+
+class NumPyExecutor:
+    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` is complete."""
+
+    def __init__(self, options: RunnerOptions, pack: Pack, layout: Layout, constants: Constants) -> None:
+        self._pack, self._layout, self._constants = pack, layout, constants
+        self._gravity, self._coriolis = passive_forces(options)
+        self._speed_limit = options.speed_limit
+        self._controller = None if isinstance(options.control, str) else options.control
+        self._reads_qvel = needs_qvel(layout, constants, options.speed_limit)
+
+    def measure(self) -> Measured:
+        """Return a reading of the robots."""
+        pack = self._pack
+        reads_force = self._gravity and not self._layout.measures
+        return Measured(
+            pack.read_qpos(),
+            pack.read_qvel() if self._reads_qvel else None,
+            pack.passive_force(self._gravity, self._coriolis) if reads_force else None,
+        )
+
+    def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
+        pack, target, rate = self._pack, None, ()
+        for index in range(begin, end):
+            step = Step(index, end, index + 1 == end)
+            try:
+                state, outputs = control_step(self._layout, self._constants, state, command, measured, step)
+            except Exception as error:
+                if self._controller is None:
+                    raise
+                raise ControllerError(type(self._controller).__name__, error, index + 1) from error
+            if outputs.target is not target:  # drives' targets cost a call for each joint
+                known = outputs.target_rate is rate
+                pack.write_drive_target(outputs.target, None if known else _zeros_for_none(outputs))
+                target, rate = outputs.target, outputs.target_rate
+            pack.write_qf(outputs.qf)
+            pack.step(index % COUPLING_STEPS == 0)
+            before, measured = measured.qpos, self.measure()
+            if failed := not sound(measured, self._speed_limit):
+                break
+        return Ran(state, outputs, measured, before, index + 1, failed)
+
+    def rows(self, array: Any) -> NDArray[Any]:
+        """Return an array of the executor as NumPy's."""
+        return array
+
+    def numpy_state(self, state: StepState) -> StepState:
+        """Return a state of the executor in arrays of NumPy."""
+        return state
+
+
+def with_model(
+    options: RunnerOptions, pack: Pack, layout: Layout, constants: Constants, controller: OwnController | None
+) -> Layout:
+    """Return ``layout`` with the functions for arrays of NumPy, natively compiled ones where there are such."""
+    jitted, motors, (gravity, coriolis) = options.backend == "jax", constants.motors, passive_forces(options)
+    model = Model(_mass_matrix(pack), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
+    if layout.law is not None and jitted:
+        model = model._replace(law=partial(jitted_law, options.dtype, pack.size))
+    elif layout.law is not None and constants.k is not None and LawProgram.available(constants.k):
+        model = model._replace(law=LawProgram(layout.law, constants.k).as_advance)
+    if controller is not None:
+        call = partial(jitted_controller, options.dtype, pack.size, controller) if jitted else controller
+        model = model._replace(controller=call)
+    if motors is not None:
+        model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
+    if gravity:
+        force = partial(model_force, pack.spec, gravity=gravity, coriolis=coriolis)
+        model = model._replace(passive_force=force)
+    return layout._replace(model=model)
+
+
+def _zeros_for_none(outputs: Outputs) -> Float64:
+    return np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
+
+
+def _mass_matrix(pack: Pack) -> Callable[[Float64], Float64]:
+    """Return the function of the mass matrix of the description of the robots."""
+
+    @cache
+    def dynamics() -> Dynamics:
+        return scene_dynamics(pack.spec)
+
+    return lambda qpos: dynamics().mass_matrix(qpos)
+
+
+def _joint_mass_matrix(pack: Pack, qpos: Float64) -> Float64:
+    """Return the mass matrix that the joints show, with the armature of the motors."""
+    matrix = pack.joint_mass_matrix(qpos)
+    return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix

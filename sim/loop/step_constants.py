@@ -1,0 +1,99 @@
+"""Layout and constants of the control step of a group of envs, from its options, params, actuators and robots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import batchpid as bp
+from batchpid import actuators as actuator_model
+from batchpid.actuators import ActuatorState
+from batchpid.coupling import Coupling
+from batchpid.elementwise import TURN
+from sim.engine.pack import Pack
+from sim.loop.control_step import Constants, KnownFriction, Layout
+from sim.loop.pid_law import PIDLaw
+from sim.options import RunnerOptions
+from sim.robot.actuators import known_joints
+from sim.robot.dissipation import DISSIPATION
+from sim.robot.mimics import coupling_of
+
+BAND = {"rad": 1e-4, "m": 2e-5}
+"""Half width, by the joint's unit, in which the compensation is less than the friction."""
+
+
+def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actuators | None) -> Layout:
+    """Return the layout of the control step, without the executor's model."""
+    control = options.control if isinstance(options.control, str) else "custom"
+    law = PIDLaw.of(params) if control == "pid" else None
+    return Layout(control, law, coupling_of(options.robot.joints), actuators is not None and actuators.measures)
+
+
+def make_constants(
+    options: RunnerOptions,
+    pack: Pack,
+    params: bp.PIDParams,
+    actuators: bp.Actuators | None = None,
+    motors: ActuatorState | None = None,
+) -> Constants:
+    """Return the constants of the envs of ``pack``.
+
+    ``params`` and ``actuators`` are those that act, with the draws of the randomization; ``motors`` is the state of
+    actuators that change efforts or measurements, None without.
+    """
+    scene, robot, guard = pack.spec, options.robot, None
+    known = None if robot.actuators is None else known_joints(robot)
+    law, damping = PIDLaw.of(params), np.array([joint.damping for joint in scene.joints])
+    damping = damping if known is None else damping + known.viscous
+    acting = acting_gains(params, coupling_of(scene.joints))
+    if isinstance(options.guard, bp.Guard):
+        guard = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
+    constants = Constants(
+        timestep=scene.timestep,
+        limits=(params.effort_min, params.effort_max),
+        friction=pack.friction,
+        known=_known_friction(options, pack),
+        guard=guard,
+        motors=None
+        if actuators is None or motors is None
+        else actuator_model.discretise(actuators, motors, scene.timestep, pack.size),
+    )
+    if options.control == "pid":
+        return constants._replace(
+            k=bp.discretise(acting, scene.timestep, pack.size),
+            armature=None if known is None else known.armature,
+            damping=damping if law.whole and damping.any() else None,
+        )
+    if options.control == "drive":
+        kd = np.zeros_like(acting.kp) if acting.kd is None else acting.kd
+        integrates = params.ki is not None and bool(np.any(params.ki > 0))
+        return constants._replace(drive=(kd, acting.kp), driven=acting if integrates else None)
+    return constants
+
+
+def acting_gains(params: bp.PIDParams, coupling: Coupling | None) -> bp.PIDParams:
+    """Return ``params`` with zero gains for followers, which move with their leaders."""
+    if coupling is None:
+        return params
+    gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
+    return params.replace(**{name: gain * coupling.independent for name, gain in gains.items() if gain is not None})
+
+
+def _known_friction(options: RunnerOptions, pack: Pack) -> KnownFriction | None:
+    """Return the friction to compensate: that of the description and of the robot's own actuators; None for none."""
+    joints = pack.spec.joints
+    modelled = DISSIPATION[pack.spec.dissipation].modelled
+    friction = np.array([joint.friction * modelled for joint in joints]) + known_joints(options.robot).coulomb
+    if not (friction.any() and "friction" in options.compensate.split("+") and options.sets_positions):
+        return None
+    turns = np.array([joint.continuous / TURN for joint in joints])
+    return KnownFriction(friction, np.array([BAND[joint.unit] for joint in joints]), turns if turns.any() else None)
+
+
+def needs_qvel(layout: Layout, constants: Constants, speed_limit: Any) -> bool:
+    """Return whether something takes the joint velocities at each sim step."""
+    law = layout.law
+    takes = law is not None and (law.measures_rate or law.needs_matrix)
+    rubs = any(leaf is not None for leaf in constants.friction)
+    return takes or rubs or constants.motors is not None or layout.control == "custom" or speed_limit is not None

@@ -1,0 +1,82 @@
+"""State of the control step: at the start, after resets, and after changes of params and actuators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid import friction as friction_model
+from batchpid import guard as guard_model
+from batchpid.actuators import ActuatorState
+from batchpid.computed_torque import convert_integral
+from batchpid.friction import FrictionState
+from sim.engine.pack import Pack
+from sim.loop.control_step import (
+    REFRESH_STEPS,
+    Constants,
+    Layout,
+    StepState,
+    joint_mass_matrix,
+    mass_matrix,
+)
+from sim.loop.pid_law import PIDLaw
+
+Bool = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+
+def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: Pack, mask: Bool) -> StepState:
+    """Return ``state`` with the friction model of the envs of ``mask`` (M,) at the present state of the robots."""
+    model = constants.friction
+    if model.coulomb is None:
+        return state._replace(friction=FrictionState(), age=None)
+    velocity, load = pack.read_qvel(), pack.passive_force(True, True)
+    if layout.coupling is not None:
+        load = layout.coupling.efforts(load)
+    matrix = joint_mass_matrix(layout, pack.read_qpos())
+    fresh = friction_model.init(model, velocity, load, matrix, constants.timestep, *constants.drive)
+    age = np.zeros(pack.size, np.int64)
+    if state.age is not None:
+        fresh, age = friction_model.reset(state.friction, fresh, mask), np.where(mask, 0, state.age)
+    return state._replace(friction=fresh, age=age)
+
+
+def with_friction(layout: Layout, constants: Constants, state: StepState, pack: Pack) -> StepState:
+    """Return ``state`` after a change of the friction of ``pack``: the model carries on, with another inertia."""
+    if constants.friction.coulomb is None or state.age is None:
+        return reset_friction(layout, constants, state, pack, np.ones(pack.size, bool))
+    return state._replace(age=np.full_like(state.age, REFRESH_STEPS))
+
+
+def with_params(
+    layout: Layout, constants: Constants, state: StepState, old: bp.PIDParams, new: bp.PIDParams, qpos: Float64
+) -> StepState:
+    """Return ``state`` with the law of the params ``new`` after ``old``, the integral in the unit of the new gains.
+
+    ``constants`` are those of the params with gains per mass matrix, if there are any.
+    """
+    if layout.control == "custom":
+        return state
+    law = state.law
+    if layout.control == "pid" and PIDLaw.of(old).whole != PIDLaw.of(new).whole:
+        law = convert_integral(law, old, new, mass_matrix(layout, constants, qpos))
+    return state._replace(law=law.matched_to(bp.init(new, qpos)), matrix=None)
+
+
+def reset_guard(constants: Constants, state: StepState, qpos: Float64, mask: Bool) -> StepState:
+    """Return ``state`` with the guard of the envs of ``mask`` (M,) at rest at ``qpos``."""
+    if constants.guard is None:
+        return state
+    fresh = guard_model.init(constants.guard, qpos)
+    return state._replace(guard=fresh if state.guard is None else guard_model.reset(state.guard, fresh, mask))
+
+
+def init_motors(
+    actuators: bp.Actuators, pack: Pack, qpos: Float64, episode: NDArray[np.int64], **since: Any
+) -> ActuatorState:
+    """Return the state of actuators that start at ``qpos``: :func:`batchpid.actuators.init`."""
+    envs = np.arange(pack.first_env, pack.first_env + pack.size)
+    return bp.actuators.init(actuators, qpos, pack.spec.timestep, envs=envs, episode=episode, **since)

@@ -1,0 +1,219 @@
+"""Sim steps of a tick as one program of XLA, which reaches the engine by a call of the extension.
+
+The program is a loop over the sim steps, ``lax.while_loop``: :func:`sim.loop.control_step.control_step`, traced, then
+:func:`sim.engine.native.xla.sim_step`. It ends early where Python has to look: a contact may come, or an env has
+failed. All groups of envs have the same number of rows (:mod:`sim.loop.jitted`), so that one program serves them all.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.coefficients import Coefficients
+from batchpid.friction import Friction
+from batchpid.jax_settings import own_settings
+from sim.engine.dynamics import scene_dynamics
+from sim.engine.native import xla
+from sim.engine.native.interface import STATUS
+from sim.engine.pack import Pack
+from sim.engine.sim_step import FAILED, NativeStep
+from sim.loop.arrays import Command
+from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from sim.loop.custom import OwnController, controller_errors
+from sim.loop.jitted import padded, put
+from sim.loop.numpy_executor import Ran, passive_forces
+from sim.loop.step_constants import needs_qvel
+from sim.options import RunnerOptions
+
+_LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
+"""Bits of the status of a sim step after which an env may have failed."""
+
+
+class Bodies(NamedTuple):
+    """Arguments of :func:`sim.engine.native.xla.mass_matrix`; None where nothing needs them."""
+
+    tree: Any = None
+    table: Any = None
+
+
+class Carry(NamedTuple):
+    """State of the loop over sim steps."""
+
+    progress: Any
+    """Sim steps of the tick that are done, and the last status (2,)."""
+    state: StepState
+    measured: Measured
+    outputs: Outputs
+    before: Any
+    """qpos before the last step."""
+
+
+class XLAExecutor:
+    """Executor of the ticks of the robots of ``pack`` by one program.
+
+    Its methods are those of :class:`sim.loop.numpy_executor.NumPyExecutor`.
+    """
+
+    def __init__(
+        self,
+        options: RunnerOptions,
+        pack: Pack,
+        layout: Layout,
+        constants: Constants,
+        controller: OwnController | None,
+    ) -> None:
+        self._pack, self._options, self._layout = pack, options, layout._replace(model=Model())
+        self._gravity, self._coriolis = passive_forces(options)
+        self._controller = controller
+        self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
+        self._reads_qvel = needs_qvel(layout, constants, None)
+        self._native: NativeStep | None = None
+        self._bound: Any = None
+        self._no_matrix: Any = None
+        law = layout.law
+        needs_bodies = (law is not None and law.needs_matrix) or constants.friction.coulomb is not None
+        bodies = scene_dynamics(pack.spec).bodies if needs_bodies else None
+
+        def spread(array: Any) -> Any:
+            return None if array is None else padded(np.broadcast_to(array, (pack.size, pack.dof)))
+
+        k = constants.k and Coefficients(
+            *(leaf if leaf is None or isinstance(leaf, tuple) else spread(leaf) for leaf in constants.k)
+        )
+        limits = (None, None) if law is not None else tuple(map(spread, constants.limits))
+        friction, timestep = Friction(*map(spread, constants.friction)), np.float64(constants.timestep)
+        arrays = constants._replace(timestep=timestep, k=k, limits=limits, friction=friction)
+        rows = (pack.size, pack.dof)
+        with own_settings(options.dtype):
+            self._constants = put(arrays)
+            self._bodies = put(Bodies() if bodies is None else Bodies(bodies.tree, bodies.table()))
+            self._zero = put(padded(np.zeros(rows)))
+
+    def measure(self) -> Measured:
+        """Return a reading of the robots."""
+        pack = self._pack
+        qpos, qvel = pack.read_qpos(), pack.read_qvel()
+        passive = pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
+        with own_settings(self._options.dtype):
+            return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
+
+    def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until Python has to look."""
+        pack = self._pack
+        native = self._bind()
+        with own_settings(self._options.dtype):
+            span = np.array([begin, end, 0, 0], np.int32)
+            span[2:].view(np.uint64)[0] = native.prepare()
+            command = command.map(padded)
+            # A JAX array either way: with another kind the program would be compiled again.
+            extra = self._zero if command.feedforward is None else put(command.feedforward)
+            command = command._replace(feedforward=extra)
+            traced = None if self._controller is None else self._controller.traced
+            with controller_errors(self._controller and self._options.control, begin + 1):
+                program = compiled(self._layout, traced, self._gravity)
+                carry = program(span, self._constants, self._bodies, self._started(state), measured, command)
+            done, status = np.asarray(carry.progress).tolist()
+        if status & FAILED:
+            raise RuntimeError(native.message)
+        measured = carry.measured
+        if status:
+            pack.look(native.left())
+            if self._bound is not pack.calls:
+                measured = self.measure()
+        return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & _LOOK))
+
+    def rows(self, array: Any) -> NDArray[Any]:
+        """Return an array of the executor as NumPy's, a new array."""
+        return np.array(array, bool if array.dtype == bool else np.float64)[: self._pack.size]
+
+    def numpy_state(self, state: StepState) -> StepState:
+        """Return a state of the executor in arrays of NumPy: float64, but for those of the caller's own controller."""
+        import jax
+
+        def rows(leaf: Any, keep: bool = False) -> NDArray[Any]:
+            array = np.array(leaf)[: self._pack.size]
+            return array if keep or array.dtype.kind != "f" else array.astype(np.float64)
+
+        law = jax.tree.map(partial(rows, keep=self._controller is not None), state.law)
+        state = jax.tree.map(rows, state._replace(law=None))._replace(law=law)
+        return state if state.age is None else state._replace(age=state.age.astype(np.int64))
+
+    def _started(self, state: StepState) -> StepState:
+        """Return ``state`` in the arrays of the program."""
+        import jax
+
+        law, pack = self._layout.law, self._pack
+        if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(state)):
+            age = None if state.age is None else state.age.astype(np.int32)
+            state = put(jax.tree.map(padded, state._replace(age=age)))
+        if state.matrix is None and law is not None and law.needs_matrix:
+            if self._no_matrix is None:
+                shape = (pack.size, pack.dof, pack.dof) if law.whole else (pack.size, pack.dof)
+                self._no_matrix = put(padded(np.zeros(shape)))
+            state = state._replace(matrix=self._no_matrix)
+        return state
+
+    def _bind(self) -> NativeStep:
+        """Return the sim step of the present robots and systems."""
+        pack = self._pack
+        if self._native is None or self._bound is not pack.calls:
+            self._bound = pack.calls
+            self._native = NativeStep(pack, self._gravity, self._coriolis, self._reads_qvel, self._speed_limit)
+        return self._native
+
+
+def tick(
+    layout: Layout,
+    controller: Any,
+    gravity: bool,
+    span: Any,
+    constants: Constants,
+    bodies: Bodies,
+    state: StepState,
+    measured: Measured,
+    command: Command,
+) -> Carry:
+    """Run sim steps of a tick; arrays (rows, dof).
+
+    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the group in two parts, as
+    each array from NumPy costs a call some microseconds.
+    """
+    import jax
+    from jax import lax
+
+    xp = jax.numpy
+    end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
+
+    def mass_matrix(qpos: Any) -> Any:
+        return xla.mass_matrix(bodies.tree, bodies.table, qpos)
+
+    def when(due: Any, function: Any, otherwise: Any) -> Any:
+        return lax.cond(due.any(), function, lambda: otherwise)
+
+    model = Model(mass_matrix, mass_matrix, when=when, controller=controller)
+    whole = layout._replace(model=model)
+
+    def body(carry: Carry) -> Carry:
+        step = Step(carry.progress[0], end)
+        state, outputs = control_step(whole, constants, carry.state, command, carry.measured, step)
+        qpos, qvel, passive, status = xla.sim_step(address, carry.progress[0], outputs.qf)
+        new = Measured(qpos, qvel, passive if gravity else None)
+        return Carry(xp.stack([carry.progress[0] + 1, status]), state, new, outputs, carry.measured.qpos)
+
+    qpos = measured.qpos
+    zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)
+    outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)
+    carry = Carry(xp.stack([span[0], xp.zeros_like(end)]), state, measured, outputs, qpos)
+    return lax.while_loop(lambda carry: (carry.progress[0] < end) & (carry.progress[1] == 0), body, carry)
+
+
+@lru_cache(maxsize=8)
+def compiled(layout: Layout, controller: Any, gravity: bool) -> Any:
+    """Return :func:`tick` of this layout, compiled when it is first called."""
+    import jax
+
+    return jax.jit(partial(tick, layout, controller, gravity), compiler_options={"xla_cpu_multi_thread_eigen": False})
