@@ -35,7 +35,7 @@ from sim.robot.self_collision import SelfContact
 from sim.robot.stability import StabilityWarning
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
     from sim.runner import Runner
     from sim.workers.pool import RecoveryWarning
 
@@ -70,7 +70,7 @@ __all__ = [
     "write_recording",
 ]
 
-_LOADS_SAPIEN = {"Physics": "sim.engine.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
+_LOADS_SAPIEN = {"Physics": "sim.engine.sapien.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
 
 
 def __getattr__(name: str) -> Any:
@@ -80,19 +80,19 @@ def __getattr__(name: str) -> Any:
 
 
 def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
-    from sim.engine.dynamics import robot_dynamics
+    from sim.engine.sapien.dynamics import robot_dynamics
 
     return robot_dynamics(robot, ground)
 
 
 def _self_contact(robot: RobotDescription) -> SelfContact:
-    from sim.engine.self_contact import self_contact
+    from sim.engine.sapien.self_contact import self_contact
 
     return self_contact(robot)
 
 
 def _link_masses(robot: RobotDescription) -> Mapping[str, LinkMass]:
-    from sim.engine.link_masses import link_masses
+    from sim.engine.sapien.link_masses import link_masses
 
     return link_masses(robot)
 

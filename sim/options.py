@@ -26,7 +26,7 @@ from sim.robot.guard import fit_guard
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
 
 ControlMode = Literal["pid", "drive", "effort"]
 
@@ -155,7 +155,7 @@ class RunnerOptions:
     (docs/cluster.md)."""
 
     def __post_init__(self) -> None:
-        from sim.engine.physics import Physics
+        from sim.engine.sapien.physics import Physics
 
         robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
         checked: dict[str, Any] = {
@@ -225,7 +225,7 @@ class RunnerOptions:
     @property
     def solver(self) -> Physics:
         """Solver settings that ``physics`` stands for."""
-        from sim.engine.physics import PHYSICS, Physics
+        from sim.engine.sapien.physics import PHYSICS, Physics
 
         return self.physics if isinstance(self.physics, Physics) else PHYSICS[self.physics]
 
@@ -244,8 +244,8 @@ class RunnerOptions:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
         Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`sim.engine.contact_prediction` missed a contact. Without collisions there is none to miss: any
-        number of workers get equal shares, and pack these.
+        where :mod:`sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to miss:
+        any number of workers get equal shares, and pack these.
         """
         assert self.pack_size is not None
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size

@@ -23,7 +23,7 @@ from batchpid.single_owner import SingleOwner
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.cluster import Ray
-from sim.engine.dynamics import robot_dynamics
+from sim.engine.sapien.dynamics import robot_dynamics
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import describe
 from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
@@ -64,7 +64,7 @@ from sim.workers.requests import (
 )
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
 
 _FARTHEST = 1e6  # rad or m, and per second: PhysX turns what is beyond into NaN
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS, Physics
+from sim.engine.sapien.building import SceneSpec
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS, Physics
 from sim.loop.arrays import Command
 from sim.loop.control import PIDControl
 from sim.loop.friction import JointFriction
@@ -52,7 +52,7 @@ _LINE = 60
 class EquationOfMotion:
     """Robots without contact and joint limits, by steps of the Runge-Kutta method of order 4; arrays are (M, dof).
 
-    It stands in for a :class:`sim.engine.pack.Pack` in the loop.
+    It stands in for a :class:`sim.engine.sapien.pack.Pack` in the loop.
     """
 
     def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:

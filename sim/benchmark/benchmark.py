@@ -22,7 +22,7 @@ from sim.benchmark.peers import make_peers
 from sim.benchmark.policy import ResidualPolicy
 from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.native import python_calls
-from sim.engine.pack import Pack
+from sim.engine.sapien.pack import Pack
 from sim.loop.arrays import Arrays
 from sim.loop.loop import Loop
 from sim.options import RunnerOptions

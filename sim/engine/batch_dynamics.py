@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import native
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import Dynamics, loaded_dynamics, robot_dynamics
 from sim.engine.native.interface import DYNAMICS, STEP
+from sim.engine.sapien.building import SceneSpec
+from sim.engine.sapien.dynamics import Dynamics, loaded_dynamics, robot_dynamics
 from sim.robot.description import RobotDescription
 
 Float64 = NDArray[np.float64]

@@ -21,13 +21,14 @@ from sim.engine.batch_dynamics import (
     NativeBatchDynamics,
     PinocchioBatchDynamics,
 )
-from sim.engine.building import SceneSpec, build_scene, new_system
-from sim.engine.calls import PythonCalls
-from sim.engine.dynamics import Dynamics
-from sim.engine.native import NativeCalls, python_calls
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
-from sim.engine.sim_step import NativeStep
+from sim.engine.native import python_calls
+from sim.engine.sapien.building import SceneSpec, build_scene, new_system
+from sim.engine.sapien.calls import PythonCalls
+from sim.engine.sapien.dynamics import Dynamics
+from sim.engine.sapien.native_calls import NativeCalls
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.sapien.sim_step import NativeStep
 from sim.robot.parts import Joint
 
 STEPS = 50

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from batchpid.coefficients import Coefficients
 from batchpid.friction import Friction, FrictionState
 from batchpid.jax_settings import own_settings
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.pack import Pack
-from sim.engine.sim_step import FAILED, NativeStep
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.sim_step import FAILED, NativeStep
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Command
 from sim.loop.backend import obstacle

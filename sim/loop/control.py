@@ -12,9 +12,9 @@ import batchpid as bp
 from batchpid.coefficients import Coefficients
 from batchpid.computed_torque import convert_integral
 from batchpid.elementwise import clip
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import Dynamics, scene_dynamics
-from sim.engine.pack import Pack
+from sim.engine.sapien.building import SceneSpec
+from sim.engine.sapien.dynamics import Dynamics, scene_dynamics
+from sim.engine.sapien.pack import Pack
 from sim.loop.arrays import Command
 from sim.loop.law_program import LawProgram
 from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, acting_params, half_way
@@ -26,7 +26,7 @@ Float64 = NDArray[np.float64]
 
 
 class Plant(Protocol):
-    """Robots under control; :class:`sim.engine.pack.Pack` is one. Arrays are (M, dof)."""
+    """Robots under control; :class:`sim.engine.sapien.pack.Pack` is one. Arrays are (M, dof)."""
 
     def read_qpos(self) -> Float64:
         """Return the joint positions [rad or m]."""

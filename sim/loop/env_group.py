@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from sim.engine.dynamics import model_force
-from sim.engine.missed_contact import MissedContacts
-from sim.engine.pack import Pack
-from sim.engine.variation import VariedPack
+from sim.engine.sapien.dynamics import model_force
+from sim.engine.sapien.missed_contact import MissedContacts
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.variation import VariedPack
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
 from sim.loop.compiled_tick import CompiledTick, compiled_tick

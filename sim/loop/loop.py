@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import ControllerError
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
+from sim.engine.sapien.building import SceneSpec
+from sim.engine.sapien.pack import Pack
 from sim.loop.arrays import Arrays, Command, Ticks
 from sim.loop.env_group import EnvGroup
 from sim.loop.failure import Failure, RunError, order

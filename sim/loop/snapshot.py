@@ -54,7 +54,7 @@ class EnvStates:
     content: NDArray[np.float32]
     """State of the user content (envs, numbers); NaN where an env has fewer numbers than another."""
     isolated: NDArray[np.bool_]
-    """Robots that have their own PhysX system (:mod:`sim.engine.contact_prediction`)."""
+    """Robots that have their own PhysX system (:mod:`sim.engine.sapien.contact_prediction`)."""
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""

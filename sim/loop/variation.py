@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import batchpid as bp
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.engine.variation import Variation, VariedPack
+from sim.engine.sapien.building import SceneSpec
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.variation import Variation, VariedPack
 from sim.options import RunnerOptions
 from sim.randomization.draws import Draws
 from sim.randomization.fields import PHYSICAL, elements, nominal_values

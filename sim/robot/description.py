@@ -32,7 +32,7 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 class Dynamics(Protocol):
-    """Dynamics and contact of one robot at given poses (n, dof); :class:`sim.engine.dynamics.Dynamics` is one."""
+    """Dynamics and contact of one robot at given poses (n, dof), of the engine."""
 
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""

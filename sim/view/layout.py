@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.dynamics import robot_dynamics
+from sim.engine.sapien.dynamics import robot_dynamics
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 

@@ -14,7 +14,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 from sim import RecoveryWarning, Robot, Runner
-from sim.engine.contact_prediction import ContactPredictor
+from sim.engine.sapien.contact_prediction import ContactPredictor
 from sim.tuning.randomization import usual_variation
 
 N, TICKS = 16, 20

@@ -17,10 +17,10 @@ from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
-from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
 from sim.engine.lazy_module import imported_lazily
-from sim.engine.physics import Physics
-from sim.engine.user_content import Build, Frames, HeadlessScene
+from sim.engine.sapien.collision_groups import CollisionGroups, Pair, collision_groups
+from sim.engine.sapien.physics import Physics
+from sim.engine.sapien.user_content import Build, Frames, HeadlessScene
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
 from sim.robot.meshes import note_meshes

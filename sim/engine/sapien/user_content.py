@@ -13,8 +13,8 @@ from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRi
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
-from sim.engine.mirrored_meshes import MirroringBuilder
-from sim.engine.root_state import ROOT_SIZE, read_root, write_root
+from sim.engine.sapien.mirrored_meshes import MirroringBuilder
+from sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds to the scene of env ``env``; returns what poses are wanted of, or None.

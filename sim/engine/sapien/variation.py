@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from sapien import Pose
 
 from batchpid.friction import Friction
-from sim.engine.building import SceneSpec, center_of_mass, merged, set_inertia
-from sim.engine.dynamics import model_force, scene_dynamics
-from sim.engine.pack import Pack
+from sim.engine.sapien.building import SceneSpec, center_of_mass, merged, set_inertia
+from sim.engine.sapien.dynamics import model_force, scene_dynamics
+from sim.engine.sapien.pack import Pack
 from sim.robot.merging import place_links
 from sim.robot.mimics import coupling_of
 from sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total

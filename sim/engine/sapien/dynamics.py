@@ -12,7 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import (
+from sim.engine.rigid_body import RigidBodies, mass_matrix
+from sim.engine.sapien.bodies import bodies_of
+from sim.engine.sapien.building import (
     SceneSpec,
     add_point_mass,
     build_scene,
@@ -22,11 +24,10 @@ from sim.engine.building import (
     rigid_bodies,
     shape_owners,
 )
-from sim.engine.collision_groups import Pair
-from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
-from sim.engine.extents import link_extents, touching_pairs
-from sim.engine.physics import PHYSICS
-from sim.engine.rigid_body import RigidBodies, bodies_of, mass_matrix
+from sim.engine.sapien.collision_groups import Pair
+from sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair
+from sim.engine.sapien.extents import link_extents, touching_pairs
+from sim.engine.sapien.physics import PHYSICS
 from sim.robot.description import RobotDescription
 from sim.robot.kinematics import Kinematics
 from sim.robot.mimics import coupling_of

@@ -3,7 +3,7 @@
 A pack is M scenes with one robot each, stepped together, several of them in one PhysX system. All stand at the origin;
 the shapes of each scene are in a collision group to themselves, so that scenes never meet. That is bit-identical to one
 system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
-(:mod:`sim.engine.contact_prediction`).
+(:mod:`sim.engine.sapien.contact_prediction`).
 
 The loop uses only the public methods and attributes of :class:`Pack`; another engine has to provide these. Longer than
 300 lines because that is the whole interface between loop and engine.
@@ -20,14 +20,21 @@ from numpy.typing import NDArray
 from batchpid.actuators import Actuators
 from batchpid.friction import Friction
 from batchpid.single_owner import SingleOwner
-from sim.engine.building import SceneSpec, build_scene, engine_settings, link_frames, new_system, set_collision_group
-from sim.engine.calls import EngineCalls
-from sim.engine.contact_watch import ContactWatch
 from sim.engine.coupling import ConstraintEfforts
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.native import engine_calls
-from sim.engine.root_state import read_root, write_root
-from sim.engine.user_content import SceneContent, refuse_shapes
+from sim.engine.sapien.building import (
+    SceneSpec,
+    build_scene,
+    engine_settings,
+    link_frames,
+    new_system,
+    set_collision_group,
+)
+from sim.engine.sapien.calls import EngineCalls
+from sim.engine.sapien.contact_watch import ContactWatch
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.native_calls import engine_calls
+from sim.engine.sapien.root_state import read_root, write_root
+from sim.engine.sapien.user_content import SceneContent, refuse_shapes
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.mimics import coupling_of
 
@@ -137,7 +144,7 @@ class Pack(SingleOwner):
         return self._calls
 
     def look(self, left: list[int]) -> None:
-        """Look for contacts after a :class:`sim.engine.sim_step.NativeStep` that led ``left`` out of regions."""
+        """Look for contacts after a :class:`sim.engine.sapien.sim_step.NativeStep` that led ``left`` out of regions."""
         self._stepped_qpos = None
         if predicted := self.watch.look(left):
             self.isolate(predicted)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine import native
 from sim.engine.native.interface import STATUS, Group
-from sim.engine.pack import Pack
+from sim.engine.sapien.native_calls import NativeCalls, contact_maps, gateway_address, gateway_sim_step, pointer
+from sim.engine.sapien.pack import Pack
 
 FAILED = 1 << STATUS.index("failed")
 """Bit of the status of a sim step in which SAPIEN raised an exception."""
@@ -19,7 +19,7 @@ FAILED = 1 << STATUS.index("failed")
 class NativeStep:
     """Sim step of the robots of ``pack``: apply efforts, step, read, and judge whether Python has to look.
 
-    It holds for the present :attr:`sim.engine.pack.Pack.calls`, which have to be native.
+    It holds for the present :attr:`sim.engine.sapien.pack.Pack.calls`, which have to be native.
 
     Parameters
     ----------
@@ -37,16 +37,16 @@ class NativeStep:
         self, pack: Pack, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
     ) -> None:
         calls, watch = pack.calls, pack.watch
-        assert isinstance(calls, native.NativeCalls)
+        assert isinstance(calls, NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
         system_of = [numbers[system] for system in pack.systems]
         self._watch, self._looked_at = watch, list[Any]()
-        contacts = native.contact_maps(calls.gateway)
+        contacts = contact_maps(calls.gateway)
         if not all(contacts):
             raise RuntimeError("the contacts of SAPIEN's systems are not where they are looked for")
         regions, count = watch.regions, len(system_of)
         pairs = regions.arms.shape[1]
-        bodies = sorted((native.pointer(link, "body"), row) for link, (row, _) in watch.links.items())
+        bodies = sorted((pointer(link, "body"), row) for link, (row, _) in watch.links.items())
         self._outside, self._watched = np.zeros(count, np.uint8), np.zeros(len(contacts), np.uint8)
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, calls.qf.shape[1:]).astype(np.float64)
         arrays = {
@@ -65,7 +65,7 @@ class NativeStep:
             "outside": self._outside,
         } | ({} if limit is None else {"speed_limit": limit})
         self._group = Group(
-            gateway=native.gateway_address(calls.gateway),
+            gateway=gateway_address(calls.gateway),
             pairs=pairs,
             bodies_size=len(bodies),
             gravity=gravity,
@@ -88,7 +88,7 @@ class NativeStep:
 
     def __call__(self, *arrays: NDArray[np.float64]) -> int:
         """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
-        return native.gateway_sim_step(self.prepare(), *arrays)
+        return gateway_sim_step(self.prepare(), *arrays)
 
     @property
     def message(self) -> str:
