@@ -123,8 +123,8 @@ class RunnerOptions:
     (docs/reliability.md)."""
     on_fault: FaultAction = "hold"
     """``"hold"`` an env that fails at rest in its last valid state, with ``ok`` False until it is reset; or ``"reset"``
-    it to its last start, with ``ok`` False for that tick. An env fails when its state is no longer finite, or by
-    ``speed_limit``. The other envs are not affected."""
+    it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite, when a position is
+    beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
     speed_limit: ArrayLike | None = None
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     actuators: bp.Actuators | None = None

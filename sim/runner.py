@@ -28,7 +28,7 @@ from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import describe
 from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
 from sim.loop.custom import initial_state
-from sim.loop.faults import Fault, FaultLog, FaultWarning
+from sim.loop.faults import FARTHEST, Fault, FaultLog, FaultWarning
 from sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from sim.observation import Observation, Rollout, RunInfo, empty_observation
 from sim.options import (
@@ -65,8 +65,6 @@ from sim.workers.requests import (
 
 if TYPE_CHECKING:
     from sim.engine.sapien.physics import Physics
-
-_FARTHEST = 1e6  # rad or m, and per second: PhysX turns what is beyond into NaN
 
 
 class TickRecorder(Protocol):
@@ -758,8 +756,8 @@ class Runner(SingleOwner):
         """Return positions or velocities (envs, dof) to reset to, checked."""
         rows = self._rows(name, value)
         if self._finite:
-            return within(name, rows, _FARTHEST, self._joint_names)
-        return np.where(np.abs(rows) > _FARTHEST, np.nan, rows)
+            return within(name, rows, FARTHEST, self._joint_names)
+        return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
 
 
 def _copy(arrays: Arrays) -> Observation:

@@ -44,8 +44,6 @@ class Control:
     ----------
     saturated
         Joints whose effort was limited in the last sim step of the last tick (M, dof).
-    reads_qpos_each_step
-        Whether :meth:`effort` needs qpos at every sim step; otherwise it is ignored.
     limits
         Least and largest effort to ask for that the motors do not clip, in addition to those of the params; None for
         no limit.
@@ -55,7 +53,6 @@ class Control:
         Last effort that the caller's own controller returned (M, dof); None for the other controls.
     """
 
-    reads_qpos_each_step = True
     limits: tuple[Any, Any] = None, None
     drive: tuple[Any, Any] = 0.0, 0.0
     returned: NDArray[Any] | None = None
@@ -199,7 +196,7 @@ class DriveControl(Control):
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times; the state carries on."""
         super().set_params(params)
-        self.reads_qpos_each_step = params.ki is not None and bool(np.any(params.ki > 0))
+        self._integrates = params.ki is not None and bool(np.any(params.ki > 0))
         params = acting_params(params, self._coupling)
         damping = np.zeros_like(params.kp) if params.kd is None else params.kd
         limit = np.full_like(params.kp, np.inf) if params.effort_max is None else params.effort_max
@@ -217,7 +214,7 @@ class DriveControl(Control):
         self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None
     ) -> Float64 | None:
         """Return ``feedforward``; move the drives' targets where there is an integral."""
-        if self.reads_qpos_each_step:
+        if self._integrates:
             setpoint, rate, _ = self._command
             rates = {"setpoint_rate": rate, "feedforward": feedforward}
             self._state, target = bp.drive_target(
@@ -232,8 +229,6 @@ class EffortControl(Control):
 
     Efforts on followers act on their leaders.
     """
-
-    reads_qpos_each_step = False
 
     def effort(
         self, qpos: Float64, feedforward: Float64 | None, step: int, qvel: Float64 | None = None

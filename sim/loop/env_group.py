@@ -18,7 +18,7 @@ from sim.engine.sapien.variation import VariedPack
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
 from sim.loop.compiled_tick import CompiledTick, compiled_tick
-from sim.loop.faults import FaultContainment, finite
+from sim.loop.faults import FaultContainment, far, finite, near
 from sim.loop.friction import JointFriction
 from sim.loop.guard import SetpointGuard
 from sim.loop.jitted import make_control
@@ -128,7 +128,7 @@ class EnvGroup:
             command = self._without_faults(command)
         with np.errstate(all="ignore"):  # overflow and invalid values become faults
             self._run_substeps(substeps, command)
-            if not finite(self._qpos, self.pack.read_qvel()):
+            if not (near(self._qpos) and finite(self.pack.read_qvel())):
                 self._contain(self._qpos, substeps)
         if self._contacts is not None:
             self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
@@ -215,7 +215,6 @@ class EnvGroup:
         pack, control, friction = self.pack, self._control, self._friction
         control.begin(command, substeps)
         actuators, guard, asked = self._actuators, self._guard, command
-        reads_qpos = control.reads_qpos_each_step or self._compensates or actuators is not None
         for step in range(substeps):
             qvel: Any = None
             if guard is not None:
@@ -223,10 +222,6 @@ class EnvGroup:
                 control.begin(command, substeps)
             if actuators is None:
                 forward = self._feedforward(command, self._qpos)
-                if not reads_qpos and not self._sound(forward):
-                    # qpos is not read at every step: the passive force, which depends on it, shows a failed state.
-                    self._contain(pack.read_qpos(), step)
-                    forward = self._feedforward(command, self._qpos)
                 if friction.acts:
                     qvel = pack.read_qvel()
                 effort = control.effort(self._qpos, forward, step, qvel)
@@ -241,12 +236,11 @@ class EnvGroup:
             if effort is not None:
                 pack.write_qf(effort)
             pack.step(step % COUPLING_STEPS == 0)
-            if reads_qpos or step + 1 == substeps:
-                qpos = pack.read_qpos()
-                if self._sound(qpos):
-                    self._qpos = qpos
-                else:
-                    self._contain(qpos, step + 1)
+            qpos = pack.read_qpos()
+            if self._sound(qpos):
+                self._qpos = qpos
+            else:
+                self._contain(qpos, step + 1)
 
     def _run_compiled(self, compiled: CompiledTick, substeps: int, command: Command) -> None:
         """Run the sim steps of a tick by the program, and do here what it stops for."""
@@ -262,8 +256,7 @@ class EnvGroup:
             if not self._sound(qpos):
                 if self._control.returned is not None:
                     self._control.returned = self._motor
-                if self._control.reads_qpos_each_step or self._compensates:  # as in NumPy's loop
-                    self._qpos = compiled.read("qpos_before")
+                self._qpos = compiled.read("qpos_before")
                 self._contain(qpos, done)
         self._qpos = self.pack.read_qpos()
 
@@ -297,16 +290,16 @@ class EnvGroup:
 
     # -- envs that fail ----------------------------------------------------------------------------------------
 
-    def _sound(self, state: Float64 | None) -> bool:
-        """Return whether no robot has failed, judged by ``state``, an array that depends on all their positions."""
+    def _sound(self, qpos: Float64) -> bool:
+        """Return whether certainly no robot has failed."""
         limit = self._speed_limit
-        return finite(state) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
+        return near(qpos) and (limit is None or bool((np.abs(self.pack.read_qvel()) <= limit).all()))
 
     def _contain(self, qpos: Float64, done: int) -> None:
         """Suspend or reset the envs that failed, ``done`` substeps into a tick."""
         containment, step = self._containment, self._steps + done
         qvel = self.pack.read_qvel()
-        bad = ~(np.isfinite(qpos) & np.isfinite(qvel))
+        bad = far(qpos) | ~np.isfinite(qvel)
         # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed

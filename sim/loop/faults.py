@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.engine.native.interface import FARTHEST
 from sim.loop.arrays import Arrays
 from sim.options import FaultAction
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
-"""Causes of faults: the state is not finite, a joint is too fast, or the array of that name was not finite.
+"""Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too fast, or the array of
+that name was not finite.
 
 "effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes, so new causes are
 appended at the end.
@@ -47,7 +49,7 @@ class Fault(NamedTuple):
 
     def __str__(self) -> str:
         known = {
-            "state": "its state is no longer finite",
+            "state": f"its state is not finite, or a position is beyond {FARTHEST:,.0f} rad or m",
             "speed": "it is faster than speed_limit",
             "effort": "the effort that its controller returned is not finite",
         }
@@ -57,7 +59,7 @@ class Fault(NamedTuple):
 
 
 class FaultWarning(UserWarning):
-    """An env failed: its state is no longer finite, or a joint is too fast."""
+    """An env failed: its state is not finite, a position is beyond :data:`FARTHEST`, or a joint is too fast."""
 
 
 class FaultLog:
@@ -156,6 +158,19 @@ class FaultContainment:
         """Set the state that :meth:`read` returned."""
         for name in self._STATE:
             getattr(self, name)[...] = state[name]
+
+
+def near(qpos: NDArray[np.float64]) -> bool:
+    """Return whether all positions are certainly finite and below :data:`FARTHEST`, in one pass.
+
+    The sum of squares may be larger although each position is near: the exact test is :func:`far`.
+    """
+    return bool(np.vdot(qpos, qpos) <= FARTHEST**2)
+
+
+def far(qpos: NDArray[np.float64]) -> Bool:
+    """Return which positions are not finite, or beyond :data:`FARTHEST`."""
+    return ~(np.abs(qpos) <= FARTHEST)
 
 
 def finite(*arrays: NDArray[Any] | None) -> bool:

@@ -57,6 +57,8 @@ OPERATIONS = (
 """Operations of programs, as Code in law_program.cpp."""
 OPERATION = ("code", "out", "first", "second", "third")
 """int32 numbers of an operation: its code, and registers; as Operation in law_program.cpp."""
+FARTHEST = 1e6
+"""Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is of float32."""
 MOST_SUMMED = 128
 """Largest number of terms for which a sum has NumPy's order."""
 
@@ -82,7 +84,7 @@ def tables_digest(name: str) -> str:
     """Return a digest of the tables that an extension shares with Python, and of its compiler flags."""
     group = [(field, getattr(Group, field).offset, getattr(Group, field).size) for field, *_ in Group._fields_]
     tables: dict[str, Any] = {
-        "_gateway": (SYMBOLS, STATUS, group, list(BODY.items())),
+        "_gateway": (SYMBOLS, STATUS, FARTHEST, group, list(BODY.items())),
         "_batch_dynamics": (DYNAMICS, STEP, list(BODY.items())),
         "_law_program": (OPERATIONS, OPERATION, MOST_SUMMED),
     }

@@ -13,6 +13,9 @@
 
 namespace batchpid {
 
+// Largest position of a robot that has not failed [rad or m].
+constexpr double FARTHEST = 1e6;
+
 // Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
 enum Status : std::int32_t { LEFT_REGION = 1, CONTACTS = 2, NOT_FINITE = 4, TOO_FAST = 8, FAILED = 16 };
 
@@ -111,7 +114,7 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
         copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
       }
       for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
-        if (!std::isfinite(position.data[joint])) status |= NOT_FINITE;
+        if (!(std::fabs(position.data[joint]) <= FARTHEST)) status |= NOT_FINITE;
         if (group.speed_limit && !(std::fabs(qvel[at + joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
       }
       group.outside[row] = group.known[row] && leaves_region(group, row, position.data);

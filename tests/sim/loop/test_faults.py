@@ -206,9 +206,27 @@ def check_random_fault(case):
     assert np.isfinite(broken.effort).all()
 
 
-@pytest.mark.parametrize("case", range(6))
+@pytest.mark.parametrize("case", [*range(6), 86])  # 86: the state stays finite, at 1e28 rad
 def test_the_other_63_of_64_envs_are_bit_identical(case):
     check_random_fault(case)
+
+
+@pytest.mark.parametrize("control", ["pid", "effort"])
+def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(control, monkeypatch):
+    found = []
+    for switch, backend in (("1", "numpy"), ("0", "numpy"), ("1", "jax")):
+        monkeypatch.setenv("BATCHPID_NATIVE", switch)
+        commands = setpoints(4, 4) if control == "pid" else np.zeros((4, 4, 9))
+        forward = np.zeros((4, 4, 9))
+        forward[1, 2, 5] = 1e30  # the robot is at about 1e20 rad after a sim step or two
+        with make(4, control=control, params=PANDA.params(effort_limit=None), backend=backend) as runner:
+            with pytest.warns(FaultWarning, match="a position is beyond 1,000,000 rad or m"):
+                rollout = runner.rollout(commands, feedforwards=forward)
+            assert rollout.ok[:, 2].tolist() == [True, False, False, False]
+            assert np.abs(rollout.qpos).max() < 10
+            found.append([fault._replace(action="") for fault in runner.faults])
+    assert len(found[0]) == 1
+    assert found[0] == found[1] == found[2]
 
 
 @pytest.mark.slow
