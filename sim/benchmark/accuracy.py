@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
-from sim.engine.sapien.building import SceneSpec
 from sim.engine.sapien.pack import Pack
 from sim.engine.sapien.physics import PHYSICS, Physics
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.arrays import Command
 from sim.loop.control import PIDControl
 from sim.loop.friction import JointFriction

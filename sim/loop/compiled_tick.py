@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from batchpid.coefficients import Coefficients
 from batchpid.friction import Friction, FrictionState
 from batchpid.jax_settings import own_settings
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.sim_step import FAILED, NativeStep
+from sim.engine.engines import scene_dynamics
+from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from sim.engine.protocol import EnginePack as Pack
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Command
 from sim.loop.backend import obstacle
@@ -36,7 +36,7 @@ class CompiledTick:
     def __init__(
         self,
         options: RunnerOptions,
-        pack: Pack,
+        pack: CompiledPack,
         control: Control,
         friction: JointFriction,
         compensated: tuple[bool, bool, bool],
@@ -53,7 +53,7 @@ class CompiledTick:
         self._matrix: Any = None
         self._constants: tuple[tuple[Any, ...], Constants] | None = None
         self._zero: Any = None
-        self._native: NativeStep | None = None
+        self._native: CompiledStep | None = None
         self._bound: tuple[Any, bool] | None = None
 
     def run(self, command: Command, begin: int, end: int) -> tuple[int, int]:
@@ -62,7 +62,7 @@ class CompiledTick:
         constants = self._take_constants()
         if self._bound != (bound := (pack.calls, self._needs_qvel)):  # robots, systems or the law have changed
             self._bound = bound
-            self._native = NativeStep(pack, self._gravity, self._coriolis, self._needs_qvel, self._speed_limit)
+            self._native = pack.compiled_step(self._gravity, self._coriolis, self._needs_qvel, self._speed_limit)
             if self._carry is not None:
                 self._carry = self._carry._replace(**self._read())
         native = self._native
@@ -87,9 +87,9 @@ class CompiledTick:
         """Return an array (envs, dof) of :class:`Carry` after the last sim step, a new array."""
         return self._rows(getattr(self._carry, name), dtype)
 
-    def left(self) -> list[int]:
-        """Return the robots that left their regions in the last sim step."""
-        return [] if self._native is None else self._native.left()
+    def look(self) -> None:
+        """Let the pack do what the last sim step stopped for."""
+        self._pack.look([] if self._native is None else self._native.left())
 
     def release(self) -> None:
         """Give the state back to the control and the friction model, which may change it, and the robots'."""
@@ -196,5 +196,6 @@ def compiled_tick(
     """Return the sim steps of a tick as one program; None where that is not asked for, or cannot be."""
     if options.backend == "numpy" or not isinstance(control, PIDControl | EffortControl | CustomControl):
         return None
-    fits = not obstacle(options, None if actuators is None else actuators.actuators)
-    return CompiledTick(options, pack, control, friction, compensated) if fits else None
+    if not isinstance(pack, CompiledPack) or obstacle(options, None if actuators is None else actuators.actuators):
+        return None
+    return CompiledTick(options, pack, control, friction, compensated)

@@ -12,9 +12,9 @@ import batchpid as bp
 from batchpid.coefficients import Coefficients
 from batchpid.computed_torque import convert_integral
 from batchpid.elementwise import clip
-from sim.engine.sapien.building import SceneSpec
-from sim.engine.sapien.dynamics import Dynamics, scene_dynamics
-from sim.engine.sapien.pack import Pack
+from sim.engine.engines import scene_dynamics
+from sim.engine.protocol import DrivenPack, RobotModel
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.arrays import Command
 from sim.loop.law_program import LawProgram
 from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, acting_params, half_way
@@ -26,7 +26,7 @@ Float64 = NDArray[np.float64]
 
 
 class Plant(Protocol):
-    """Robots under control; :class:`sim.engine.sapien.pack.Pack` is one. Arrays are (M, dof)."""
+    """Robots under control; :class:`sim.engine.protocol.EnginePack` is one. Arrays are (M, dof)."""
 
     def read_qpos(self) -> Float64:
         """Return the joint positions [rad or m]."""
@@ -117,7 +117,7 @@ class PIDControl(Control):
         Viscous damping of the joints that the law compensates (dof,) [N m s/rad or N s/m]; None for none.
     """
 
-    _dynamics: Dynamics | None = None
+    _dynamics: RobotModel | None = None
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times; the state carries on, with the integral in the unit of the new gains."""
@@ -191,7 +191,7 @@ class DriveControl(Control):
     a PID whose P and D the engine integrates implicitly.
     """
 
-    _plant: Pack
+    _plant: DrivenPack
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times; the state carries on."""

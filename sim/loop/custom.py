@@ -14,7 +14,7 @@ import batchpid as bp
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.jax_settings import own_settings
 from batchpid.read_only import read_only
-from sim.engine.sapien.building import SceneSpec
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.control import Control, Plant
 from sim.options import Controller, RunnerOptions
 

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from sim.engine.sapien.dynamics import model_force
-from sim.engine.sapien.missed_contact import MissedContacts
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.variation import VariedPack
+from sim.engine.engines import scene_dynamics
+from sim.engine.protocol import EnginePack as Pack
 from sim.loop.actuators import JointActuators
 from sim.loop.arrays import Arrays, Command
 from sim.loop.compiled_tick import CompiledTick, compiled_tick
@@ -63,7 +61,7 @@ class EnvGroup:
             limits = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
             self._guard = SetpointGuard(limits, self._coupling, self._qpos, options.timestep)
         collides, ground = options.collisions, options.robot.has_ground
-        self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
+        self._contacts = None if collides else options.load_engine().missed_contacts(pack.spec, pack.size, ground)
         self._compiled = self._make_compiled()
 
     def _make_compiled(self) -> CompiledTick | None:
@@ -156,12 +154,8 @@ class EnvGroup:
         pack = self.pack
         self._release()
         return EnvStates(
-            qpos=pack.read_qpos(np.float32),
-            qvel=pack.read_qvel(np.float32),
+            engine=pack.read_state(),
             effort=self._motor.copy(),
-            root=pack.read_root(),
-            content=pack.read_content(),
-            isolated=pack.isolated.copy(),
             saturated=self._control.saturated,
             controller=self._control.read(),
             friction=self._friction.read(),
@@ -178,9 +172,7 @@ class EnvGroup:
         if self._actuators is not None:
             self._actuators.write(states.actuators)
         self._control = make_control(self._options, pack.spec, self._control.params, pack)
-        pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
-        pack.write_content(states.content)
-        pack.isolate(np.flatnonzero(states.isolated).tolist())
+        pack.write_state_rows(states.engine)
         self._containment.write(states.containment)
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
@@ -200,7 +192,7 @@ class EnvGroup:
         rows = np.flatnonzero(mask).tolist()
         if self._options.randomization is None or self.draws is None or not rows:
             return
-        if isinstance(self.pack, VariedPack):
+        if self._options.randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
         self.pack.write_joints(self._take_actuators(), rows)
         self.set_params(self._params)
@@ -251,7 +243,7 @@ class EnvGroup:
             self._control.saturated = compiled.read("saturated", bool)
             if not status:
                 continue
-            self.pack.look(compiled.left())
+            compiled.look()
             qpos = self.pack.read_qpos()
             if not self._sound(qpos):
                 if self._control.returned is not None:
@@ -279,7 +271,11 @@ class EnvGroup:
         if self._gravity:
             which = self._gravity, self._coriolis
             pack = self.pack
-            passive = pack.passive_force(*which) if qvel is None else model_force(pack.spec, qpos, qvel, *which)
+            passive = (
+                pack.passive_force(*which)
+                if qvel is None
+                else scene_dynamics(pack.spec).passive_force(qpos, qvel, *which)
+            )
             forward = passive if forward is None else passive + forward
         if forward is not None and self._coupling is not None:
             forward = self._coupling.efforts(forward)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from batchpid import friction
 from batchpid.elementwise import TURN, namespace, wrap
-from sim.engine.sapien.pack import Pack
+from sim.engine.protocol import EnginePack as Pack
 from sim.loop.arrays import Command
 from sim.loop.snapshot import AGE
 from sim.robot.dissipation import DISSIPATION

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.coefficients import Coefficients
 from batchpid.jax_settings import own_settings
-from sim.engine.sapien.building import SceneSpec
-from sim.engine.sapien.pack import Pack
+from sim.engine.protocol import EnginePack as Pack
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.control import CONTROLS, Control, PIDControl
 from sim.loop.custom import CustomControl
 from sim.loop.pid_law import PIDLaw

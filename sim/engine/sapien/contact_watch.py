@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.building import SceneSpec
 from sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
 from sim.engine.sapien.dynamics import Dynamics, scene_dynamics
 from sim.engine.sapien.extents import link_extents, touching_pairs
+from sim.engine.scene_spec import SceneSpec
 
 Float64 = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.building import SceneSpec
 from sim.engine.sapien.contact_prediction import LISTED_DISTANCE
 from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.scene_spec import SceneSpec
 
 Float64 = NDArray[np.float64]
 

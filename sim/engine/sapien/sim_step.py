@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.native.interface import STATUS, Group
+from sim.engine.native.interface import Group
+from sim.engine.sapien.calls import EngineCalls
+from sim.engine.sapien.contact_watch import ContactWatch
 from sim.engine.sapien.native_calls import NativeCalls, contact_maps, gateway_address, gateway_sim_step, pointer
-from sim.engine.sapien.pack import Pack
-
-FAILED = 1 << STATUS.index("failed")
-"""Bit of the status of a sim step in which SAPIEN raised an exception."""
 
 
 class NativeStep:
-    """Sim step of the robots of ``pack``: apply efforts, step, read, and judge whether Python has to look.
-
-    It holds for the present :attr:`sim.engine.sapien.pack.Pack.calls`, which have to be native.
+    """Sim step of the robots of a pack: apply efforts, step, read, and judge whether Python has to look.
 
     Parameters
     ----------
-    pack
-        Its watch is judged and updated in place.
+    calls
+        Present calls of the pack, which have to be native.
+    systems
+        PhysX system of each robot.
+    watch
+        Watch of the pack, judged and updated in place.
     gravity, coriolis
         Parts of the passive force that is read; without both it is zero.
     velocities
@@ -34,12 +35,18 @@ class NativeStep:
     """
 
     def __init__(
-        self, pack: Pack, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+        self,
+        calls: EngineCalls,
+        systems: Sequence[Any],
+        watch: ContactWatch,
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: NDArray[np.float64] | None,
     ) -> None:
-        calls, watch = pack.calls, pack.watch
         assert isinstance(calls, NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
-        system_of = [numbers[system] for system in pack.systems]
+        system_of = [numbers[system] for system in systems]
         self._watch, self._looked_at = watch, list[Any]()
         contacts = contact_maps(calls.gateway)
         if not all(contacts):

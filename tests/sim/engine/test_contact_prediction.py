@@ -10,7 +10,7 @@ from robots import load_bundled
 
 from sim import Runner
 from sim.benchmark.accuracy import contact_moves
-from sim.engine.sapien.building import SceneSpec, build_scene, new_system
+from sim.engine.sapien.building import build_scene, new_system
 from sim.engine.sapien.contact_prediction import (
     LISTED_DISTANCE,
     LOOKAHEAD_STEPS,
@@ -26,6 +26,7 @@ from sim.engine.sapien.dynamics import scene_dynamics
 from sim.engine.sapien.extents import link_extents, touching_pairs
 from sim.engine.sapien.pack import Pack
 from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 
 DT = 1 / 2000
 
