@@ -224,7 +224,7 @@ class Engine(description.RobotFunctions, Protocol):
     capabilities
         What it offers besides.
     physics
-        Settings of its solver, by the name of the preset.
+        Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
     """
 
     name: str
