@@ -6,7 +6,6 @@ Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,16 +25,14 @@ from sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from sim.randomization.randomization import Randomization
 from sim.recording.files import RecordingError, read_recording, write_recording
 from sim.recording.recorder import Recorder
-from sim.robot.description import Dynamics, Engine, RobotDescription, register_engine
+from sim.robot.description import RobotFunctions, register_engine
 from sim.robot.findings import Finding
 from sim.robot.limits import SetpointWarning
-from sim.robot.parts import LinkMass
 from sim.robot.robot import Robot
-from sim.robot.self_collision import SelfContact
 from sim.robot.stability import StabilityWarning
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
     from sim.runner import Runner
     from sim.workers.pool import RecoveryWarning
 
@@ -70,7 +67,7 @@ __all__ = [
     "write_recording",
 ]
 
-_LOADS_SAPIEN = {"Physics": "sim.engine.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
+_LOADS_SAPIEN = {"Physics": "sim.engine.sapien.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
 
 
 def __getattr__(name: str) -> Any:
@@ -79,22 +76,10 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LOADS_SAPIEN[name]), name)
 
 
-def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
-    from sim.engine.dynamics import robot_dynamics
+def _engine() -> RobotFunctions:
+    from sim.engine.engines import load_engine
 
-    return robot_dynamics(robot, ground)
-
-
-def _self_contact(robot: RobotDescription) -> SelfContact:
-    from sim.engine.self_contact import self_contact
-
-    return self_contact(robot)
+    return load_engine()
 
 
-def _link_masses(robot: RobotDescription) -> Mapping[str, LinkMass]:
-    from sim.engine.link_masses import link_masses
-
-    return link_masses(robot)
-
-
-register_engine(Engine(_dynamics, _self_contact, _link_masses))
+register_engine(_engine)

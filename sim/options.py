@@ -19,6 +19,8 @@ from batchpid.leaves import frozen
 from batchpid.read_only import read_only
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
 from sim.cluster import Ray
+from sim.engine.engines import load_engine
+from sim.engine.protocol import Capability, Engine, require
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
 from sim.randomization.randomization import Randomization
 from sim.robot.actuators import fit_actuators
@@ -26,7 +28,7 @@ from sim.robot.guard import fit_guard
 from sim.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
 
 ControlMode = Literal["pid", "drive", "effort"]
 
@@ -155,8 +157,6 @@ class RunnerOptions:
     (docs/cluster.md)."""
 
     def __post_init__(self) -> None:
-        from sim.engine.physics import Physics
-
         robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
         checked: dict[str, Any] = {
             "num_envs": integer("num_envs", self.num_envs, 1, 1_000_000),
@@ -189,8 +189,18 @@ class RunnerOptions:
             )
         if self.workers is not None:
             checked["workers"] = integer("workers", self.workers, 0, 1024)
-        if not isinstance(self.physics, Physics):
-            choice("physics", self.physics, get_args(PhysicsPreset))
+        engine = self.load_engine()
+        if not engine.is_physics(self.physics):
+            choice("physics", self.physics, engine.physics)
+        needed: dict[Capability, tuple[str, bool]] = {
+            "drive": ("control", checked["control"] == "drive"),
+            "build": ("build", self.build is not None),
+            "missed_contacts": ("collisions", not checked["collisions"]),
+            "sapien_dissipation": ("robot", robot.dissipation == "sapien"),
+        }
+        for capability, (argument, needs) in needed.items():
+            if needs:
+                require(engine, capability, argument)
         if self.build is not None and not callable(self.build):
             raise InvalidArgumentError(
                 "build", "must be a function", value=self.build, remedy="define build(scene, env)"
@@ -225,9 +235,11 @@ class RunnerOptions:
     @property
     def solver(self) -> Physics:
         """Solver settings that ``physics`` stands for."""
-        from sim.engine.physics import PHYSICS, Physics
+        return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
 
-        return self.physics if isinstance(self.physics, Physics) else PHYSICS[self.physics]
+    def load_engine(self) -> Engine:
+        """Return the physics engine of the robots, with its packages imported."""
+        return load_engine()
 
     @property
     def control_name(self) -> str:
@@ -244,8 +256,8 @@ class RunnerOptions:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
         Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`sim.engine.contact_prediction` missed a contact. Without collisions there is none to miss: any
-        number of workers get equal shares, and pack these.
+        where :mod:`sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to miss:
+        any number of workers get equal shares, and pack these.
         """
         assert self.pack_size is not None
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
@@ -312,6 +324,7 @@ class RunnerOptions:
         return {
             **robot.about(),
             "joints": list(robot.joint_names),
+            "engine": self.load_engine().name,
             "num_envs": self.num_envs,
             "timestep": self.timestep,
             "control": self.control_name,

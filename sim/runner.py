@@ -23,7 +23,6 @@ from batchpid.single_owner import SingleOwner
 from batchpid.validate import array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.cluster import Ray
-from sim.engine.dynamics import robot_dynamics
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import describe
 from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
@@ -52,8 +51,8 @@ from sim.workers.ledger import Commit, Ledger
 from sim.workers.node import NodeInfo
 from sim.workers.pool import WorkerPool
 from sim.workers.requests import (
-    ReadContentSizes,
     ReadPoses,
+    ReadStateSizes,
     Request,
     Reset,
     Restore,
@@ -64,7 +63,7 @@ from sim.workers.requests import (
 )
 
 if TYPE_CHECKING:
-    from sim.engine.physics import Physics
+    from sim.engine.sapien.physics import Physics
 
 
 class TickRecorder(Protocol):
@@ -192,8 +191,9 @@ class Runner(SingleOwner):
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
         contacts = None
         if not options.collisions:
+            engine = options.load_engine()
             contacts = MissedContactLog(
-                self.num_envs, self.timestep, lambda qpos: robot_dynamics(robot).nearest_links(qpos)
+                self.num_envs, self.timestep, lambda qpos: engine.robot_dynamics(robot).nearest_links(qpos)
             )
         self._pool = WorkerPool(options, params)
         randomization = options.randomization
@@ -478,7 +478,7 @@ class Runner(SingleOwner):
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
         snapshot.check(self.options.about())
         snapshot = replace(snapshot, params=self.options.check_params(snapshot.params))
-        sizes = [size for part in self._execute(ReadContentSizes(), _read) for size in part]
+        sizes = [size for part in self._execute(ReadStateSizes(), _read) for size in part]
         controller = initial_state(self.options, snapshot.params)
         acting = actuators = self.options.check_actuators(snapshot.actuators)
         draws, randomization = NOTHING, self.options.randomization

@@ -23,9 +23,9 @@ import batchpid as bp
 from batchpid.friction import Friction
 from batchpid.validate import choice, integer, number
 from sim.benchmark.workload import TIMESTEP
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS, Physics
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS, Physics
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Step, StepState, apply_friction, control_step
 from sim.loop.pid_law import PIDLaw
@@ -56,7 +56,7 @@ _LINE = 60
 class EquationOfMotion:
     """Robots without contact and joint limits, by steps of the Runge-Kutta method of order 4; arrays are (M, dof).
 
-    It has the methods of a :class:`sim.engine.pack.Pack` that a control step takes.
+    It has the methods of a :class:`sim.engine.sapien.pack.Pack` that a control step takes.
     """
 
     def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from sim.benchmark.workload import Case, Workload
-from sim.engine.pack import Pack
+from sim.engine.sapien.pack import Pack
 from sim.workers.background import BACKGROUND
 from sim.workers.placement import pinned_cores
 from sim.workers.worker import ONE_THREAD

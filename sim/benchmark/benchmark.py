@@ -22,7 +22,7 @@ from sim.benchmark.peers import make_peers
 from sim.benchmark.policy import ResidualPolicy
 from sim.benchmark.workload import Case, Workload, run_round
 from sim.engine.native import python_calls
-from sim.engine.pack import Pack
+from sim.engine.protocol import EnginePack
 from sim.loop.arrays import Arrays
 from sim.loop.loop import Loop
 from sim.options import RunnerOptions
@@ -186,7 +186,7 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
 
 
-def _time_calls(pack: Pack, spent: dict[str, float]) -> None:
+def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
     """Replace the calls of each phase on ``pack`` by ones that add their seconds to ``spent``."""
 
     def timed(phase: str, call: Callable[..., Any]) -> Callable[..., Any]:

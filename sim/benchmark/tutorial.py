@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.reference import SimplePID
-from sim.engine.user_content import HeadlessScene
+from sim.engine.sapien.user_content import HeadlessScene
 from sim.robot.parts import Settings
 from sim.robot.robot import Robot
 

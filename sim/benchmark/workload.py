@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError
 from sim.benchmark.tutorial import tutorial_settings
-from sim.engine.building import SceneSpec
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 from sim.options import PhysicsPreset
 from sim.robot.robot import Robot
 from sim.runner import Runner

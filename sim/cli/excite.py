@@ -35,7 +35,7 @@ class ExciteCommand:
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
 
-    imports = ("sim.engine.dynamics", "sim.tuning.identification.excitation")
+    imports = ("sim.engine.sapien.dynamics", "sim.tuning.identification.excitation")
 
     def run(self) -> None:
         """Run the command."""

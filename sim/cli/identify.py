@@ -61,7 +61,7 @@ class IdentifyCommand:
     actuators file."""
     force: flags.Force = False
 
-    imports = ("sim.plots", "sim.engine.dynamics", "sim.tuning.identification.identify")
+    imports = ("sim.plots", "sim.engine.sapien.dynamics", "sim.tuning.identification.identify")
 
     def run(self) -> None:
         """Run the command."""

@@ -43,7 +43,7 @@ class InspectCommand:
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
-    imports = ("sim.engine.dynamics",)
+    imports = ("sim.engine.sapien.dynamics",)
 
     def run(self) -> int:
         """Run the command and return its exit status."""

@@ -33,13 +33,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import native
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import Dynamics, loaded_dynamics, robot_dynamics
+from sim.engine.engines import load_engine
 from sim.engine.native.interface import DYNAMICS, STEP
+from sim.engine.protocol import RobotModel
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.description import RobotDescription
 
 Float64 = NDArray[np.float64]
-Models = Callable[[float], Dynamics]
+Models = Callable[[float], RobotModel]
 """Model of a robot with a payload [kg]."""
 _MOST_PAYLOADS = 64
 """Most models of robots with a payload that are kept."""
@@ -81,7 +82,10 @@ def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBa
 
 def models_of(robot: RobotDescription) -> Models:
     """Return the models of ``robot`` on a fixed base."""
-    return lambda payload: loaded_dynamics(robot, payload) if payload else robot_dynamics(robot, ground=False)
+    engine = load_engine()
+    return lambda payload: (
+        engine.loaded_dynamics(robot, payload) if payload else engine.robot_dynamics(robot, ground=False)
+    )
 
 
 class MovingJoints(NamedTuple):
@@ -175,7 +179,7 @@ class PinocchioBatchDynamics:
     def __init__(self, models: Models, joints: MovingJoints) -> None:
         self._models, self._joints, self._spread = models, joints, joints.matrix
         self._empty = models(0.0)
-        self._loaded: dict[float, Dynamics] = {}
+        self._loaded: dict[float, RobotModel] = {}
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
         """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
@@ -190,7 +194,7 @@ class PinocchioBatchDynamics:
                 loaded[rows] = model.inverse_dynamics(q[rows], v[rows], still[rows]) - force[rows]
         return Passive(self._spread.T @ matrix @ self._spread, force @ self._spread, loaded @ self._spread)
 
-    def _model(self, payload: float) -> Dynamics:
+    def _model(self, payload: float) -> RobotModel:
         if not payload:
             return self._empty
         if payload not in self._loaded:

@@ -21,13 +21,14 @@ from sim.engine.batch_dynamics import (
     NativeBatchDynamics,
     PinocchioBatchDynamics,
 )
-from sim.engine.building import SceneSpec, build_scene, new_system
-from sim.engine.calls import PythonCalls
-from sim.engine.dynamics import Dynamics
-from sim.engine.native import NativeCalls, python_calls
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
-from sim.engine.sim_step import NativeStep
+from sim.engine.native import python_calls
+from sim.engine.sapien.building import build_scene, new_system
+from sim.engine.sapien.calls import PythonCalls
+from sim.engine.sapien.dynamics import Dynamics
+from sim.engine.sapien.native_calls import NativeCalls
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.parts import Joint
 
 STEPS = 50
@@ -154,7 +155,7 @@ def _compare_steps() -> None:
     table, looks = np.zeros((3, 4, 2)), 0
     for pack in (ours, theirs):
         pack.write_state(range(4), np.linspace((0, 0), (1.2, 0.4), 4), np.zeros((4, 2)))
-    step = NativeStep(ours, True, True, True, None)
+    step = ours.compiled_step(True, True, True, None)
     for number in range(STEPS):
         effort = np.tile([20.0 * np.sin(number), 5.0], (4, 1))
         theirs.write_qf(effort)
@@ -162,7 +163,7 @@ def _compare_steps() -> None:
         if step(effort, *table):
             looks += 1
             ours.look(step.left())
-            step = NativeStep(ours, True, True, True, None)
+            step = ours.compiled_step(True, True, True, None)
         reads = theirs.read_qpos(), theirs.read_qvel(), theirs.passive_force(True, True)
         if np.array(reads).tobytes() != table.tobytes() or (ours.isolated != theirs.isolated).any():
             raise AssertionError("native and Python sim steps give different results")

@@ -16,11 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.read_only import read_only
 from sim.engine.native import xla
 from sim.engine.native.interface import BODY
-from sim.robot.rotations import from_rpy, rotate
-from sim.robot.spatial_inertia import SpatialInertia, total
 
 Float64 = NDArray[np.float64]
 
@@ -49,39 +46,6 @@ class RigidBodies(NamedTuple):
         return np.hstack([getattr(self, name).reshape(-1, numbers) for name, numbers in BODY.items()])
 
 
-def bodies_of(robot: Any) -> RigidBodies:
-    """Return the bodies of one of SAPIEN's articulations."""
-    dofs = {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
-    places: dict[Any, tuple[int, Float64]] = {}  # of each link: its body, and its pose in the body's frame
-    parts: list[list[SpatialInertia]] = [[] for _ in dofs]
-    tree, at_zero = np.tile(np.array([-1, 0], np.int32), (len(dofs), 1)), np.tile(np.eye(4), (len(dofs), 1, 1))
-    for link in robot.links:
-        if link.parent is None:
-            places[link] = -1, np.eye(4)
-            continue
-        joint, (body, place) = link.joint, places[link.parent]
-        place = place @ _matrix(joint.pose_in_parent)
-        if (dof := dofs.get(joint.name)) is not None:
-            tree[dof], at_zero[dof] = (body, joint.type == "prismatic"), place
-            body, place = dof, np.eye(4)
-        place = place @ _matrix(joint.pose_in_child.inv())
-        places[link] = body, place
-        if body >= 0:
-            at, principal = place @ _matrix(link.cmass_local_pose), np.diag([float(str(one)) for one in link.inertia])
-            parts[body].append(SpatialInertia(link.mass, at[:3, 3], at[:3, :3] @ principal @ at[:3, :3].T))
-    bodies = [total(of_body) for of_body in parts]
-    of_bodies = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, zip(*bodies, strict=True)))
-    return RigidBodies._make(map(read_only, of_bodies))
-
-
 def mass_matrix(bodies: RigidBodies, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), a JAX array on the CPU."""
     return xla.mass_matrix(bodies.tree, bodies.table(), qpos)
-
-
-def _matrix(pose: Any) -> Float64:
-    """Return one of SAPIEN's poses (4, 4), homogeneous: from roll, pitch and yaw, as SAPIEN gives it to Pinocchio."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotate(np.broadcast_to(from_rpy(np.asarray(pose.rpy, float)), (3, 4)), np.eye(3)).T
-    matrix[:3, 3] = pose.p
-    return matrix

@@ -18,6 +18,9 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
         return "the guard of setpoints is in NumPy"
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"
+    engine = options.load_engine()
+    if "compiled_steps" not in engine.capabilities:
+        return f"the sim steps of {engine.name!r} are calls of Python"
     status = xla.status()
     return "" if status.active else status.reason
 

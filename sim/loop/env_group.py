@@ -12,9 +12,7 @@ from batchpid.actuators import ActuatorState, advance_measurement
 from batchpid.elementwise import clip
 from batchpid.friction import FrictionState
 from batchpid.guard import GuardState
-from sim.engine.missed_contact import MissedContacts
-from sim.engine.pack import Pack
-from sim.engine.variation import VariedPack
+from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import obstacle
 from sim.loop.control_step import StepState
@@ -42,7 +40,7 @@ class EnvGroup:
 
     def __init__(
         self,
-        pack: Pack,
+        pack: EnginePack,
         envs: slice,
         params: bp.PIDParams,
         options: RunnerOptions,
@@ -60,7 +58,7 @@ class EnvGroup:
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
-        self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
+        self._contacts = None if collides else options.load_engine().missed_contacts(pack.spec, pack.size, ground)
         qpos = pack.read_qpos()
         self._state = StepState(bp.init(params, qpos) if controller is None else controller.init(pack.size))
         self._prepare()
@@ -77,13 +75,14 @@ class EnvGroup:
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
         self._executor: NumPyExecutor | XLAExecutor = NumPyExecutor(options, pack, layout, constants)
-        if options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators):
+        compiles = options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators)
+        if compiles and isinstance(pack, CompiledPack):
             self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
         self._measured = self._executor.measure()
 
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
-        if self._options.control == "drive":
+        if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
             damping, stiffness = self._constants.drive
             limit = self._acting_params.effort_max
             self.pack.write_drive(stiffness, damping, np.full_like(stiffness, np.inf) if limit is None else limit)
@@ -195,12 +194,8 @@ class EnvGroup:
         pack, state = self.pack, self._take_state()
         friction = {} if state.age is None else {**state.friction._asdict(), AGE: state.age}
         return EnvStates(
-            qpos=pack.read_qpos(np.float32),
-            qvel=pack.read_qvel(np.float32),
+            engine=pack.read_state(),
             effort=self._motor.copy(),
-            root=pack.read_root(),
-            content=pack.read_content(),
-            isolated=pack.isolated.copy(),
             saturated=self._saturated.copy(),
             controller=state.law.leaves() if isinstance(state.law, bp.PIDState) else dict(state.law),
             friction=friction,
@@ -209,14 +204,12 @@ class EnvGroup:
             containment=self._containment.read(),
         )
 
-    def write(self, pack: Pack, states: EnvStates) -> None:
+    def write(self, pack: EnginePack, states: EnvStates) -> None:
         """Continue with ``pack``, which is new, in the given state."""
         self.pack = pack
         if self._own_actuators is not None:
             pack.write_joints(self._take_actuators())
-        pack.write_state(range(pack.size), states.qpos, states.qvel, states.root)
-        pack.write_content(states.content)
-        pack.isolate(np.flatnonzero(states.isolated).tolist())
+        pack.write_state_rows(states.engine)
         self._containment.write(states.containment)
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
@@ -244,7 +237,7 @@ class EnvGroup:
         if self._options.randomization is None or self.draws is None or not rows:
             return
         self._take_state()
-        if isinstance(self.pack, VariedPack):
+        if self._options.randomization.changes_robot:
             self.pack.vary(rows, variation(self._options, len(rows), self.draws.for_envs(rows)))
         self.pack.write_joints(self._take_actuators(), rows)
         self.set_params(self._params)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import ControllerError
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
+from sim.engine.protocol import EnginePack
+from sim.engine.scene_spec import SceneSpec
 from sim.loop.arrays import Arrays, Command, Ticks
 from sim.loop.custom import OwnController
 from sim.loop.env_group import EnvGroup
@@ -74,7 +74,7 @@ class Loop:
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
-    def _build(self, envs: slice, draws: Draws | None = None) -> Pack:
+    def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         return make_pack(self.options, self._scene, envs.stop - envs.start, self._first_env + envs.start, draws)
 
     def reset(
@@ -156,9 +156,9 @@ class Loop:
             group.pack.close()
             group.write(self._build(group.envs, group.draws), states.for_envs(group.envs))
 
-    def content_sizes(self) -> list[int]:
-        """Return how many numbers a snapshot holds of each env's user content."""
-        return [size for group in self.groups for size in group.pack.content_sizes()]
+    def state_sizes(self) -> list[int]:
+        """Return the number of values in the engine's state of each env."""
+        return [size for group in self.groups for size in group.pack.state_sizes()]
 
     def poses(self) -> list[NDArray[np.float32]]:
         """Return the poses of the entities that ``build`` returned for each env, (entities, 7) each."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ControllerError
-from sim.engine.dynamics import Dynamics, model_force, scene_dynamics
-from sim.engine.pack import Pack
+from sim.engine.engines import scene_dynamics
+from sim.engine.protocol import DrivenPack, EnginePack, RobotModel
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from sim.loop.custom import OwnController
@@ -54,7 +54,7 @@ def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
 class NumPyExecutor:
     """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` is complete."""
 
-    def __init__(self, options: RunnerOptions, pack: Pack, layout: Layout, constants: Constants) -> None:
+    def __init__(self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants) -> None:
         self._pack, self._layout, self._constants = pack, layout, constants
         self._gravity, self._coriolis = passive_forces(options)
         self._speed_limit = options.speed_limit
@@ -82,7 +82,9 @@ class NumPyExecutor:
                 if self._controller is None:
                     raise
                 raise ControllerError(type(self._controller).__name__, error, index + 1) from error
-            if outputs.target is not target:  # drives' targets cost a call for each joint
+            if outputs.target is not target and isinstance(
+                pack, DrivenPack
+            ):  # drives' targets cost a call for each joint
                 known = outputs.target_rate is rate
                 pack.write_drive_target(outputs.target, None if known else _zeros_for_none(outputs))
                 target, rate = outputs.target, outputs.target_rate
@@ -103,7 +105,7 @@ class NumPyExecutor:
 
 
 def with_model(
-    options: RunnerOptions, pack: Pack, layout: Layout, constants: Constants, controller: OwnController | None
+    options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
 ) -> Layout:
     """Return ``layout`` with the functions for arrays of NumPy, natively compiled ones where there are such."""
     jitted, motors, (gravity, coriolis) = options.backend == "jax", constants.motors, passive_forces(options)
@@ -118,7 +120,7 @@ def with_model(
     if motors is not None:
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if gravity:
-        force = partial(model_force, pack.spec, gravity=gravity, coriolis=coriolis)
+        force = lambda qpos, qvel: scene_dynamics(pack.spec).passive_force(qpos, qvel, gravity, coriolis)  # noqa: E731
         model = model._replace(passive_force=force)
     return layout._replace(model=model)
 
@@ -127,17 +129,17 @@ def _zeros_for_none(outputs: Outputs) -> Float64:
     return np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
 
 
-def _mass_matrix(pack: Pack) -> Callable[[Float64], Float64]:
+def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
     """Return the function of the mass matrix of the description of the robots."""
 
     @cache
-    def dynamics() -> Dynamics:
+    def dynamics() -> RobotModel:
         return scene_dynamics(pack.spec)
 
     return lambda qpos: dynamics().mass_matrix(qpos)
 
 
-def _joint_mass_matrix(pack: Pack, qpos: Float64) -> Float64:
+def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
     """Return the mass matrix that the joints show, with the armature of the motors."""
     matrix = pack.joint_mass_matrix(qpos)
     return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix

@@ -35,7 +35,7 @@ CHANGED = "changed"
 """Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 7
+_FORMAT = 8
 _ACTUATORS = "actuator_params"
 _CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
 _CHOICES["conditional"] = (Everywhere(),)
@@ -46,15 +46,10 @@ _CHOICES["conditional"] = (Everywhere(),)
 class EnvStates:
     """State of some envs; every array has a row for each."""
 
-    qpos: NDArray[np.float32]
-    qvel: NDArray[np.float32]
+    engine: NDArray[np.float64]
+    """Robots and content (envs, values), of which only the engine knows the meaning; NaN where an env has fewer values
+    than another (:meth:`sim.engine.protocol.EnginePack.read_state`)."""
     effort: NDArray[np.float32]
-    root: NDArray[np.float32]
-    """Position, quaternion w, x, y, z, linear and angular velocity of the root link (envs, 13)."""
-    content: NDArray[np.float32]
-    """State of the user content (envs, numbers); NaN where an env has fewer numbers than another."""
-    isolated: NDArray[np.bool_]
-    """Robots that have their own PhysX system (:mod:`sim.engine.contact_prediction`)."""
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
@@ -75,8 +70,8 @@ class EnvStates:
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
         """Return the states of the envs of all ``parts``."""
-        width = max(part.content.shape[1] for part in parts)
-        tables = [flatten(vars(replace(part, content=widen(part.content, width)))) for part in parts]
+        width = max(part.engine.shape[1] for part in parts)
+        tables = [flatten(vars(replace(part, engine=widen(part.engine, width)))) for part in parts]
         return EnvStates(**nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
 
     def check(
@@ -87,9 +82,9 @@ class EnvStates:
         friction: bool,
         actuators: dict[str, NDArray[Any]],
         guard: bool,
-        content_sizes: Sequence[int],
+        engine_sizes: Sequence[int],
     ) -> None:
-        """Check that these are states of so many envs and joints, with content of such sizes (envs,).
+        """Check that these are states of so many envs and joints, with as many values of the engine (envs,).
 
         ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
         have Coulomb friction, ``guard`` whether there is a guard.
@@ -101,12 +96,8 @@ class EnvStates:
         """
         table, double, row = np.zeros((num_envs, dof), np.float32), np.zeros((num_envs, dof)), np.zeros(num_envs, bool)
         expected = EnvStates(
-            qpos=table,
-            qvel=table,
+            engine=np.zeros((num_envs, self.engine.size // num_envs)),
             effort=table,
-            root=np.zeros((num_envs, 13), np.float32),
-            content=np.zeros((num_envs, self.content.size // num_envs), np.float32),
-            isolated=row,
             saturated=table > 0,
             controller=controller,
             friction={**dict.fromkeys(FrictionState._fields, double), AGE: row.astype(np.int64)} if friction else {},
@@ -129,8 +120,8 @@ class EnvStates:
         for name, count in (("joint", dof), ("cause", len(CAUSES))):
             if not ((self.containment[name] >= 0) & (self.containment[name] < count)).all():
                 raise InvalidArgumentError("snapshot", f"names a {name} beyond {count}", remedy="take a new one")
-        for env, size in enumerate(content_sizes):
-            if size > self.content.shape[1] or not np.isnan(self.content[env, size:]).all():
+        for env, size in enumerate(engine_sizes):
+            if size > self.engine.shape[1] or not np.isnan(self.engine[env, size:]).all():
                 raise InvalidArgumentError(
                     "snapshot",
                     "holds other content than this runner's build makes",
@@ -139,7 +130,7 @@ class EnvStates:
                 )
 
     def __repr__(self) -> str:
-        return "EnvStates({} envs, {} joints)".format(*self.qpos.shape)
+        return "EnvStates({} envs, {} joints)".format(*self.effort.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,8 +238,8 @@ class Snapshot:
         params.options()  # raises for a choice that is none
         params.check(num_envs)
         # The rows first: what the next check allocates is of the size of the file then.
-        if states.qpos.shape != (num_envs, dof) or params.num_joints != dof or params.dtype.kind != "f":
-            raise ValueError(f"its qpos {states.qpos.shape} or params do not fit {num_envs} envs of {dof} joints")
+        if states.effort.shape != (num_envs, dof) or params.num_joints != dof or params.dtype.kind != "f":
+            raise ValueError(f"its effort {states.effort.shape} or params do not fit {num_envs} envs of {dof} joints")
         controller = states.controller
         if about["control"] in ("pid", "drive", "effort"):
             controller = bp.init(params, np.zeros((num_envs, dof), np.float32)).leaves()

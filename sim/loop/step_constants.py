@@ -11,7 +11,7 @@ from batchpid import actuators as actuator_model
 from batchpid.actuators import ActuatorState
 from batchpid.coupling import Coupling
 from batchpid.elementwise import TURN
-from sim.engine.pack import Pack
+from sim.engine.protocol import EnginePack
 from sim.loop.control_step import Constants, KnownFriction, Layout
 from sim.loop.pid_law import PIDLaw
 from sim.options import RunnerOptions
@@ -32,7 +32,7 @@ def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actu
 
 def make_constants(
     options: RunnerOptions,
-    pack: Pack,
+    pack: EnginePack,
     params: bp.PIDParams,
     actuators: bp.Actuators | None = None,
     motors: ActuatorState | None = None,
@@ -80,7 +80,7 @@ def acting_gains(params: bp.PIDParams, coupling: Coupling | None) -> bp.PIDParam
     return params.replace(**{name: gain * coupling.independent for name, gain in gains.items() if gain is not None})
 
 
-def _known_friction(options: RunnerOptions, pack: Pack) -> KnownFriction | None:
+def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction | None:
     """Return the friction to compensate: that of the description and of the robot's own actuators; None for none."""
     joints = pack.spec.joints
     modelled = DISSIPATION[pack.spec.dissipation].modelled

@@ -13,7 +13,7 @@ from batchpid import guard as guard_model
 from batchpid.actuators import ActuatorState
 from batchpid.computed_torque import convert_integral
 from batchpid.friction import FrictionState
-from sim.engine.pack import Pack
+from sim.engine.protocol import EnginePack
 from sim.loop.control_step import (
     REFRESH_STEPS,
     Constants,
@@ -28,7 +28,7 @@ Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
 
-def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: Pack, mask: Bool) -> StepState:
+def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack, mask: Bool) -> StepState:
     """Return ``state`` with the friction model of the envs of ``mask`` (M,) at the present state of the robots."""
     model = constants.friction
     if model.coulomb is None:
@@ -44,7 +44,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     return state._replace(friction=fresh, age=age)
 
 
-def with_friction(layout: Layout, constants: Constants, state: StepState, pack: Pack) -> StepState:
+def with_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack) -> StepState:
     """Return ``state`` after a change of the friction of ``pack``: the model carries on, with another inertia."""
     if constants.friction.coulomb is None or state.age is None:
         return reset_friction(layout, constants, state, pack, np.ones(pack.size, bool))
@@ -75,7 +75,7 @@ def reset_guard(constants: Constants, state: StepState, qpos: Float64, mask: Boo
 
 
 def init_motors(
-    actuators: bp.Actuators, pack: Pack, qpos: Float64, episode: NDArray[np.int64], **since: Any
+    actuators: bp.Actuators, pack: EnginePack, qpos: Float64, episode: NDArray[np.int64], **since: Any
 ) -> ActuatorState:
     """Return the state of actuators that start at ``qpos``: :func:`batchpid.actuators.init`."""
     envs = np.arange(pack.first_env, pack.first_env + pack.size)

@@ -29,6 +29,6 @@ def nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     return groups
 
 
-def widen(rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+def widen(rows: NDArray[np.float64], width: int) -> NDArray[np.float64]:
     """Return ``rows`` (envs, n) with ``width`` columns, the new ones NaN."""
     return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=np.nan)

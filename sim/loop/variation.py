@@ -5,21 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 import batchpid as bp
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.engine.variation import Variation, VariedPack
+from sim.engine.protocol import EnginePack
+from sim.engine.scene_spec import SceneSpec, Variation
 from sim.options import RunnerOptions
 from sim.randomization.draws import Draws
 from sim.randomization.fields import PHYSICAL, elements, nominal_values
 
 
-def make_pack(options: RunnerOptions, scene: SceneSpec, size: int, first_env: int, draws: Draws | None) -> Pack:
+def make_pack(options: RunnerOptions, scene: SceneSpec, size: int, first_env: int, draws: Draws | None) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` the robots are those of the model."""
     randomization, robot, packed = options.randomization, options.robot, options.scenes_per_system
+    make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
-        return Pack(scene, size, first_env, packed)
+        return make(scene, size, first_env, packed)
     varied, links = variation(options, size, draws), elements("link_mass", robot)
-    return VariedPack(scene, size, first_env, packed, varied, randomization.carrier(robot), links)
+    return make(scene, size, first_env, packed, varied, randomization.carrier(robot), links)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:

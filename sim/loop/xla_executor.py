@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from batchpid.coefficients import Coefficients
 from batchpid.friction import Friction
 from batchpid.jax_settings import own_settings
-from sim.engine.dynamics import scene_dynamics
+from sim.engine.engines import scene_dynamics
 from sim.engine.native import xla
 from sim.engine.native.interface import STATUS
-from sim.engine.pack import Pack
-from sim.engine.sim_step import FAILED, NativeStep
+from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from sim.loop.custom import OwnController, controller_errors
@@ -61,7 +60,7 @@ class XLAExecutor:
     def __init__(
         self,
         options: RunnerOptions,
-        pack: Pack,
+        pack: CompiledPack,
         layout: Layout,
         constants: Constants,
         controller: OwnController | None,
@@ -71,7 +70,7 @@ class XLAExecutor:
         self._controller = controller
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
         self._reads_qvel = needs_qvel(layout, constants, None)
-        self._native: NativeStep | None = None
+        self._native: CompiledStep | None = None
         self._bound: Any = None
         self._no_matrix: Any = None
         law = layout.law
@@ -157,12 +156,12 @@ class XLAExecutor:
             state = state._replace(matrix=self._no_matrix)
         return state
 
-    def _bind(self) -> NativeStep:
+    def _bind(self) -> CompiledStep:
         """Return the sim step of the present robots and systems."""
         pack = self._pack
         if self._native is None or self._bound is not pack.calls:
             self._bound = pack.calls
-            self._native = NativeStep(pack, self._gravity, self._coriolis, self._reads_qvel, self._speed_limit)
+            self._native = pack.compiled_step(self._gravity, self._coriolis, self._reads_qvel, self._speed_limit)
         return self._native
 
 

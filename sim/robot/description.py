@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +32,7 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 class Dynamics(Protocol):
-    """Dynamics and contact of one robot at given poses (n, dof); :class:`sim.engine.dynamics.Dynamics` is one."""
+    """Dynamics and contact of one robot at given poses (n, dof), of the engine."""
 
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
@@ -47,20 +47,25 @@ class Dynamics(Protocol):
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 
 
-class Engine(NamedTuple):
-    """Functions of the engine, which is a floor above, so that :mod:`sim` connects the two."""
+class RobotFunctions(Protocol):
+    """Functions of an engine that a robot needs; :class:`sim.engine.protocol.Engine` has them."""
 
-    dynamics: Callable[[RobotDescription, bool | None], Dynamics]
-    self_contact: Callable[[RobotDescription], SelfContact]
-    link_masses: Callable[[RobotDescription], Mapping[str, LinkMass]]
+    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> Dynamics:
+        """Return the dynamics of ``robot`` on a fixed base; ``ground`` as in :meth:`RobotDescription.dynamics`."""
+
+    def self_contact(self, robot: RobotDescription) -> SelfContact:
+        """Return the pairs of links that do not collide. Raises RobotError if the engine cannot build the robot."""
+
+    def link_masses(self, robot: RobotDescription) -> Mapping[str, LinkMass]:
+        """Return the simulated mass of every link. Raises RobotError if the engine cannot build the robot."""
 
 
-_engine: list[Engine] = []
+_load_engine: list[Callable[[], RobotFunctions]] = []
 
 
-def register_engine(engine: Engine) -> None:
-    """Set the functions by which a :class:`RobotDescription` reaches the engine."""
-    _engine[:] = [engine]
+def register_engine(load: Callable[[], RobotFunctions]) -> None:
+    """Set the function that returns the engine, which is a floor above, so that :mod:`sim` connects the two."""
+    _load_engine[:] = [load]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -247,17 +252,17 @@ class RobotDescription(Urdf):
 
         ``ground`` says whether there is one at height 0, by default :attr:`has_ground`.
         """
-        return _engine[0].dynamics(self, ground)
+        return _load_engine[0]().robot_dynamics(self, ground)
 
     @cached_property
     def self_contact(self) -> SelfContact:
         """Pairs of links that do not collide, and contact with the ground. Loads SAPIEN at the first use."""
-        return _engine[0].self_contact(self)
+        return _load_engine[0]().self_contact(self)
 
     @cached_property
     def link_masses(self) -> Mapping[str, LinkMass]:
         """Simulated mass of every link of the URDF, by name. Loads SAPIEN at the first use."""
-        return _engine[0].link_masses(self)
+        return _load_engine[0]().link_masses(self)
 
     @property
     def ignored_pairs(self) -> tuple[tuple[str, str], ...]:

@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.files import replacing
 from batchpid.validate import file_path, integer, number
-from sim.engine import sapien
+from sim.engine.native.library import import_sapien
 from sim.observation import Rollout
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 from sim.robot.rotations import from_rpy
 from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotLayout, arrange_robots
 from sim.view.playback import had_ground, rows_at
+
+sapien: Any = import_sapien()
 
 FORMATS = (".mp4", ".gif")
 _ENCODERS = {

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.dynamics import robot_dynamics
+from sim.engine.engines import load_engine
 from sim.robot.kinematics import Kinematics
 from sim.robot.robot import Robot
 
@@ -67,4 +67,4 @@ def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group:
 def lowest_point(kinematics: Kinematics, robot: Robot) -> float:
     """Return the height [m] of the lowest collision shape or link frame at the start pose."""
     frames = kinematics.poses(robot.start).position[:, 2].min()
-    return min(float(frames), robot_dynamics(robot).height(robot.start, base_too=True))
+    return min(float(frames), load_engine().robot_dynamics(robot).height(robot.start, base_too=True))

@@ -215,13 +215,13 @@ class Restore(Request):
 
 
 @dataclass(frozen=True)
-class ReadContentSizes(Request):
-    """Read how many numbers a snapshot holds of each env's content."""
+class ReadStateSizes(Request):
+    """Read the number of values in the engine's state of each env."""
 
     changes_loop = False
 
     def apply(self, loop: Loop) -> list[int]:
-        return loop.content_sizes()
+        return loop.state_sizes()
 
     def join(self, results: list[list[int]]) -> list[int]:
         return [size for sizes in results for size in sizes]

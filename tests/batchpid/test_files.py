@@ -65,8 +65,8 @@ def test_a_trial_leaves_nothing_and_names_what_is_no_file(tmp_path):
 
 NOT_FILES = {
     "batchpid/files.py": "the atomic writer",
-    "sim/engine/building.py": "text in memory",
-    "sim/engine/trial.py": "a pipe",
+    "sim/engine/sapien/building.py": "text in memory",
+    "sim/engine/sapien/trial.py": "a pipe",
     "sim/recording/partial_file.py": "space for a growing recording",
     "sim/view/film.py": "messages in memory",
 }

@@ -1,116 +1,20 @@
-"""Native calls into the engine: an optional extension that reads and writes all robots of a pack in one call.
+"""Native extensions: programs on arrays, dynamics of many robots, and calls into SAPIEN.
 
-The extension calls functions that SAPIEN's shared library exports, so that it needs nothing of SAPIEN to be compiled.
-It depends on the layout of two of SAPIEN's types, which no header promises: see :mod:`sim.engine.native.verdict`.
-Where it is not used, and with the environment variable ``BATCHPID_NATIVE=0``, Python's calls do the same work.
+Where they are not used, and with the environment variable ``BATCHPID_NATIVE=0``, Python does the same work.
 """
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-from sim.engine.calls import EngineCalls, PythonCalls
-from sim.engine.native.library import callback_table, functions
 from sim.engine.native.loading import extension
 from sim.engine.native.verdict import SWITCH, NativeStatus, environment, python_calls, status, take_verdict, verify
 
 __all__ = [
     "SWITCH",
-    "NativeCalls",
     "NativeStatus",
-    "contact_maps",
-    "engine_calls",
     "environment",
     "extension",
-    "gateway_address",
-    "gateway_sim_step",
-    "pointer",
     "python_calls",
     "status",
     "take_verdict",
     "verify",
 ]
-
-_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
-_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
-_capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
-    ("PyCapsule_GetPointer", ctypes.pythonapi)
-)
-
-
-def engine_calls(
-    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
-) -> EngineCalls:
-    """Return native calls where they are available, else Python's; the arguments are those of both."""
-    make = NativeCalls if robots and status().active else PythonCalls
-    return make(robots, systems, qf, skip)
-
-
-class NativeCalls:
-    """The calls of :class:`sim.engine.calls.PythonCalls`, one for all robots. Raises RuntimeError if SAPIEN does."""
-
-    def __init__(
-        self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
-    ) -> None:
-        self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
-        pointers = [[pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))]
-        self._native = extension("_gateway")
-        self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
-        self.systems, self.qf, self.skip = self._objects[1], qf, skip
-
-    def qpos(self, dtype: Any) -> NDArray[Any]:
-        """Return the joint positions, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
-        self._native.read_qpos(self.gateway, rows)
-        return rows
-
-    def qvel(self, dtype: Any) -> NDArray[Any]:
-        """Return the joint velocities, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
-        self._native.read_qvel(self.gateway, rows)
-        return rows
-
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
-        rows = np.empty(self.qf.shape, dtype)
-        self._native.passive_force(self.gateway, rows, gravity, coriolis)
-        return rows
-
-    def write_qf(self) -> None:
-        """Apply the efforts in ``qf``."""
-        self._native.write_qf(self.gateway, self.qf, self.skip)
-
-    def step(self) -> None:
-        """Do one sim step of every system."""
-        self._native.step(self.gateway)
-
-
-def pointer(wrapper: Any, kind: str) -> int:
-    """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "body".
-
-    It comes by pybind11's conduit, which checks type and ABI.
-    """
-    capsule = wrapper._pybind11_conduit_v1_(_ABI, extension("_gateway").type_info(kind), b"raw_pointer_ephemeral")
-    if capsule is None:
-        raise RuntimeError(f"SAPIEN's {kind} is not of the type that the extension was made for")
-    return _capsule_pointer(capsule, _capsule_name(capsule))
-
-
-def gateway_address(gateway: Any) -> int:
-    """Return the address of what a gateway's capsule holds."""
-    return extension("_gateway").address(gateway)
-
-
-def gateway_sim_step(address: int, *arrays: NDArray[np.float64]) -> int:
-    """Do a sim step of the group at ``address``: see :class:`sim.engine.sim_step.NativeStep`."""
-    return extension("_gateway").sim_step(address, *arrays)
-
-
-def contact_maps(gateway: Any) -> list[int]:
-    """Return the address of the map of contacts of each system of a gateway; 0 if it is not found."""
-    return extension("_gateway").contacts(gateway, callback_table())

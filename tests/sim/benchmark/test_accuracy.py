@@ -6,7 +6,7 @@ from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.physics import PHYSICS
 
 
 def falling(robot, qpos, timestep, seconds):

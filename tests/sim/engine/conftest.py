@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.engine.pack import Pack
+from sim.engine.sapien.pack import Pack
 
 
 class Packs(list[Pack]):

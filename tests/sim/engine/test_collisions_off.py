@@ -14,10 +14,10 @@ from robots import RUBBING, load_bundled
 import batchpid
 from batchpid.errors import InvalidArgumentError
 from sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.missed_contact import DEPTH
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.missed_contact import DEPTH
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 from sim.options import default_params
 from sim.tuning.moves import random_moves
 

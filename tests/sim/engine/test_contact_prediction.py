@@ -10,8 +10,8 @@ from robots import load_bundled
 
 from sim import Runner
 from sim.benchmark.accuracy import contact_moves
-from sim.engine.building import SceneSpec, build_scene, new_system
-from sim.engine.contact_prediction import (
+from sim.engine.sapien.building import build_scene, new_system
+from sim.engine.sapien.contact_prediction import (
     LISTED_DISTANCE,
     LOOKAHEAD_STEPS,
     MAX_ACCELERATION,
@@ -22,10 +22,11 @@ from sim.engine.contact_prediction import (
     NearPair,
     SafeRegions,
 )
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.extents import link_extents, touching_pairs
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.extents import link_extents, touching_pairs
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 
 DT = 1 / 2000
 

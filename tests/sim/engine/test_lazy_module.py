@@ -9,7 +9,7 @@ from sim.engine.lazy_module import LazyModule, imported_lazily
 
 PROGRAM = """
 import sys
-import sim.engine.building
+import sim.engine.sapien.building
 assert not {"trimesh", "scipy"} & sys.modules.keys(), "a worker starts without them"
 import sapien.wrapper.urchin.utils as urchin
 import trimesh

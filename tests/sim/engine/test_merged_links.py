@@ -6,11 +6,12 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner
-from sim.engine.building import SceneSpec, parse
-from sim.engine.collision_groups import may_touch
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
-from sim.engine.variation import Variation, VariedPack
+from sim.engine.sapien.building import parse
+from sim.engine.sapien.collision_groups import may_touch
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.sapien.variation import VariedPack
+from sim.engine.scene_spec import SceneSpec, Variation
 
 BOX = '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry></collision>'

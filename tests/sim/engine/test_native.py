@@ -12,9 +12,9 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 from sim import Robot, Runner
 from sim.engine import native
-from sim.engine.building import SceneSpec
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 
 BUILT = not native.status().reason.startswith("the extension was not built")
 needs_extension = pytest.mark.skipif(not BUILT, reason="the extension was not built: no C++ compiler")

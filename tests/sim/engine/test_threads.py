@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.engine.building import SceneSpec, build_scene, new_system
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.building import build_scene, new_system
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 
 
 @pytest.fixture

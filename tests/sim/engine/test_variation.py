@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from robots import load_bundled
 
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import Dynamics
-from sim.engine.pack import Pack
-from sim.engine.physics import PHYSICS
-from sim.engine.variation import Variation, VariedPack
+from sim.engine.sapien.dynamics import Dynamics
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.sapien.variation import VariedPack
+from sim.engine.scene_spec import SceneSpec, Variation
 
 STEPS = 120
 

@@ -155,8 +155,8 @@ def rewrite(good, path, save=np.savez, **changes):
         ({"about": {"num_envs": 10**9}}, "do not fit 1000000000 envs"),
         ({"about": {"num_envs": "2"}}, "num_envs"),
         ({"about": {"joints": ["a"]}}, "do not fit 2 envs of 1 joints"),
-        ({"qpos": np.zeros(18, np.float32)}, "do not fit"),
-        ({"root": np.zeros((2, 10**5), np.float32)}, "has root of"),
+        ({"effort": np.zeros(18, np.float32)}, "do not fit"),
+        ({"engine": np.zeros((2, 10**5), np.float32)}, "has engine of"),
         ({"params.kp": np.full((1, 9), np.nan)}, r"params\.kp"),
         ({"params.kp": np.full((1, 9), -1.0)}, r"params\.kp"),
         ({"params.kp": np.zeros((1, 9), int)}, "int64"),
@@ -181,7 +181,7 @@ def test_numbers_that_do_not_agree_are_refused(good, changes, message, tmp_path)
 
 
 def test_a_small_file_that_expands_a_thousand_times_is_refused(good, tmp_path):
-    rewrite(good, tmp_path / "bomb.npz", np.savez_compressed, content=np.zeros((2, 10**7), np.float32))
+    rewrite(good, tmp_path / "bomb.npz", np.savez_compressed, engine=np.zeros((2, 10**7), np.float32))
     tracemalloc.start()
     with pytest.raises(InvalidArgumentError, match="bytes, more than"):
         Snapshot.load(tmp_path / "bomb.npz")

@@ -8,9 +8,9 @@ from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
 from sim import Randomization, Robot, Runner, Uniform
-from sim.engine.building import SceneSpec
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]

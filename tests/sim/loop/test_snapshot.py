@@ -170,7 +170,7 @@ def test_a_snapshot_with_other_content_is_refused(panda, builds):
 
 
 BROKEN = {
-    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 7"),
+    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 8"),
     "about": (lambda head, tables: head.update(about=[]), "cannot be read"),
     "steps": (lambda head, tables: head.update(steps=-1), "cannot be read"),
     "a marker": (lambda head, tables: head.update(markers={"anti_windup": "Evil"}), "cannot be read"),
@@ -181,9 +181,17 @@ BROKEN = {
         lambda head, tables: tables.update({"containment.x": np.zeros(2)}),
         "an unknown containment.x",
     ),
-    "text": (lambda head, tables: tables.update(qpos=tables["qpos"].astype("U8")), "qpos of <U8"),
-    "content of another rank": (lambda head, tables: tables.update(content=np.zeros(2, "f4")), "content of float32"),
-    "one env": (lambda head, tables: tables.update(qvel=tables["qvel"][:1]), r"qvel of float32 \(1, 9\)"),
+    "text": (lambda head, tables: tables.update(engine=tables["engine"].astype("U8")), "engine of <U8"),
+    "another precision": (lambda head, tables: tables.update(engine=np.float32(tables["engine"])), "engine of float32"),
+    "rows of another rank": (lambda head, tables: tables.update(engine=np.zeros(2)), r"engine of float64 \(2,\)"),
+    "one env": (lambda head, tables: tables.update(engine=tables["engine"][:1]), r"engine of float64 \(1, 32\)"),
+    "short rows": (lambda head, tables: tables.update(engine=tables["engine"][:, :-1]), "env 0: holds other content"),
+    "long rows": (
+        lambda head, tables: tables.update(engine=np.pad(tables["engine"], ((0, 0), (0, 1)))),
+        "env 0: holds other content",
+    ),
+    "no rows": (lambda head, tables: tables.pop("engine"), "cannot be read"),
+    "efforts of one env": (lambda head, tables: tables.update(effort=tables["effort"][:1]), r"effort \(1, 9\)"),
     "a joint beyond": (
         lambda head, tables: tables.update({"containment.joint": np.full(2, 9)}),
         "names a joint beyond 9",

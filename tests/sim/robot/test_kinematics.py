@@ -11,8 +11,9 @@ from tiny_urdf import link, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot
-from sim.engine.building import SceneSpec, build_scene, new_system
-from sim.engine.physics import PHYSICS
+from sim.engine.sapien.building import build_scene, new_system
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.kinematics import Kinematics
 from sim.robot.rotations import about, from_rpy, multiply, rotate
 

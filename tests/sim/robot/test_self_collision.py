@@ -15,7 +15,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from sim import Robot, Runner
-from sim.engine.dynamics import robot_dynamics
+from sim.engine.sapien.dynamics import robot_dynamics
 from sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'

@@ -12,8 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import (
-    SceneSpec,
+from sim.engine.rigid_body import RigidBodies, mass_matrix
+from sim.engine.sapien.bodies import bodies_of
+from sim.engine.sapien.building import (
     add_point_mass,
     build_scene,
     center_of_mass,
@@ -22,11 +23,11 @@ from sim.engine.building import (
     rigid_bodies,
     shape_owners,
 )
-from sim.engine.collision_groups import Pair
-from sim.engine.contact_prediction import WORLD, ContactPredictor, NearPair
-from sim.engine.extents import link_extents, touching_pairs
-from sim.engine.physics import PHYSICS
-from sim.engine.rigid_body import RigidBodies, bodies_of, mass_matrix
+from sim.engine.sapien.collision_groups import Pair
+from sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair
+from sim.engine.sapien.extents import link_extents, touching_pairs
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.description import RobotDescription
 from sim.robot.kinematics import Kinematics
 from sim.robot.mimics import coupling_of
@@ -123,6 +124,13 @@ class Dynamics:
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         return _rowwise(self._model.compute_inverse_dynamics, qpos, qvel, qacc)
+
+    @_one_at_a_time
+    def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
+        still = np.zeros_like(qpos)
+        force = self.inverse_dynamics(qpos, qvel if coriolis else still, still)
+        return force if gravity else force - self.inverse_dynamics(qpos, still, still)
 
     @_one_at_a_time
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
@@ -261,13 +269,6 @@ def loaded_dynamics(robot: RobotDescription, payload: float) -> Dynamics:
         robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"], merge_fixed=robot.merge_fixed
     )
     return Dynamics(replace(spec, ground=False), payload, kinematics.links[kinematics.tool])
-
-
-def model_force(spec: SceneSpec, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
-    """Return the passive force of the model at ``qpos`` and ``qvel`` (M, dof), as a controller computes it."""
-    model, still = scene_dynamics(spec), np.zeros_like(qpos)
-    force = model.inverse_dynamics(qpos, qvel if coriolis else still, still)
-    return force if gravity else force - model.inverse_dynamics(qpos, still, still)
 
 
 def robot_dynamics(robot: RobotDescription, ground: bool | None = None) -> Dynamics:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import link_inertia, unmerged_links
-from sim.engine.extents import shape_box
+from sim.engine.sapien.building import link_inertia, unmerged_links
+from sim.engine.sapien.extents import shape_box
 from sim.robot.description import RobotDescription
 from sim.robot.parts import LinkMass
 

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine import native
-from sim.engine.native.interface import STATUS, Group
-from sim.engine.pack import Pack
-
-FAILED = 1 << STATUS.index("failed")
-"""Bit of the status of a sim step in which SAPIEN raised an exception."""
+from sim.engine.native.interface import Group
+from sim.engine.sapien.calls import EngineCalls
+from sim.engine.sapien.contact_watch import ContactWatch
+from sim.engine.sapien.native_calls import NativeCalls, contact_maps, gateway_address, gateway_sim_step, pointer
 
 
 class NativeStep:
-    """Sim step of the robots of ``pack``: apply efforts, step, read, and judge whether Python has to look.
-
-    It holds for the present :attr:`sim.engine.pack.Pack.calls`, which have to be native.
+    """Sim step of the robots of a pack: apply efforts, step, read, and judge whether Python has to look.
 
     Parameters
     ----------
-    pack
-        Its watch is judged and updated in place.
+    calls
+        Present calls of the pack, which have to be native.
+    systems
+        PhysX system of each robot.
+    watch
+        Watch of the pack, judged and updated in place.
     gravity, coriolis
         Parts of the passive force that is read; without both it is zero.
     velocities
@@ -34,19 +35,25 @@ class NativeStep:
     """
 
     def __init__(
-        self, pack: Pack, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+        self,
+        calls: EngineCalls,
+        systems: Sequence[Any],
+        watch: ContactWatch,
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: NDArray[np.float64] | None,
     ) -> None:
-        calls, watch = pack.calls, pack.watch
-        assert isinstance(calls, native.NativeCalls)
+        assert isinstance(calls, NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
-        system_of = [numbers[system] for system in pack.systems]
+        system_of = [numbers[system] for system in systems]
         self._watch, self._looked_at = watch, list[Any]()
-        contacts = native.contact_maps(calls.gateway)
+        contacts = contact_maps(calls.gateway)
         if not all(contacts):
             raise RuntimeError("the contacts of SAPIEN's systems are not where they are looked for")
         regions, count = watch.regions, len(system_of)
         pairs = regions.arms.shape[1]
-        bodies = sorted((native.pointer(link, "body"), row) for link, (row, _) in watch.links.items())
+        bodies = sorted((pointer(link, "body"), row) for link, (row, _) in watch.links.items())
         self._outside, self._watched = np.zeros(count, np.uint8), np.zeros(len(contacts), np.uint8)
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, calls.qf.shape[1:]).astype(np.float64)
         arrays = {
@@ -65,7 +72,7 @@ class NativeStep:
             "outside": self._outside,
         } | ({} if limit is None else {"speed_limit": limit})
         self._group = Group(
-            gateway=native.gateway_address(calls.gateway),
+            gateway=gateway_address(calls.gateway),
             pairs=pairs,
             bodies_size=len(bodies),
             gravity=gravity,
@@ -88,7 +95,7 @@ class NativeStep:
 
     def __call__(self, *arrays: NDArray[np.float64]) -> int:
         """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
-        return native.gateway_sim_step(self.prepare(), *arrays)
+        return gateway_sim_step(self.prepare(), *arrays)
 
     @property
     def message(self) -> str:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from sapien import Pose
 
 from batchpid.friction import Friction
-from sim.engine.building import SceneSpec, center_of_mass, merged, set_inertia
-from sim.engine.dynamics import model_force, scene_dynamics
-from sim.engine.pack import Pack
+from sim.engine.sapien.building import center_of_mass, merged, set_inertia
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.pack import Pack
+from sim.engine.scene_spec import SceneSpec, Variation
 from sim.robot.merging import place_links
 from sim.robot.mimics import coupling_of
 from sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total
@@ -27,24 +28,6 @@ from sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_m
 Float64 = NDArray[np.float64]
 _NO_MASS = 1e-6
 """Mass [kg] that SAPIEN gives a link without mass."""
-
-
-class Variation(NamedTuple):
-    """Differences of some robots from the model, one row each; None where there is none."""
-
-    payload: Float64 | None = None
-    """Mass added at the center of mass of a link (envs,) [kg]."""
-    link_mass: Float64 | None = None
-    """Mass of each link of the URDF as a share of its own (envs, links); NaN for 1."""
-    center_of_mass: Float64 | None = None
-    """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3 links) [m]: x, y, z of
-    the first link, of the second, ..."""
-    friction: Float64 | None = None
-    """Coulomb friction of the joints (envs, dof) [N m or N]."""
-    damping: Float64 | None = None
-    """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
-    armature: Float64 | None = None
-    """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""
 
 
 class VariedPack(Pack):
@@ -126,7 +109,7 @@ class VariedPack(Pack):
         """Return the passive force of the model at the measured positions."""
         if not self._bodies:
             return super().passive_force(gravity, coriolis, dtype)
-        force = model_force(self.spec, self.read_qpos(), self.read_qvel(), gravity, coriolis)
+        force = scene_dynamics(self.spec).passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis)
         return force.astype(dtype)
 
 

@@ -3,10 +3,10 @@
 A pack is M scenes with one robot each, stepped together, several of them in one PhysX system. All stand at the origin;
 the shapes of each scene are in a collision group to themselves, so that scenes never meet. That is bit-identical to one
 system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
-(:mod:`sim.engine.contact_prediction`).
+(:mod:`sim.engine.sapien.contact_prediction`).
 
-The loop uses only the public methods and attributes of :class:`Pack`; another engine has to provide these. Longer than
-300 lines because that is the whole interface between loop and engine.
+The loop uses only the members of :class:`sim.engine.protocol.EnginePack` and its capabilities. Longer than 300 lines
+because that is the whole interface between loop and engine.
 """
 
 from __future__ import annotations
@@ -20,14 +20,22 @@ from numpy.typing import NDArray
 from batchpid.actuators import Actuators
 from batchpid.friction import Friction
 from batchpid.single_owner import SingleOwner
-from sim.engine.building import SceneSpec, build_scene, engine_settings, link_frames, new_system, set_collision_group
-from sim.engine.calls import EngineCalls
-from sim.engine.contact_watch import ContactWatch
 from sim.engine.coupling import ConstraintEfforts
-from sim.engine.dynamics import scene_dynamics
-from sim.engine.native import engine_calls
-from sim.engine.root_state import read_root, write_root
-from sim.engine.user_content import SceneContent, refuse_shapes
+from sim.engine.sapien.building import (
+    build_scene,
+    engine_settings,
+    link_frames,
+    new_system,
+    set_collision_group,
+)
+from sim.engine.sapien.calls import EngineCalls
+from sim.engine.sapien.contact_watch import ContactWatch
+from sim.engine.sapien.dynamics import scene_dynamics
+from sim.engine.sapien.native_calls import engine_calls
+from sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
+from sim.engine.sapien.sim_step import NativeStep
+from sim.engine.sapien.user_content import SceneContent, refuse_shapes
+from sim.engine.scene_spec import SceneSpec, Variation
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.mimics import coupling_of
 
@@ -136,8 +144,14 @@ class Pack(SingleOwner):
         """Calls into the engine, other ones since robots or systems were replaced."""
         return self._calls
 
+    def compiled_step(
+        self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+    ) -> NativeStep:
+        """Return the sim step as one native call, which holds for the present :attr:`calls`."""
+        return NativeStep(self.calls, self.systems, self.watch, gravity, coriolis, velocities, speed_limit)
+
     def look(self, left: list[int]) -> None:
-        """Look for contacts after a :class:`sim.engine.sim_step.NativeStep` that led ``left`` out of regions."""
+        """Look for contacts after a :meth:`compiled_step` that led ``left`` out of regions."""
         self._stepped_qpos = None
         if predicted := self.watch.look(left):
             self.isolate(predicted)
@@ -215,16 +229,18 @@ class Pack(SingleOwner):
         if self._constraint is None:
             self._calls.write_qf()
 
-    def write_state(
-        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], root: NDArray[Any] | None = None
-    ) -> None:
-        """Place robots ``rows``: positions and velocities (len(rows), dof); their efforts become zero.
+    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof), the root at the origin; their efforts
+        become zero, and the content of their scenes is reset.
+        """
+        self._place(rows, qpos, qvel, np.tile(_ORIGIN, (len(rows), 1)))
 
-        ``root`` (len(rows), 13), as :meth:`read_root` returns it, is by default the origin, at rest. It is always set,
-        since a robot whose state is NaN has lost its root, too. Content of these scenes is reset.
+    def _place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], roots: Float32) -> None:
+        """Do :meth:`write_state` with these states of the root (len(rows), 13).
+
+        They are always set, since a robot whose state is NaN has lost its root, too.
         """
         self._stepped_qpos = None
-        roots = np.tile(_ORIGIN, (len(rows), 1)) if root is None else root
         for row, position, velocity, base in zip(rows, qpos, qvel, roots, strict=True):
             robot = self.robots[row]
             write_root(robot, base)
@@ -237,26 +253,33 @@ class Pack(SingleOwner):
         if self._isolates:
             self._assign_systems(rows, qpos, qvel)
 
-    def read_root(self) -> Float32:
-        """Return each robot's root link (M, 13): position, quaternion w, x, y, z, linear and angular velocity."""
-        return np.stack([read_root(robot) for robot in self.robots])
+    def vary(self, rows: Sequence[int], variation: Variation) -> None:
+        """Raise TypeError: robots of this pack are those of the model; see :class:`sim.engine.sapien.variation`."""
+        raise TypeError("the robots of this pack do not vary; make it with a variation")
 
-    def read_content(self) -> Float32:
-        """Return the state of each scene's content (M, values), with NaN after the :meth:`content_sizes` of a scene."""
-        sizes = self.content_sizes()
-        table = np.full((self.size, max(sizes)), np.nan, np.float32)
-        for row, size, content in zip(table, sizes, self._contents, strict=False):
-            row[:size] = content.read()
-        return table
+    def state_sizes(self) -> list[int]:
+        """Return the number of values in the state of each scene: of the robot, and of its content."""
+        robot = 2 * self.dof + ROOT_SIZE + 1
+        return [robot + content.size for content in self._contents] or [robot] * self.size
 
-    def content_sizes(self) -> list[int]:
-        """Return the number of values in the state of each scene's content."""
-        return [content.size for content in self._contents] or [0] * self.size
+    def read_state(self) -> NDArray[np.float64]:
+        """Return the state of each scene (M, values): qpos, qvel, root, whether it is isolated, content, then NaN."""
+        sizes = self.state_sizes()
+        states = np.full((self.size, max(sizes)), np.nan)
+        for row, (robot, isolated) in enumerate(zip(self.robots, self.isolated, strict=True)):
+            content = [scene.read() for scene in self._contents[row : row + 1]]
+            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), [isolated], *content
+            states[row, : sizes[row]] = np.concatenate(parts)
+        return states
 
-    def write_content(self, table: NDArray[Any]) -> None:
-        """Put each scene's content into the state that :meth:`read_content` returned."""
-        for content, row in zip(self._contents, table, strict=False):
+    def write_state_rows(self, states: NDArray[np.float64]) -> None:
+        """Put the scenes of this new pack into the states that :meth:`read_state` returned."""
+        ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, 1])
+        qpos, qvel, roots, isolated, contents = np.split(states.astype(np.float32), ends, axis=1)
+        self._place(range(self.size), qpos, qvel, roots)
+        for content, row in zip(self._contents, contents, strict=False):
             content.write(row)
+        self.isolate(np.flatnonzero(isolated).tolist())
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
         """Apply zero effort and no gravity to the robots of ``mask`` (M,), and both again to the others."""

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.building import SceneSpec, link_groups
-from sim.engine.collision_groups import Pair
-from sim.engine.dynamics import Dynamics
-from sim.engine.physics import PHYSICS
-from sim.engine.trial import in_child
+from sim.engine.sapien.building import link_groups
+from sim.engine.sapien.collision_groups import Pair
+from sim.engine.sapien.dynamics import Dynamics
+from sim.engine.sapien.physics import PHYSICS
+from sim.engine.sapien.trial import in_child
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.description import RobotDescription
 from sim.robot.parts import Joint
 from sim.robot.self_collision import (

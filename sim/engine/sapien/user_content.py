@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,10 @@ from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRi
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
-from sim.engine.mirrored_meshes import MirroringBuilder
-from sim.engine.root_state import ROOT_SIZE, read_root, write_root
+from sim.engine.sapien.mirrored_meshes import MirroringBuilder
+from sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
+from sim.engine.scene_spec import Build
 
-Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds to the scene of env ``env``; returns what poses are wanted of, or None.
-
-That is entities, and names of the robot's links, also of those that are simulated as part of another.
-"""
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Links of a robot by name: the entity that each is part of, and its pose in that, None for the same."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from itertools import combinations
 from threading import RLock
@@ -17,14 +16,13 @@ from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
-from sim.engine.collision_groups import CollisionGroups, Pair, collision_groups
 from sim.engine.lazy_module import imported_lazily
-from sim.engine.physics import Physics
-from sim.engine.user_content import Build, Frames, HeadlessScene
+from sim.engine.sapien.collision_groups import CollisionGroups, Pair, collision_groups
+from sim.engine.sapien.user_content import Frames, HeadlessScene
+from sim.engine.scene_spec import SceneSpec
 from sim.robot.dissipation import DISSIPATION
 from sim.robot.merging import Merged, merge_fixed_links, place_links
 from sim.robot.meshes import note_meshes
-from sim.robot.parts import Joint
 from sim.robot.spatial_inertia import SpatialInertia, total
 
 _building = RLock()
@@ -33,31 +31,6 @@ _building = RLock()
 with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fifths of the start of a worker
     # Its packages suppress a Ctrl-C while they are imported: not amid a run.
     import sapien.wrapper.urdf_loader  # noqa: F401
-
-
-@dataclass(frozen=True)
-class SceneSpec:
-    """Everything that a scene is built from, picklable.
-
-    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
-    ``joints`` are the degrees of freedom in SAPIEN's order. With ``merge_fixed`` each rigid body is one link
-    (:mod:`sim.robot.merging`).
-    Without ``collisions`` the robot has no shapes and there is no ground; masses and inertias stay.
-    Specs that differ in ``build`` alone are equal.
-    """
-
-    urdf: str
-    ignored: tuple[tuple[str, str], ...]
-    joints: tuple[Joint, ...]
-    timestep: float
-    physics: Physics
-    dissipation: str = "urdf"
-    ground: bool = True
-    fixed_base: bool = True
-    merge_fixed: bool = True
-    collisions: bool = True
-    build: Build | None = field(default=None, compare=False)
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
 @lru_cache(maxsize=8)

@@ -1,0 +1,283 @@
+"""Interface of a physics engine: what loop, robots and tuning ask of it.
+
+The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning compute with a
+:class:`RobotModel`. :func:`sim.engine.engines.load_engine` returns an :class:`Engine`, which makes both.
+
+What only some engines offer is a capability. :func:`require` raises an error where an engine lacks it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.actuators import Actuators
+from batchpid.errors import InvalidArgumentError
+from batchpid.friction import Friction
+from sim.engine.native.interface import STATUS
+from sim.engine.rigid_body import RigidBodies
+from sim.engine.scene_spec import SceneSpec, Variation
+from sim.robot import description
+from sim.robot.description import RobotDescription
+
+Bool = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "sapien_dissipation"]
+"""
+- ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
+- ``"build"``: the user's function ``build`` adds content to scenes;
+- ``"missed_contacts"``: robots without shapes report contacts that they would have had;
+- ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
+- ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
+"""
+FAILED = 1 << STATUS.index("failed")
+"""Bit of the status of a compiled sim step in which the engine raised an exception."""
+
+
+@runtime_checkable
+class EnginePack(Protocol):
+    """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of its joints, SI units.
+
+    A method that returns an array returns a new one. What an env does depends on its own rows alone: not on the other
+    envs of the pack, nor on their number.
+
+    Attributes
+    ----------
+    size, dof
+        Number of envs M, and of joints.
+    first_env
+        Number of the first env among those of the runner.
+    qf
+        Efforts last written, in the engine's precision; without those that the engine adds, as for coupled joints.
+    friction
+        Friction and damping that the loop has to apply to the joints; None where the engine applies them.
+    armature
+        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], which is no part of :meth:`joint_mass_matrix`.
+    """
+
+    spec: SceneSpec
+    size: int
+    dof: int
+    first_env: int
+    qf: NDArray[Any]
+    friction: Friction
+    armature: Float64
+
+    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+        """Return the joint positions [rad or m]."""
+
+    def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
+        """Return the joint velocities [rad/s or m/s]."""
+
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+        """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
+
+        They are those of the model of ``spec`` at the present state, whatever the pack's variation.
+        """
+
+    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
+
+        On a floating base they are the Schur complement by the base's six degrees of freedom.
+        """
+
+    def write_qf(self, effort: NDArray[Any]) -> None:
+        """Apply joint efforts [N m or N]. They persist until written again."""
+
+    def step(self, update: bool = True) -> None:
+        """Do one sim step of every env. Without ``update`` coupled joints may use the mass matrix of an earlier step.
+
+        A state that is not finite is no error: the loop finds it in what it reads next.
+        """
+
+    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
+        """Place the envs ``rows``: positions and velocities (len(rows), dof); zero efforts, the root at the origin.
+
+        Content of these envs goes back to its start. It recovers an env whose state is not finite.
+        """
+
+    def suspend(self, mask: Bool) -> None:
+        """Apply zero effort and no gravity to the robots of ``mask`` (M,), and both again to the others."""
+
+    def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
+        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
+
+    def vary(self, rows: Sequence[int], variation: Variation) -> None:
+        """Change the robots ``rows`` to ``variation``, one row for each; the pack was made with one.
+
+        Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
+        """
+
+    def state_sizes(self) -> list[int]:
+        """Return the number of values in the state of each env."""
+
+    def read_state(self) -> Float64:
+        """Return the state of every env (M, values), of which only the engine knows the meaning, for a snapshot.
+
+        A row holds all that decides about the next steps of a new pack, and NaN after the size of its env.
+        """
+
+    def write_state_rows(self, states: Float64) -> None:
+        """Put all envs of this new pack into the states that :meth:`read_state` returned.
+
+        Rows may be longer, with more NaN at the end. Efforts and suspension are written afterwards.
+        """
+
+    def read_poses(self) -> list[NDArray[np.float32]]:
+        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion w, x, y, z."""
+
+    def close(self) -> None:
+        """Free the envs. The pack cannot be used afterwards."""
+
+
+@runtime_checkable
+class DrivenPack(EnginePack, Protocol):
+    """Pack whose joints have drives: PD control that the engine integrates implicitly."""
+
+    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or for m]."""
+
+    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
+
+
+class CompiledStep(Protocol):
+    """Sim step of a pack as one native call, which a program of XLA makes (:func:`sim.engine.native.xla.sim_step`)."""
+
+    def prepare(self) -> int:
+        """Return the address of the native group for the next steps."""
+
+    def left(self) -> list[int]:
+        """Return the envs that :meth:`CompiledPack.look` has to be told of after the last sim step."""
+
+    @property
+    def message(self) -> str:
+        """Message of the engine's exception, after the status FAILED."""
+
+
+@runtime_checkable
+class CompiledPack(EnginePack, Protocol):
+    """Pack whose sim steps a program of XLA can make."""
+
+    @property
+    def calls(self) -> object:
+        """Another object once a :meth:`compiled_step` that was made before is no longer valid."""
+
+    def compiled_step(self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: Any) -> CompiledStep:
+        """Return the sim step of the present robots.
+
+        ``gravity`` and ``coriolis`` are the parts of the passive force that it reads; without both it is zero.
+        ``velocities`` tells whether to read velocities; otherwise they are zero. Beyond ``speed_limit`` (dof,), if it
+        is given, the status says so.
+        """
+
+    def look(self, left: list[int]) -> None:
+        """Do what Python has to do after a compiled step that stopped, and for the envs ``left``."""
+
+
+class RobotModel(description.Dynamics, Protocol):
+    """Dynamics and contact of one robot at given poses (n, dof), without friction, damping and variation."""
+
+    @property
+    def bodies(self) -> RigidBodies:
+        """Bodies of the robot on a fixed base."""
+
+    def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
+
+    def link_poses(self, qpos: NDArray[Any]) -> Float64:
+        """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
+
+    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
+
+        One if the other is the ground; none if no links are near each other.
+        """
+
+    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
+
+        With ``base_too`` the links that are fixed to the base count as well.
+        """
+
+
+class ContactRecord(Protocol):
+    """Contacts that the M robots of a pack without shapes would have had."""
+
+    def place(self, mask: Bool) -> None:
+        """Note that the robots of ``mask`` (M,) were placed."""
+
+    def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
+        """Write ``step`` into ``first`` (M,), where that is 0, for robots that overlap at ``qpos`` (M, dof)."""
+
+
+class Engine(description.RobotFunctions, Protocol):
+    """Physics engine: it makes packs, and models of robots.
+
+    Attributes
+    ----------
+    name
+        Value of the option ``engine``.
+    capabilities
+        What it offers besides.
+    physics
+        Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
+    """
+
+    name: str
+    capabilities: frozenset[Capability]
+    physics: Mapping[str, Any]
+
+    def is_physics(self, settings: object) -> bool:
+        """Return whether these are settings of its solver."""
+
+    def make_pack(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int = 0,
+        system_size: int = 8,
+        variation: Variation | None = None,
+        carrier: str = "",
+        links: Sequence[str] = (),
+    ) -> EnginePack:
+        """Return a new pack of ``size`` envs.
+
+        Parameters
+        ----------
+        system_size
+            Largest number of robots that may share a world of the engine. It changes no result.
+        variation
+            Differences of the robots from the model; None for robots that :meth:`EnginePack.vary` never changes.
+        carrier, links
+            Link of the URDF that carries the payload, and those whose mass or center varies.
+
+        Raises
+        ------
+        RobotError
+            The engine cannot build the robot.
+        InvalidArgumentError
+            The function ``build`` of the spec is wrong.
+        """
+
+    def scene_dynamics(self, spec: SceneSpec) -> RobotModel:
+        """Return the model of the robot of ``spec``, the same object for equal specs."""
+
+    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> RobotModel:
+        """Return the model of ``robot`` on a fixed base, with or without a ground at height 0; by default its own."""
+
+    def loaded_dynamics(self, robot: RobotDescription, payload: float) -> RobotModel:
+        """Return the model of ``robot`` on a fixed base with ``payload`` [kg] at the center of mass of its tool."""
+
+    def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
+        """Return the record of ``size`` robots of ``spec``, with a ground at height 0 or without."""
+
+
+def require(engine: Engine, capability: Capability, argument: str) -> None:
+    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``."""
+    if capability not in engine.capabilities:
+        problem = f"needs an engine with the capability {capability!r}, which {engine.name!r} does not have"
+        raise InvalidArgumentError(argument, problem, remedy="leave it out, or use the engine 'sapien', which has all")

@@ -1,0 +1,64 @@
+"""Description of the envs of a pack: the robot and its scene, and how each robot differs from the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robot.parts import Joint
+
+Float64 = NDArray[np.float64]
+
+Build = Callable[[Any, int], Any]
+"""``build(scene, env)`` adds to the engine's scene of env ``env``; returns what poses are wanted of, or None.
+
+That is entities, and names of the robot's links, also of those that are simulated as part of another.
+"""
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Everything that a scene is built from, picklable.
+
+    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
+    ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are settings of the solver of
+    ``engine``, of a type of its own. With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
+    Without ``collisions`` the robot has no shapes and there is no ground; masses and inertias stay.
+    Specs that differ in ``build`` alone are equal.
+    """
+
+    urdf: str
+    ignored: tuple[tuple[str, str], ...]
+    joints: tuple[Joint, ...]
+    timestep: float
+    physics: Any
+    dissipation: str = "urdf"
+    ground: bool = True
+    fixed_base: bool = True
+    merge_fixed: bool = True
+    collisions: bool = True
+    build: Build | None = field(default=None, compare=False)
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    engine: str = "sapien"
+
+
+class Variation(NamedTuple):
+    """Differences of some robots from the model, one row each; None where there is none."""
+
+    payload: Float64 | None = None
+    """Mass added at the center of mass of a link (envs,) [kg]."""
+    link_mass: Float64 | None = None
+    """Mass of each link of the URDF as a share of its own (envs, links); NaN for 1."""
+    center_of_mass: Float64 | None = None
+    """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3 links) [m]: x, y, z of
+    the first link, of the second, ..."""
+    friction: Float64 | None = None
+    """Coulomb friction of the joints (envs, dof) [N m or N]."""
+    damping: Float64 | None = None
+    """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
+    armature: Float64 | None = None
+    """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""

@@ -1,0 +1,230 @@
+"""SAPIEN has every member of the protocol of an engine, and any other engine that has them runs in the loop."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from identical import assert_identical
+from robots import load_bundled
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.friction import Friction
+from sim import Runner, RunnerOptions
+from sim.engine import engines
+from sim.engine.protocol import CompiledPack, CompiledStep, ContactRecord, DrivenPack, Engine, EnginePack, RobotModel
+from sim.engine.sapien.dynamics import Dynamics
+from sim.engine.sapien.missed_contact import MissedContacts
+from sim.engine.sapien.pack import Pack
+from sim.engine.sapien.sapien_engine import SapienEngine
+from sim.engine.sapien.sim_step import NativeStep
+from sim.engine.sapien.variation import VariedPack
+from sim.loop.backend import describe
+
+PANDA = load_bundled("panda")
+PANDA.has_ground  # noqa: B018 - by SAPIEN, before a test replaces it
+DT, N = 1e-3, 3
+
+
+def parameters(function):
+    return list(inspect.signature(function).parameters) if inspect.isfunction(function) else None
+
+
+@pytest.mark.parametrize(
+    ("protocol", "kind"),
+    [
+        (EnginePack, Pack),
+        (DrivenPack, Pack),
+        (CompiledPack, VariedPack),
+        (CompiledStep, NativeStep),
+        (RobotModel, Dynamics),
+        (ContactRecord, MissedContacts),
+        (Engine, SapienEngine),
+    ],
+)
+def test_sapien_has_the_members_of_each_protocol(protocol, kind):
+    members = {name: member for name, member in inspect.getmembers(protocol) if not name.startswith("_")}
+    assert members
+    for name, member in members.items():
+        assert parameters(getattr(kind, name)) == parameters(member), name
+
+
+class UnitInertia:
+    """Model of joints of 1 kg m^2 that nothing couples or loads."""
+
+    def mass_matrix(self, qpos):
+        return np.tile(np.eye(qpos.shape[1]), (len(qpos), 1, 1))
+
+    def inverse_dynamics(self, qpos, qvel, qacc):
+        return np.array(qacc)
+
+
+class DoubleIntegrators:
+    """Pack whose joints have unit inertia: q'' = u, by the semi-implicit Euler method."""
+
+    def __init__(self, spec, size, first_env):
+        self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
+        self.qf = np.zeros((size, self.dof))
+        self.friction, self.armature = Friction(), np.zeros((1, self.dof))
+        self._state, self._moves = np.zeros((2, size, self.dof)), np.ones((size, 1))
+
+    def read_qpos(self, dtype=np.float64):
+        return self._state[0].astype(dtype)
+
+    def read_qvel(self, dtype=np.float64):
+        return self._state[1].astype(dtype)
+
+    def passive_force(self, gravity, coriolis, dtype=np.float64):
+        return np.zeros_like(self.qf, dtype)
+
+    def joint_mass_matrix(self, qpos):
+        return UnitInertia().mass_matrix(qpos)
+
+    def write_qf(self, effort):
+        self.qf[...] = effort
+
+    def step(self, update=True):
+        qpos, qvel = self._state
+        qvel += self.spec.timestep * self._moves * self.qf
+        qpos += self.spec.timestep * qvel
+
+    def write_state(self, rows, qpos, qvel):
+        self._state[0, rows], self._state[1, rows], self.qf[rows] = qpos, qvel, 0.0
+
+    def suspend(self, mask):
+        self._moves = ~mask[:, None]
+
+    def write_joints(self, actuators, rows=None):
+        assert actuators is None
+
+    def vary(self, rows, variation):
+        raise AssertionError
+
+    def state_sizes(self):
+        return [2 * self.dof] * self.size
+
+    def read_state(self):
+        return np.hstack(self._state)
+
+    def write_state_rows(self, states):
+        self._state[...] = np.split(states[:, : 2 * self.dof], 2, axis=1)
+
+    def read_poses(self):
+        return []
+
+    def close(self):
+        self._state = self._state[:, :0]
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Settings of the toy."""
+
+    order: int
+
+
+class ToyEngine:
+    """Engine without any capability."""
+
+    name, capabilities, physics = "toy", frozenset(), {"accurate": Solver(1)}
+
+    def is_physics(self, settings):
+        return False
+
+    def make_pack(self, spec, size, first_env=0, system_size=8, variation=None, carrier="", links=()):
+        return DoubleIntegrators(spec, size, first_env)
+
+    def robot_dynamics(self, robot, ground=None):
+        return UnitInertia()
+
+
+ENGINE = ToyEngine()
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """Make the toy the engine of all runners of this process."""
+    monkeypatch.setitem(engines.MODULES, "sapien", __name__)
+
+
+def runner(**options):
+    params = bp.make_params(PANDA.dof, kp=100.0, ki=30.0, kd=20.0, effort_limit=5.0)
+    options = {"workers": 0, "timestep": DT, "compensate": "none"} | options
+    return Runner(PANDA, N, params=params, **options)
+
+
+def setpoints(ticks=30):
+    noise = np.random.default_rng(0).uniform(-0.02, 0.02, (ticks, N, PANDA.dof))
+    return np.clip(PANDA.start + noise, PANDA.lower, PANDA.upper)
+
+
+@pytest.mark.usefixtures("toy")
+def test_another_engine_runs_in_the_loop_as_the_law_on_it_alone_does():
+    table = setpoints()
+    with runner() as mine:
+        rollout = mine.rollout(table)
+        params, substeps = mine.params, mine.substeps
+    qpos, qvel = np.tile(PANDA.start, (N, 1)), np.zeros((N, PANDA.dof))
+    state = bp.init(params, qpos)
+    for tick, setpoint in enumerate(table):
+        for _ in range(substeps):
+            state, effort = bp.step(params, state, setpoint, qpos, DT)
+            qvel = qvel + DT * effort
+            qpos = qpos + DT * qvel
+        np.testing.assert_allclose(rollout.qpos[tick], qpos, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(rollout.effort[tick], effort, rtol=0, atol=1e-4)
+    assert np.ptp(rollout.qpos, axis=0).min() > 1e-3
+
+
+@pytest.mark.usefixtures("toy")
+def test_its_envs_are_suspended_reset_and_restored_from_its_rows():
+    table = setpoints()
+    table[3, 1] = np.nan
+    with runner(on_invalid_input="contain") as mine:
+        with pytest.warns(UserWarning, match="env 1"):
+            before = mine.rollout(table[:10])
+        assert before.ok[-1].tolist() == [True, False, True]
+        snapshot = mine.snapshot()
+        assert snapshot.states.engine.shape == (N, 2 * PANDA.dof)
+        went_on = mine.rollout(table[10:])
+        np.testing.assert_array_equal(went_on.qpos[-1, 1], before.qpos[-1, 1])
+        mine.restore(snapshot)
+        assert_identical(went_on, mine.rollout(table[10:]))
+        assert mine.reset(mask=[False, True, False]).ok.all()
+    assert snapshot.about["engine"] == "toy"
+
+
+def test_a_snapshot_of_another_engine_is_refused(toy, monkeypatch):
+    with runner() as mine:
+        snapshot = mine.snapshot()
+    monkeypatch.undo()
+    with runner() as other, pytest.raises(InvalidArgumentError, match="engine 'toy', not 'sapien'"):
+        other.restore(snapshot)
+
+
+@pytest.mark.usefixtures("toy")
+@pytest.mark.parametrize(
+    ("options", "argument", "capability"),
+    [
+        ({"control": "drive"}, "control", "drive"),
+        ({"build": print}, "build", "build"),
+        ({"collisions": False}, "collisions", "missed_contacts"),
+    ],
+)
+def test_what_it_cannot_do_is_an_error_with_a_remedy(options, argument, capability):
+    with pytest.raises(InvalidArgumentError, match=rf"{argument}: .*{capability}.*'toy' does not have.*use the engine"):
+        RunnerOptions(PANDA, N, **options)
+
+
+@pytest.mark.usefixtures("toy")
+def test_its_sim_steps_are_no_part_of_a_program_of_xla():
+    options = RunnerOptions(PANDA, N, backend="jax")
+    assert "a call each sim step (the sim steps of 'toy' are calls of Python)" in describe(options, None)
+
+
+def test_an_unknown_engine_is_an_error():
+    with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of 'sapien'"):
+        engines.load_engine("bullet")
