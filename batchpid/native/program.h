@@ -88,7 +88,8 @@ struct Operand {
   Index step;  // numbers to the next chunk; 0: each chunk is the same
 };
 
-// Sum of the products of n numbers as NumPy's for n <= 128: in order below eight, else eight sums side by side.
+// Sum of the products of n numbers as NumPy's for n <= 128: in order below eight, else eight sums side by side; then
+// added to 0, as the sign of a sum of -0 tells.
 template <class T>
 BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
   T sum = T(-0.0);
@@ -102,7 +103,7 @@ BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
     sum = ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]));
   }
   for (; i < n; ++i) sum += a[i] * b[i];
-  return sum;
+  return T(0) + sum;
 }
 
 // Apply an operation to n numbers, whole rows.
@@ -280,7 +281,8 @@ inline void run(Program const &program, Input const *inputs, Output const *outpu
 
 // Run a program on all rows with the help of further threads; the result does not depend on their number.
 inline void run_on_threads(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
-  Index const slab = std::max<Index>(1, 32 * BLOCK / program.columns);  // what a thread takes at once
+  // Rows that a thread takes at once: some blocks, and few enough to keep all threads busy to the end.
+  Index const slab = std::max<Index>(1, std::min(4 * BLOCK / program.columns, rows / (4 * threads)));
   std::atomic<Index> next{0};
   auto const work = [&] {
     for (Index row; (row = next.fetch_add(slab)) < rows;) {
