@@ -20,7 +20,8 @@ PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
 
 # Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
-NATIVE := setup.py sim/engine/native/interface.py $(wildcard sim/engine/native/*.cpp sim/engine/native/*.h)
+NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py sim/engine/native/interface.py \
+	$(foreach room,batchpid/native sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
 .PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak clean

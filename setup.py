@@ -1,24 +1,32 @@
 """Build of the optional extensions; everything else about the package stands in pyproject.toml."""
 
+import importlib.util
 import runpy
+import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
 
-FOLDER = "sim/engine/native"
-interface = runpy.run_path(str(Path(__file__).parent / FOLDER / "interface.py"))
+ROOT = Path(__file__).parent
+DEFINITIONS = ("batchpid/native/operations.py", "sim/engine/native/interface.py")
 
 
-def extension(name):
-    """Return an extension with the digests of its tables and sources."""
-    unit, headers, flags = interface["EXTENSIONS"][name]
-    digests = {kind: interface[f"{kind}_digest"](name) for kind in ("tables", "sources")}
-    macros = {f"BATCHPID_{kind.upper()}": f'"{digest}"' for kind, digest in digests.items()}
+def load(name):
+    """Import one module of batchpid without its package, which needs NumPy."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"{name.replace('.', '/')}.py")
+    sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules[name])
+
+
+def built(extension, definition):
+    """Return an extension, as setuptools has them, with the digests of its tables and sources."""
+    digests = {"TABLES": extension.tables_digest(), "SOURCES": extension.sources_digest()}
+    macros = {f"BATCHPID_{kind}": f'"{digest}"' for kind, digest in digests.items()}
     return Extension(
-        f"sim.engine.native.{name}",
-        [f"{FOLDER}/{unit}"],
-        depends=["setup.py", *(f"{FOLDER}/{file}" for file in ("interface.py", *headers))],
-        extra_compile_args=list(flags),
+        extension.module,
+        [extension.files[0]],
+        depends=["setup.py", "batchpid/native/extensions.py", definition, *extension.files[1:]],
+        extra_compile_args=list(extension.flags),
         language="c++",
         define_macros=[("Py_LIMITED_API", "0x030B0000"), *macros.items()],
         py_limited_api=True,
@@ -26,7 +34,12 @@ def extension(name):
     )
 
 
+load("batchpid.native.extensions")
 setup(
-    ext_modules=[extension(name) for name in interface["EXTENSIONS"]],
+    ext_modules=[
+        built(extension, definition)
+        for definition in DEFINITIONS
+        for extension in runpy.run_path(str(ROOT / definition))["EXTENSIONS"].values()
+    ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from batchpid import law
 from batchpid.coefficients import discretise
 from batchpid.errors import MissingDependencyError
 from batchpid.jax_settings import own_settings
+from batchpid.native.availability import program_status
+from batchpid.native.compiled_law import CompiledLaw
 from batchpid.params import PIDParams
 from batchpid.state import PIDState, Terms
 
@@ -17,15 +20,36 @@ LARGE = 2**18
 """Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
 
 
-class NumPyBackend:
-    """The law on NumPy, with coefficients that are computed once and spread over all envs."""
+def declined(*_: Any) -> Any:
+    """Return NotImplemented: there is no fast call."""
+    return NotImplemented
 
-    def __init__(self, dt: float, terms: bool) -> None:
-        self.dt, self.terms = dt, terms
+
+class NumPyBackend:
+    """The law on NumPy's arrays: by the native extension where there is one, else by NumPy, with the same bytes.
+
+    Its coefficients are computed once; for NumPy they are spread over all envs.
+    """
+
+    def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
+        self.dt, self.terms, self.threads = dt, terms, threads
+        self.native = program_status().active
+        """Whether the native extension computes the law, which then writes over the arrays of the state."""
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
-        self.params, self.coefficients = params, discretise(params, self.dt, shape[0])
+        self.params, self.shape = params, shape
+        self.coefficients = discretise(params, self.dt, 1 if self.native else shape[0])
+        self._law = CompiledLaw(self.coefficients, shape[0], self.terms, self.threads) if self.native else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_law": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the native program again, if this process has the extension."""
+        self.__dict__.update(state)
+        self.native = program_status().active
+        self.prepare(self.params, self.shape)
 
     def array(self, value: Any) -> Any:
         """Return ``value`` as an array of this backend."""
@@ -35,10 +59,20 @@ class NumPyBackend:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         return function(self.params, *inputs, **named)
 
-    def step(self, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-        """Return the new state, the effort, and the terms if they are kept."""
+    def step(self, state: PIDState, out: Any, *inputs: Any) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
+        """Return the new state, the effort, the terms if they are kept, and a fast call of the next steps.
+
+        The effort is ``out``, if that is not None. The fast call takes ``out`` and the inputs and returns the effort,
+        or NotImplemented. It may be used while the state is the new one and nobody else holds its arrays.
+        """
+        if self._law is not None:
+            state, effort, shown, fast = self._law.step(state, inputs, out)
+            return state, effort, shown, fast or declined
         new, effort, *terms = law.advance(self.coefficients, state, *inputs, terms=self.terms)
-        return new, effort, terms[0] if terms else None
+        if out is not None:
+            out[...] = effort
+            effort, terms = out, [each._replace(effort=out) for each in terms]
+        return new, effort, terms[0] if terms else None, declined
 
 
 class JAXBackend:
@@ -47,7 +81,9 @@ class JAXBackend:
     A call costs JAX some 4 us per array, so the params that all envs share travel as one.
     """
 
-    def __init__(self, dt: float, terms: bool) -> None:
+    native = False
+
+    def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
         try:
             import jax
         except ImportError:
@@ -109,15 +145,17 @@ class JAXBackend:
         with own_settings(self.dtype):
             return self._compiled[function](*self.packed, *inputs, **named)
 
-    def step(self, state: PIDState, r: Any, y: Any, *rates: Any) -> tuple[PIDState, Any, Terms | None]:
-        """Return the new state, the effort, and the terms if they are kept."""
+    def step(
+        self, state: PIDState, out: None, r: Any, y: Any, *rates: Any
+    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
+        """Return the new state, the effort, the terms if they are kept, and no fast call; ``out`` is None."""
         with own_settings(self.dtype):
             if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
-                return self._step(*self.packed, state, r, y, *rates)
+                return *self._step(*self.packed, state, r, y, *rates), declined
             spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
             new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
         self._spare = state
-        return new, effort, None
+        return new, effort, None, declined
 
     def _on_one_cpu(self, y: Any) -> bool:
         devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from batchpid import bumpless, law
-from batchpid.backends import JAXBackend, NumPyBackend
+from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.errors import InvalidArgumentError
 from batchpid.leaves import frozen
 from batchpid.params import PIDParams
@@ -18,12 +18,13 @@ from batchpid.validate import choice, env_mask, instance, integer, names, positi
 
 BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31
+MOST_THREADS = 1024
 
 
 class BatchPID:
     """PID controller of (num_envs, joints) loops that keeps its state between calls.
 
-    It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype.
+    It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype, and new in each call.
 
     Parameters
     ----------
@@ -34,17 +35,21 @@ class BatchPID:
     dt
         Time between calls [s].
     backend
-        "numpy", or "jax": compiled once, with the state's buffers donated from call to call, and on a CPU block by
-        block where the batch is large.
+        "numpy": computed by the native extension where that was built, with the bytes of NumPy but without its
+        floating-point warnings. Or "jax": compiled once, with the state's buffers donated from call to call, and on a
+        CPU block by block where the batch is large.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
         Used in error messages.
+    threads
+        Largest number of threads of the native extension, which uses them for large batches; None: the cores that this
+        process may use. The result does not depend on it.
 
     Raises
     ------
     InvalidArgumentError
-        Wrong backend, num_envs, dt or params.
+        Wrong backend, num_envs, dt, params or threads.
     MissingDependencyError
         Backend "jax" without JAX.
     """
@@ -58,12 +63,16 @@ class BatchPID:
         *,
         terms: bool = False,
         joint_names: Sequence[str] | None = None,
+        threads: int | None = None,
     ) -> None:
         self._backend, self._dt = choice("backend", backend, BACKENDS), positive("dt", dt, "s")
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
         self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
-        self._engine = BACKENDS[self._backend](self._dt, terms)
+        threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
+        self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
+        self._fast = declined  # fast call of the law on this very state
+        self._lent = False  # whether someone else may hold arrays of the state
         self._stale = False  # whether the state may lack leaves that the params now need
         self._terms: Terms | None = None
         self._params = params
@@ -72,7 +81,12 @@ class BatchPID:
     def __repr__(self) -> str:
         started = "not started" if self._state is None else "started"
         envs, joints = self._shape
-        return f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {self._backend!r}, {started})"
+        backend = f"{self._backend!r}{' (native)' * self.native}"
+        return f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend}, {started})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._fast, self._lent = declined, True  # a shallow copy holds the same arrays
+        return self.__dict__.copy()
 
     @property
     def num_envs(self) -> int:
@@ -95,6 +109,11 @@ class BatchPID:
         return self._backend
 
     @property
+    def native(self) -> bool:
+        """Whether the native extension computes the law."""
+        return self._engine.native
+
+    @property
     def params(self) -> PIDParams:
         """Params of the law. Assign others at any time: they are checked, and the state is kept.
 
@@ -114,11 +133,12 @@ class BatchPID:
             raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
         params = frozen(params)
         self._engine.prepare(params, self._shape)
-        self._params, self._stale = params, self._state is not None
+        self._params, self._stale, self._fast = params, self._state is not None, declined
 
     @property
     def state(self) -> PIDState | None:
         """State of the law, read-only; None before the first measurement. With JAX it is valid until the next call."""
+        self._fast, self._lent = declined, True
         return None if self._state is None else PIDState(*map(read_only, self._state))
 
     @property
@@ -135,21 +155,35 @@ class BatchPID:
         measurement_rate: Any = None,
         setpoint_rate: Any = None,
         feedforward: Any = None,
+        *,
+        out: Any = None,
     ) -> Any:
         """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
 
-        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that. Where a shape is wrong,
-        InvalidArgumentError is raised and the state is unchanged.
+        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that. ``out`` is an array to
+        write the effort to and to return, of the params' dtype: with many envs, the pages of a new one cost more than
+        the law. It may be one of the inputs. Where a shape is wrong, InvalidArgumentError is raised and the state is
+        unchanged.
         """
+        effort = self._fast(out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+        if effort is not NotImplemented:
+            return effort
         r, y = self._array("setpoint", setpoint), self._array("measurement", measurement, exact=True)
         rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
-        self._state, effort, self._terms = self._engine.step(self._started(y), r, y, *rest.values())
+        if out is not None:
+            self._check_out(out)
+        state = self._started(y)
+        if self._lent and self._engine.native:
+            state = PIDState(*(None if leaf is None else leaf.copy() for leaf in state))
+        self._state, effort, self._terms, self._fast = self._engine.step(state, out, r, y, *rest.values())
+        self._lent = False
         return effort
 
     def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
         """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
         y = self._array("measurement", measurement, exact=True)
         mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        self._fast = declined
         self._state = self._engine.call(law.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
 
     def track(
@@ -168,6 +202,7 @@ class BatchPID:
             self._array("effort", effort),
         )
         rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
+        self._fast = declined
         self._state = self._engine.call(bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest)
 
     def _started(self, y: Any) -> PIDState:
@@ -180,6 +215,20 @@ class BatchPID:
 
     def _optional(self, **values: Any) -> dict[str, Any]:
         return {name: None if value is None else self._array(name, value) for name, value in values.items()}
+
+    def _check_out(self, out: Any) -> None:
+        dtype, remedy = self._params.dtype, "leave it out, or give np.empty((num_envs, joints), params.dtype)"
+        if self._backend != "numpy":
+            problem, remedy = f"is not for backend {self._backend!r}", "leave it out"
+        elif not isinstance(out, np.ndarray):
+            problem = f"is a {type(out).__name__}, not an array of NumPy"
+        elif out.dtype != dtype or out.shape != self._shape:
+            problem = f"is {out.dtype} {out.shape}, not {dtype} {self._shape}"
+        elif not (out.flags.c_contiguous and out.flags.writeable and out.flags.aligned):
+            problem = "cannot be written to" if not out.flags.writeable else "is not contiguous"
+        else:
+            return
+        raise InvalidArgumentError("out", problem, remedy=remedy)
 
     def _array(self, name: str, value: Any, exact: bool = False) -> Any:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is ``exact``-ly that."""

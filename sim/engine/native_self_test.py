@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid as bp
-from sim.engine.array_program import ArrayProgram, trace
+from batchpid.native.availability import first_difference
 from sim.engine.batch_dynamics import (
     Friction,
     MovingJoints,
@@ -56,60 +55,10 @@ def main() -> None:
     _compare_dynamics()
 
 
-def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
-    """Return the results of all operations of programs on arrays (rows, columns) and a matrix for each row."""
-    xp = a.__array_namespace__()
-    masks = a > b, a < b, a != b, xp.isfinite(a), (a > b) & (b < c)
-    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.maximum(a, b), xp.minimum(a, b)
-    least = a.min(axis=-1, keepdims=True)
-    product = (matrix * b[:, None, :]).sum(axis=-1)
-    return [*numbers, xp.where(a > b, b, c), xp.zeros_like(a) + least, product, *masks]
-
-
 def _compare_programs() -> None:
-    """Compare programs of all operations, and of the law, with NumPy; some numbers are zero, infinite or NaN."""
-    rng, shape = np.random.default_rng(0), (5, 9)
-    a, b, c = 10.0 * rng.normal(size=(3, *shape))
-    a.flat[:6], b.flat[4:8] = (0.0, np.inf, -np.inf, np.nan, 2.5, 1.0), (2.5, 1.0, np.nan, np.inf)
-    inputs = (a, b, c, rng.normal(size=(*shape, shape[1])))
-    with np.errstate(all="ignore"):
-        expected = every_operation(*inputs)
-    masks = sum(rows.dtype == bool for rows in expected)
-    _assert_identical(ArrayProgram(trace(every_operation, 0, 4), (), 4, shape)(*inputs, masks=masks), expected)
-
-    options: dict[str, Any] = {
-        "effort_limit": 5.0,
-        "derivative_filter_time": 0.01,
-        "anti_windup": "back_calculation",
-        "deadband": 0.1,
-    }
-    params = bp.make_params(shape[1], 40.0, ki=50.0, kd=2.0, setpoint_weight=0.7, continuous=True, **options)
-    k, state = bp.discretise(params, 1e-3, shape[0]), bp.init(params, b)
-    leaves = [[leaf for leaf in group if isinstance(leaf, np.ndarray)] for group in (k, state)]
-
-    def law(*arrays: Any) -> list[Any]:
-        rest = iter(arrays)
-        mine, before = (
-            [next(rest) if isinstance(leaf, np.ndarray) else leaf for leaf in group] for group in (k, state)
-        )
-        new, effort = bp.advance(type(k)(*mine), bp.PIDState(*before), *rest)
-        return [effort, *(leaf for leaf in new if leaf is not None)]
-
-    setpoint, measurement = 0.1 * rng.normal(size=(2, *shape))
-    program = ArrayProgram(trace(law, len(leaves[0]), len(leaves[1]) + 2), leaves[0], len(leaves[1]) + 2, shape)
-    with np.errstate(all="ignore"):
-        _assert_identical(
-            program(*leaves[1], setpoint, measurement), law(*leaves[0], *leaves[1], setpoint, measurement)
-        )
-
-
-def _assert_identical(ours: list[Any], theirs: list[Any]) -> None:
-    for number, (mine, expected) in enumerate(zip(ours, theirs, strict=True)):
-        same = np.broadcast_to(expected, mine.shape)
-        # The sign of a NaN means nothing.
-        nan = np.isnan(mine) & np.isnan(same)
-        if mine.dtype != same.dtype or np.where(nan, 0, mine).tobytes() != np.where(nan, 0, same).tobytes():
-            raise AssertionError(f"result {number} of a native program is not NumPy's")
+    """Compare programs of all operations with NumPy."""
+    if problem := first_difference():
+        raise AssertionError(problem)
 
 
 def _compare_dynamics() -> None:

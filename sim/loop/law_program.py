@@ -1,4 +1,4 @@
-"""The law of the control "pid" as a native program (:mod:`sim.engine.array_program`).
+"""The law of the control "pid" as a native program (:mod:`batchpid.native`).
 
 In a sim step the law makes some thirty calls of NumPy. The program is traced from
 :meth:`sim.loop.pid_law.PIDLaw.advance`, so that there is only one definition of the law.
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.coefficients import Coefficients
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.operations import MOST_SUMMED
+from batchpid.native.tracing import Symbol, Trace, trace
 from sim.engine import native
-from sim.engine.array_program import ArrayProgram, Symbol, Trace, trace
-from sim.engine.native.interface import MOST_SUMMED
 from sim.loop.pid_law import PIDLaw
 
 
@@ -83,7 +84,7 @@ class LawProgram:
             count = len(leaves) - sum(key[1:])
             self._programs[key] = ArrayProgram(traced, self._constants, count, self._shape), returned
         program, returned = self._programs[key]
-        outputs = program(*[leaf for leaf in leaves if leaf is not None], masks=observed)
+        outputs = program(*[leaf for leaf in leaves if leaf is not None])
         new: list[Any] = [None] * len(state)
         for at, leaf in zip(returned, outputs, strict=False):
             new[at] = leaf

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from batchpid.actuators import STAGES, Coefficients, Stages
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.operations import OPERATION
+from batchpid.native.tracing import trace
 from sim.engine import native
-from sim.engine.array_program import ArrayProgram, trace
-from sim.engine.native.interface import OPERATION
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""

@@ -33,7 +33,8 @@ def test_every_option_fits_on_three_lines(options):
 
 def test_a_controller_shows_its_size_and_whether_it_started():
     pid = bp.BatchPID(bp.make_params(JOINTS, **OPTIONS["pid"]), ENVS, 1 / 2000, terms=True)
-    assert repr(pid) == "BatchPID(4 envs, 3 joints, dt 0.0005 s, backend 'numpy', not started)"
+    backend = "'numpy' (native)" if pid.native else "'numpy'"
+    assert repr(pid) == f"BatchPID(4 envs, 3 joints, dt 0.0005 s, backend {backend}, not started)"
     pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
     assert repr(pid).endswith("started)")
     assert "not" not in repr(pid)

@@ -1,38 +1,15 @@
-"""Interface between Python and the native extensions: sources, flags, tables, and a digest of each.
+"""Interface between Python and the native extensions: files, flags and tables.
 
-The C++ code repeats these tables, so an extension works with the Python code that it was built with and with no other.
-``setup.py`` compiles the digests into each extension, and :mod:`sim.engine.native.loading` compares them. ``setup.py``
-runs this file by its path, before batchpid is installed: it may import the standard library only.
+The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` runs this file by its path,
+before batchpid is installed: it may import that module and the standard library only.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-FOLDER = Path(__file__).parent
-
-
-class Sources(NamedTuple):
-    """Files of an extension in this folder, and its compiler flags."""
-
-    unit: str
-    headers: tuple[str, ...]
-    flags: tuple[str, ...]
-
-
-_GATEWAY_HEADERS = ("buffer.h", "extension.h", "gateway.h", "rigid_body.h", "sim_step.h", "xla_call.h")
-_ROUNDED = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno")
-"""Operations are not fused, so that each is rounded as in NumPy."""
-EXTENSIONS = {
-    "_gateway": Sources("gateway.cpp", _GATEWAY_HEADERS, ("-std=c++17", "-O2")),
-    "_batch_dynamics": Sources(
-        "batch_dynamics.cpp", ("buffer.h", "extension.h", "rigid_body.h"), (*_ROUNDED, "-Wno-psabi")
-    ),
-    "_law_program": Sources("law_program.cpp", ("extension.h",), _ROUNDED),
-}
+from batchpid.native.extensions import ROUNDED, Extension
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -50,17 +27,8 @@ DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
 """Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
 STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
 """Arrays of ``step``, as Leaf in batch_dynamics.cpp."""
-OPERATIONS = (
-    *("add", "subtract", "multiply", "divide", "maximum", "minimum", "greater", "less", "not_equal", "and"),
-    *("negative", "absolute", "rint", "isfinite", "where", "row_minimum", "matrix_vector"),
-)
-"""Operations of programs, as Code in law_program.cpp."""
-OPERATION = ("code", "out", "first", "second", "third")
-"""int32 numbers of an operation: its code, and registers; as Operation in law_program.cpp."""
 FARTHEST = 1e6
 """Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is of float32."""
-MOST_SUMMED = 128
-"""Largest number of terms for which a sum has NumPy's order."""
 
 
 class Group(ctypes.Structure):
@@ -80,29 +48,30 @@ class Group(ctypes.Structure):
     ]
 
 
-def tables_digest(name: str) -> str:
-    """Return a digest of the tables that an extension shares with Python, and of its compiler flags."""
+def _files(*names: str) -> tuple[str, ...]:
+    return (*(f"sim/engine/native/{name}" for name in names), "batchpid/native/extension.h")
+
+
+def _gateway_tables() -> tuple[Any, ...]:
     group = [(field, getattr(Group, field).offset, getattr(Group, field).size) for field, *_ in Group._fields_]
-    tables: dict[str, Any] = {
-        "_gateway": (SYMBOLS, STATUS, FARTHEST, group, list(BODY.items())),
-        "_batch_dynamics": (DYNAMICS, STEP, list(BODY.items())),
-        "_law_program": (OPERATIONS, OPERATION, MOST_SUMMED),
-    }
-    return _digest(repr((tables[name], EXTENSIONS[name].flags)).encode())
+    return SYMBOLS, STATUS, FARTHEST, group, list(BODY.items())
 
 
-def sources_digest(name: str, folder: Path = FOLDER) -> str | None:
-    """Return a digest of an extension's C++ files; None if some are missing: only a build needs them."""
-    unit, headers, _ = EXTENSIONS[name]
-    try:
-        return _digest(*((folder / file).read_bytes() for file in (unit, *headers)))
-    except OSError:
-        return None
+def _batch_dynamics_tables() -> tuple[Any, ...]:
+    return DYNAMICS, STEP, list(BODY.items())
 
 
-def _digest(*parts: bytes) -> str:
-    """Return a hash of ``parts`` in order."""
-    digest = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little") + part)
-    return digest.hexdigest()
+EXTENSIONS = {
+    "_gateway": Extension(
+        "sim.engine.native._gateway",
+        _files("gateway.cpp", "buffer.h", "gateway.h", "rigid_body.h", "sim_step.h", "xla_call.h"),
+        ("-std=c++17", "-O2"),
+        _gateway_tables,
+    ),
+    "_batch_dynamics": Extension(
+        "sim.engine.native._batch_dynamics",
+        _files("batch_dynamics.cpp", "buffer.h", "rigid_body.h"),
+        (*ROUNDED, "-Wno-psabi"),
+        _batch_dynamics_tables,
+    ),
+}

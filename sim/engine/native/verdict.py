@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.native.availability import SWITCH
+from batchpid.native.extensions import ROOT, StaleExtensionError
 from sim.engine.native.library import functions, sapien_library
-from sim.engine.native.loading import ROOT, StaleExtensionError, extensions
+from sim.engine.native.loading import extensions
 
-SWITCH = "BATCHPID_NATIVE"
-"""Environment variable: "0" switches the native calls off."""
 _VERIFIED, _REFUSED = "BATCHPID_NATIVE_VERIFIED", "BATCHPID_NATIVE_REFUSED"
 """Environment variables of child processes: fingerprint of a verdict to use the extensions, or reason not to."""
 _SWITCHED_OFF = f"native calls are switched off by {SWITCH}=0"
@@ -128,7 +128,7 @@ def _fingerprint() -> str:
     """Return a hash of the inputs of the self-test: libraries, Python code, versions and the processor."""
     digest = hashlib.blake2b(digest_size=16)
     code = [file for package in ("batchpid", "sim/engine", "sim/robot") for file in (ROOT / package).rglob("*.py")]
-    for path in (sapien_library(), *(module.__file__ for module in extensions().values()), *sorted(code)):
+    for path in (sapien_library(), *(module.__file__ for module in extensions()), *sorted(code)):
         content = Path(path).read_bytes()
         digest.update(len(content).to_bytes(8, "little") + content)
     digest.update(repr((sys.version, np.__version__, platform.platform(), _processor())).encode())

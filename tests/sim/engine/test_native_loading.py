@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.util
+import importlib
 import pickle
 import re
-import shutil
-import subprocess
 import sys
-import sysconfig
 import threading
 import warnings
 
@@ -17,30 +14,26 @@ import numpy as np
 import pytest
 from identical import assert_identical
 
+from batchpid.native import extensions
+from batchpid.native.operations import PROGRAM
 from sim import Runner
-from sim.engine import native, native_self_test
-from sim.engine.array_program import Namespace, Symbol
+from sim.engine import native
 from sim.engine.batch_dynamics import PinocchioBatchDynamics, batch_dynamics
-from sim.engine.native import interface, loading, verdict
-from sim.engine.native.interface import EXTENSIONS, FOLDER, sources_digest, tables_digest
+from sim.engine.native import interface, verdict
+from sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
-needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no compiler")
 OTHERS = {
     "SYMBOLS": interface.SYMBOLS[::-1],
     "STATUS": interface.STATUS[::-1],
     "BODY": interface.BODY | {"mass": 2},
     "DYNAMICS": interface.DYNAMICS[::-1],
     "STEP": interface.STEP[::-1],
-    "OPERATIONS": interface.OPERATIONS[:4] + interface.OPERATIONS[5:3:-1] + interface.OPERATIONS[6:],
-    "OPERATION": interface.OPERATION[::-1],
-    "MOST_SUMMED": 256,
     "Group": type("Group", (ctypes.Structure,), {"_fields_": interface.Group._fields_[::-1]}),
 }
 USERS = {
     "_gateway": {"SYMBOLS", "STATUS", "BODY", "Group"},
     "_batch_dynamics": {"BODY", "DYNAMICS", "STEP"},
-    "_law_program": {"OPERATIONS", "OPERATION", "MOST_SUMMED"},
 }
 
 
@@ -49,9 +42,9 @@ def fresh(monkeypatch):
     """Let extensions be loaded and judged anew, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE_VERIFIED", raising=False)
     monkeypatch.setattr(verdict, "_verdict", None)
-    loading.extension.cache_clear()
+    extensions.load.cache_clear()
     yield
-    loading.extension.cache_clear()
+    extensions.load.cache_clear()
 
 
 def rollout(panda, workers=0, runners=1):
@@ -65,54 +58,22 @@ def rollout(panda, workers=0, runners=1):
 
 @pytest.mark.parametrize("table", OTHERS)
 def test_the_digest_of_tables_changes_with_each(monkeypatch, table):
-    before = {name: tables_digest(name) for name in EXTENSIONS}
+    before = {name: each.tables_digest() for name, each in EXTENSIONS.items()}
     monkeypatch.setattr(interface, table, OTHERS[table])
-    changed = {name for name in EXTENSIONS if tables_digest(name) != before[name]}
+    changed = {name for name, each in EXTENSIONS.items() if each.tables_digest() != before[name]}
     assert changed == {name for name, tables in USERS.items() if table in tables}
-
-
-@pytest.mark.parametrize("name", EXTENSIONS)
-def test_the_digest_changes_with_the_compiler_flags(monkeypatch, name):
-    before = tables_digest(name)
-    monkeypatch.setitem(EXTENSIONS, name, EXTENSIONS[name]._replace(flags=("-Ofast",)))
-    assert tables_digest(name) != before
-
-
-@pytest.mark.parametrize("name", EXTENSIONS)
-def test_the_digest_changes_with_each_source_file(tmp_path, name):
-    unit, headers, _ = EXTENSIONS[name]
-    for file in (unit, *headers):
-        shutil.copy(FOLDER / file, tmp_path)
-    assert sources_digest(name, tmp_path) == sources_digest(name)
-    for file in (unit, *headers):
-        content = (tmp_path / file).read_bytes()
-        (tmp_path / file).write_bytes(content + b"\n")
-        assert sources_digest(name, tmp_path) != sources_digest(name)
-        (tmp_path / file).write_bytes(content)
-    (tmp_path / unit).unlink()
-    assert sources_digest(name, tmp_path) is None
-
-
-@pytest.mark.parametrize("name", EXTENSIONS)
-def test_the_sources_are_all_that_are_included(name):
-    unit, headers, _ = EXTENSIONS[name]
-    included, pending = set(), [unit]
-    while pending:
-        found = set(re.findall(r'#include "(.*)"', (FOLDER / pending.pop()).read_text())) - included
-        included |= found
-        pending += found
-    assert included == set(headers)
 
 
 @needs_extension
 @pytest.mark.parametrize("changed", ["tables", "sources"])
-@pytest.mark.parametrize("name", EXTENSIONS)
+@pytest.mark.parametrize("name", [*EXTENSIONS, PROGRAM.name])
 def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, panda, name, changed):
     expected, _ = rollout(panda)
-    loading.extension.cache_clear()
+    extensions.load.cache_clear()
     monkeypatch.setattr(verdict, "_verdict", None)
-    real = getattr(loading, f"{changed}_digest")
-    monkeypatch.setattr(loading, f"{changed}_digest", lambda asked: "other" if asked == name else real(asked))
+    method = f"{changed}_digest"
+    real = getattr(extensions.Extension, method)
+    monkeypatch.setattr(extensions.Extension, method, lambda self: "other" if self.name == name else real(self))
     reason = f"{name} was built from other {changed}; run 'python setup.py build_ext --inplace --force' in "
     with pytest.warns(RuntimeWarning, match=re.escape(reason)) as caught:
         found, backend = rollout(panda, runners=2)
@@ -127,7 +88,7 @@ def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, 
 
 @needs_extension
 def test_worker_processes_take_the_verdict_without_a_warning_of_their_own(monkeypatch, panda, capfd):
-    monkeypatch.setattr(loading, "tables_digest", lambda name: "other")
+    monkeypatch.setattr(extensions.Extension, "tables_digest", lambda self: "other")
     with pytest.warns(RuntimeWarning, match="_gateway was built from other tables, _batch"):
         expected, _ = rollout(panda)
     found, _ = rollout(panda, workers=2)
@@ -135,100 +96,14 @@ def test_worker_processes_take_the_verdict_without_a_warning_of_their_own(monkey
     assert "Warning" not in capfd.readouterr().err
 
 
-def test_the_remedy_without_sources_is_a_new_installation(monkeypatch, tmp_path):
-    monkeypatch.setattr(loading, "FOLDER", tmp_path)
-    assert loading.remedy() == "install batchpid again"
-    monkeypatch.setattr(loading, "sources_digest", lambda name: sources_digest(name, tmp_path))
-    if native.status().active:
-        assert loading.extensions().keys() == EXTENSIONS.keys()  # judged by their tables
-
-
-def test_an_extension_that_cannot_be_loaded_is_named(monkeypatch, tmp_path):
-    broken = tmp_path / "_law_program.abi3.so"
-    broken.write_bytes(b"not a library")
-    monkeypatch.delitem(sys.modules, "sim.engine.native._law_program", raising=False)
-    monkeypatch.setattr(native, "__path__", [str(tmp_path), *native.__path__])
-    importlib.invalidate_caches()
-    with pytest.raises(ImportError, match="cannot be loaded"):
-        loading.extension("_law_program")
-    status = native.verify(tmp_path)
-    assert status.reason.startswith("_law_program cannot be loaded")
-    assert status.warning
-
-
 def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path):
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
-    monkeypatch.delitem(sys.modules, "sim.engine.native._law_program", raising=False)
+    monkeypatch.delitem(sys.modules, "sim.engine.native._gateway", raising=False)
     monkeypatch.setattr(native, "__path__", [str(tmp_path)])
     importlib.invalidate_caches()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert native.status() == (False, loading.NOT_BUILT, "")
-
-
-@pytest.fixture(scope="module")
-def build(tmp_path_factory):
-    """Return a function that compiles a program of permuted operations, with digests that are given."""
-
-    def compiled(tables, sources):
-        folder = tmp_path_factory.mktemp("build")
-        code = (FOLDER / "law_program.cpp").read_text().replace("MAXIMUM, MINIMUM", "MINIMUM, MAXIMUM")
-        (folder / "law_program.cpp").write_text(code)
-        library = folder / "_law_program.abi3.so"
-        macros = [f'-DBATCHPID_TABLES="{tables}"', f'-DBATCHPID_SOURCES="{sources}"']
-        include = [f"-I{FOLDER}", f"-I{sysconfig.get_paths()['include']}"]
-        flags = ["-shared", "-fPIC", "-std=c++17", "-O0"]
-        subprocess.run(["g++", *flags, *macros, *include, folder / "law_program.cpp", "-o", library], check=True)
-        return library
-
-    return compiled
-
-
-def load(monkeypatch, path):
-    """Load the library at ``path`` in place of the extension."""
-    spec = importlib.util.spec_from_file_location("sim.engine.native._law_program", path)
-    monkeypatch.delitem(sys.modules, spec.name)  # loading sets it
-    monkeypatch.setitem(sys.modules, spec.name, importlib.util.module_from_spec(spec))
-
-
-@needs_extension
-@needs_compiler
-def test_an_extension_of_permuted_operations_is_refused(monkeypatch, build, panda):
-    expected, _ = rollout(panda)
-    with monkeypatch.context() as patch:
-        patch.setattr(interface, "OPERATIONS", OTHERS["OPERATIONS"])
-        permuted = build(tables_digest("_law_program"), sources_digest("_law_program"))
-    load(monkeypatch, permuted)
-    monkeypatch.setattr(verdict, "_verdict", None)
-    loading.extension.cache_clear()
-    with pytest.warns(RuntimeWarning, match="_law_program was built from other tables") as caught:
-        found, backend = rollout(panda)
-    assert len(caught) == 1
-    assert "law in NumPy" in backend
-    assert_identical(expected, found)
-
-
-@needs_extension
-@needs_compiler
-def test_the_self_test_finds_permuted_operations_under_the_right_digests(build, tmp_path):
-    permuted = build(tables_digest("_law_program"), sources_digest("_law_program"))
-    program = (
-        "import importlib.util, json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-        f"spec = importlib.util.spec_from_file_location('sim.engine.native._law_program', {str(permuted)!r}); "
-        "sys.modules[spec.name] = importlib.util.module_from_spec(spec); "
-        "from sim.engine import native_self_test; native_self_test._compare_programs()"
-    )
-    status = native.verify(tmp_path, program)
-    assert not status.active
-    assert re.search(
-        r"the self-test failed: AssertionError: result \d+ of a native program is not NumPy's", status.reason
-    )
-
-
-def test_the_self_test_makes_every_operation():
-    namespace = Namespace()
-    native_self_test.every_operation(*(Symbol(namespace) for _ in range(4)))
-    assert {name for name, _, _ in namespace.noted} == set(interface.OPERATIONS)
+        assert native.status() == (False, extensions.NOT_BUILT, "")
 
 
 @needs_extension

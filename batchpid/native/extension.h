@@ -1,4 +1,4 @@
-// Module of an extension, with the digests of what it was built from; see sim/engine/native/interface.py.
+// Module of an extension, with the digests of what it was built from; see extensions.py.
 
 #pragma once
 

@@ -1,0 +1,117 @@
+"""Array functions as programs of the native extension, which executes all their operations in one call.
+
+With few envs, the overhead of a NumPy call is a hundred times its computation; with many, each call moves whole arrays
+to and from memory. A function is traced (:mod:`batchpid.native.tracing`), and the recorded operations are the program.
+It works through the rows in blocks that stay in the cache. Each operation is rounded as in NumPy, so that results are
+bit-identical, except for the sign of a NaN, which means nothing. There are no floating-point warnings.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.native.extensions import StaleExtensionError, load
+from batchpid.native.operations import PROGRAM
+from batchpid.native.tracing import Trace
+
+NUMBERS_PER_THREAD = 2**17
+"""Numbers of an array for which a further thread is worth its start (50 us)."""
+
+
+@cache
+def interpreter() -> Any:
+    """Return the extension, which has been told the types of NumPy; errors as :func:`extensions.load`."""
+    native = load(PROGRAM)
+    native.use(np.ndarray, np.empty)
+    rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
+    fixed.flags.writeable = False
+    for each in (rows, fixed):
+        if native.look(each) != (each.ctypes.data, *each.shape, each.dtype.num, each.flags.writeable):
+            raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
+    return native
+
+
+def threads_for(numbers: int, threads: int | None = None) -> int:
+    """Return the number of threads for arrays of so many numbers: at most ``threads``, or the cores it may use."""
+    most = numbers // NUMBERS_PER_THREAD
+    if most < 2:
+        return 1
+    if threads is None:
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(most, threads)
+
+
+class ArrayProgram:
+    """A trace with its first inputs fixed to ``constants``, for arrays (rows, columns) = ``shape`` of one dtype.
+
+    An array of constants is (rows, columns), (1, columns) or a number. ``inputs`` is the number of other inputs,
+    ``threads`` the largest number of threads (None: the cores that this process may use).
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        constants: Sequence[Any],
+        inputs: int,
+        shape: tuple[int, int],
+        dtype: Any = np.float64,
+        threads: int | None = None,
+    ) -> None:
+        self.shape, self.dtype, self.masks = shape, np.dtype(dtype), trace.masks
+        given = [np.ascontiguousarray(each, dtype) for each in (*constants, *trace.literals)]
+        if trace.prelude is not None:
+            rows = max((each.shape[0] for each in given if each.ndim == 2), default=1)
+            found = ArrayProgram(trace.prelude, (), len(given), (rows, shape[1]), dtype)(*given)
+            given += [each.astype(dtype) for each in found]
+        tables = trace.operations, trace.results, trace.registers
+        self.arguments = (*tables, inputs, tuple(given), *shape, self.dtype == np.float32)
+        """Arguments of ``make_program`` in make_program.h."""
+        self._program = interpreter().program(*self.arguments)
+        self._run = interpreter().run
+        self._threads = threads_for(shape[0] * shape[1], threads)
+
+    def __call__(self, *arrays: NDArray[Any], out: Sequence[NDArray[Any]] | None = None) -> Sequence[NDArray[Any]]:
+        """Return the results for the other inputs: new arrays, or ``out``, which is written to.
+
+        An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns) for products of
+        matrices and vectors. An array of ``out`` is (rows, columns), of dtype bool for masks. It may be an input of
+        that shape, and may not overlap with another one.
+
+        Raises
+        ------
+        ValueError
+            An array has a wrong shape or dtype, or one of ``out`` overlaps.
+        """
+        if out is None:
+            out = [np.empty(self.shape, bool if is_mask else self.dtype) for is_mask in self.masks]
+        try:
+            self._run(self._program, self.shape[0], arrays, tuple(out), self._threads)
+        except ValueError:  # the extension takes NumPy's own class alone, contiguous and aligned
+            plain = tuple([np.require(each, requirements=["C", "A", "E"]) for each in arrays])
+            self._run(self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads)
+        return out
+
+    def bind(
+        self, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]], given: int, full: int
+    ) -> Callable[..., Any]:
+        """Return a fast call with the first inputs, and all outputs but the last, fixed to these arrays.
+
+        The function is called with ``out`` and the further inputs, or None for each. It returns ``out``, or a new
+        array; or NotImplemented, having done nothing, if an array needs a check or conversion in Python.
+
+        Parameters
+        ----------
+        given
+            Bits of the further inputs that are arrays and not None.
+        full
+            Bits of the further inputs that have to be (rows, columns).
+        """
+        native, new = interpreter(), (self.shape, self.dtype)
+        fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)
+        return partial(native.call, native.bind(*fixed, given, full, new, self._threads))

@@ -1,0 +1,89 @@
+"""Whether native programs are used: built from the present files, not switched off, and equal to NumPy's results."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.native.array_program import ArrayProgram, interpreter
+from batchpid.native.extensions import StaleExtensionError, load_all
+from batchpid.native.operations import PROGRAM
+from batchpid.native.tracing import trace
+
+SWITCH = "BATCHPID_NATIVE"
+"""Environment variable: "0" switches native code off."""
+
+
+class ProgramStatus(NamedTuple):
+    """State of native programs: used or not, and the reason if not."""
+
+    active: bool
+    reason: str = ""
+    warning: str = ""
+    """Text of a warning, if the reason is a fault of the installation."""
+
+
+def program_status() -> ProgramStatus:
+    """Return whether native programs are used; a fault of the installation is one RuntimeWarning per process."""
+    if os.environ.get(SWITCH) == "0":
+        return ProgramStatus(False, f"native programs are switched off by {SWITCH}=0")
+    return _judged()
+
+
+@cache
+def _judged() -> ProgramStatus:
+    try:
+        load_all([PROGRAM])
+        interpreter()
+    except StaleExtensionError as error:
+        status = ProgramStatus(False, str(error), f"the native extension is not used, only NumPy: {error}")
+    except ModuleNotFoundError as error:
+        return ProgramStatus(False, str(error))
+    else:
+        if (problem := first_difference()) is None:
+            return ProgramStatus(True)
+        status = ProgramStatus(False, problem, f"the native extension is not used, only NumPy: {problem}")
+    warnings.warn(status.warning, RuntimeWarning, stacklevel=3)
+    return status
+
+
+def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
+    """Return the results of all operations of programs on arrays (rows, columns) and a matrix for each row."""
+    xp = a.__array_namespace__()
+    masks = a > b, a >= b, a < b, a <= b, a == b, a != b, xp.isfinite(a)
+    some = (a > b) & (b < c), (a > b) | (b < c), ~(a > b)
+    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.ceil(a), xp.floor(a), xp.sqrt(a), xp.sign(a)
+    pairs = a * b + c, a + b * c, a + b - c, (a - b) * c, xp.minimum(xp.maximum(a, b), c)
+    ends = xp.maximum(a, b), xp.minimum(a, b), xp.maximum(b, a), xp.minimum(b, a)
+    least = xp.zeros_like(a) + a.min(axis=-1, keepdims=True)
+    product = (matrix * b[:, None, :]).sum(axis=-1)
+    return [*numbers, *pairs, *ends, xp.where(a > b, b, c), least, product, *masks, *some]
+
+
+def first_difference() -> str | None:
+    """Return how results of programs of all operations differ from NumPy's, or None: a millisecond.
+
+    Some inputs are zero, infinite or NaN.
+    """
+    rng, shape = np.random.default_rng(0), (5, 9)
+    for dtype in (np.float64, np.float32):
+        a, b, c = (10.0 * rng.normal(size=(3, *shape))).astype(dtype)
+        special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 2.5], dtype)
+        a.flat[:36], b.flat[:36] = np.repeat(special, 6), np.tile(special, 6)
+        inputs = a, b, c, rng.normal(size=(*shape, shape[1])).astype(dtype)
+        with np.errstate(all="ignore"):
+            expected = every_operation(*inputs)
+        found = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype)(*inputs)
+        for number, pair in enumerate(zip(found, expected, strict=True)):
+            if _bits(pair[0]) != _bits(pair[1]):
+                return f"result {number} of a native program of {np.dtype(dtype)} is not NumPy's"
+    return None
+
+
+def _bits(array: Any) -> tuple[Any, bytes]:
+    """Return dtype and bytes of an array, with one NaN for all: their sign means nothing."""
+    return array.dtype, np.where(np.isnan(array), np.nan, array).tobytes()

@@ -1,0 +1,94 @@
+"""The law with its state as a native program, traced from :func:`batchpid.advance`, which is its only definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.coefficients import Coefficients
+from batchpid.law import advance
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.tracing import Symbol, Trace, trace
+from batchpid.state import PIDState, Terms
+
+_MEASUREMENT = 1
+"""Number of the measurement among the inputs: the one that is (envs, joints)."""
+
+
+@lru_cache(maxsize=256)
+def _trace(structures: tuple[tuple[Any, ...], ...], terms: bool, dtype: Any) -> tuple[Trace, tuple[int, ...]]:
+    """Return the trace of the law, and the leaves of the state that it returns before its other results.
+
+    ``structures`` are those of coefficients, state and inputs: ``...`` in place of each array, None where one is
+    missing, or a choice of the law, which compares by its type.
+    """
+    kept: list[int] = []
+
+    def function(*symbols: Symbol) -> list[Any]:
+        rest = iter(symbols)
+        k, state, inputs = ([next(rest) if one is ... else one for one in leaves] for leaves in structures)
+        new, *others = advance(Coefficients(*k), PIDState(*state), *inputs, terms=terms)
+        kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
+        if terms:
+            others = [*others[1], others[0]]
+        return [*(new[at] for at in kept), *others]
+
+    counts = [leaves.count(...) for leaves in structures]
+    traced = trace(function, counts[0], counts[1] + counts[2], dtype)
+    return traced, tuple(kept)
+
+
+class CompiledLaw:
+    """:func:`batchpid.advance` for coefficients ``k`` (1 | envs, joints), on arrays of their dtype."""
+
+    def __init__(self, k: Coefficients, num_envs: int, terms: bool, threads: int | None) -> None:
+        self._k, self._terms, self._threads = k, terms, threads
+        self._shape = num_envs, k.kp.shape[1]
+        self._programs: dict[tuple[bool, ...], tuple[ArrayProgram, tuple[int, ...]]] = {}
+
+    def _program(self, leaves: tuple[Any, ...], size: int) -> tuple[ArrayProgram, tuple[int, ...]]:
+        """Return the program for a state of ``size`` leaves and inputs, and the leaves of the state that it returns."""
+        key = tuple([leaf is None for leaf in leaves])
+        if key not in self._programs:
+            structures = tuple(map(_structure, (self._k, leaves[:size], leaves[size:])))
+            dtype = self._k.kp.dtype
+            traced, kept = _trace(structures, self._terms, dtype)
+            constants = [leaf for leaf in self._k if isinstance(leaf, np.ndarray)]
+            program = ArrayProgram(traced, constants, key.count(False), self._shape, dtype, self._threads)
+            self._programs[key] = program, kept
+        return self._programs[key]
+
+    def step(
+        self, state: PIDState, inputs: tuple[NDArray[Any] | None, ...], out: NDArray[Any] | None
+    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any] | None]:
+        """Advance the law; return the new state, the effort, the terms, and a fast call of the following steps.
+
+        The arrays of ``state`` are written to and are those of the new state. The fast call advances this state in
+        place, for ``out`` and the same kinds of inputs: see :meth:`ArrayProgram.bind`.
+        """
+        given = [each for each in inputs if each is not None]
+        state = PIDState(*(None if leaf is None else self._whole(leaf) for leaf in state))
+        program, kept = self._program((*state, *inputs), len(state))
+        fixed = [leaf for leaf in state if leaf is not None]
+        written = [state[at] for at in kept]
+        masks = program.masks[len(kept) :]
+        effort = np.empty(self._shape, program.dtype) if out is None else out
+        shown = [np.empty(self._shape, bool if is_mask else program.dtype) for is_mask in masks[:-1]]
+        read = [each if out is None or not np.may_share_memory(each, out) else each.copy() for each in given]
+        program(*fixed, *read, out=(*written, *shown, effort))
+        if self._terms:
+            return state, effort, Terms(*shown)._replace(effort=effort), None
+        bits = sum((each is not None) << at for at, each in enumerate(inputs))
+        return state, effort, None, program.bind(fixed, written, bits, 1 << _MEASUREMENT)
+
+    def _whole(self, leaf: NDArray[Any]) -> NDArray[Any]:
+        """Return a leaf of the state as a contiguous array (envs, joints); a row that all envs share is repeated."""
+        return np.ascontiguousarray(leaf if leaf.shape == self._shape else np.broadcast_to(leaf, self._shape))
+
+
+def _structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple([... if isinstance(leaf, np.ndarray) else leaf for leaf in leaves])

@@ -1,0 +1,107 @@
+// A Program from the arguments that Python gives (ArrayProgram.arguments in array_program.py).
+
+#pragma once
+
+#include "extension.h"
+
+#include <memory>
+
+#include "program.h"
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+template <class T>
+std::vector<T> values_of(char const *bytes, Py_ssize_t size) {
+  std::vector<T> all(static_cast<std::size_t>(size) / sizeof(T));
+  std::memcpy(all.data(), bytes, all.size() * sizeof(T));
+  return all;
+}
+
+inline std::nullptr_t misfit() {
+  PyErr_SetString(PyExc_ValueError, "arrays do not fit the program");
+  return nullptr;
+}
+
+// Add a constant of one number, one row, or all rows, which is copied.
+template <class T>
+bool add_constant(Program &program, Py_buffer const &view) {
+  Index const columns = program.columns, size = view.len / static_cast<Index>(sizeof(T));
+  if (view.itemsize != sizeof(T) || (size != 1 && size != columns && size != program.rows * columns)) return false;
+  bool const is_full = size != 1 && size != columns;
+  std::vector<T> all(static_cast<std::size_t>(is_full ? size : program.chunk));
+  T const *from = static_cast<T const *>(view.buf);
+  for (std::size_t i = 0; i < all.size(); ++i) all[i] = from[static_cast<Index>(i) % size];
+  std::vector<double> memory((all.size() * sizeof(T) + sizeof(double) - 1) / sizeof(double));
+  std::memcpy(memory.data(), all.data(), all.size() * sizeof(T));
+  program.shapes.push_back(is_full ? Shape::FULL : Shape::ROW);
+  program.constants.push_back(std::move(memory));
+  return true;
+}
+
+// Arguments: operations, results (bytes of int32), registers, inputs, constants (a tuple of contiguous arrays), rows,
+// columns, single. Return null with an exception of Python if they do not fit.
+inline std::unique_ptr<Program> make_program(PyObject *arguments) {
+  char const *operations, *results;
+  Py_ssize_t operations_size, results_size;
+  PyObject *constants;
+  int single;
+  auto program = std::make_unique<Program>();
+  if (!PyArg_ParseTuple(arguments, "y#y#nnO!nnp", &operations, &operations_size, &results, &results_size,
+                        &program->registers, &program->inputs, &PyTuple_Type, &constants, &program->rows,
+                        &program->columns, &single)) {
+    return nullptr;
+  }
+  program->operations = values_of<Operation>(operations, operations_size);
+  program->results = values_of<std::int32_t>(results, results_size);
+  program->single = single != 0;
+  if (program->rows < 1 || program->columns < 1) return misfit();
+  // Whole vectors of numbers, unless the rows are long.
+  program->chunk = program->columns;
+  while (program->chunk < CHUNK || (program->chunk < 4 * CHUNK && program->chunk % 8)) program->chunk += program->columns;
+  Py_ssize_t const count = PyTuple_Size(constants);
+  for (Py_ssize_t i = 0; i < count; ++i) {
+    Py_buffer view;
+    if (PyObject_GetBuffer(PyTuple_GetItem(constants, i), &view, PyBUF_C_CONTIGUOUS) != 0) return nullptr;
+    bool const added = single ? add_constant<float>(*program, view) : add_constant<double>(*program, view);
+    PyBuffer_Release(&view);
+    if (!added) return misfit();
+  }
+  Index const given = count + program->inputs;
+  auto const known = [&](std::int32_t number) { return number >= 0 && number < program->registers; };
+  bool fits = program->inputs >= 0 && given <= program->registers;
+  for (Operation const &each : program->operations) {
+    fits = fits && known(each.out) && each.out >= given && each.code >= ADD && each.code <= CLIP &&
+           std::all_of(each.operands, each.operands + 3, known);
+  }
+  fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
+  if (!fits) return misfit();
+  auto const made_by = [&](std::int32_t number) {
+    Index found = -1;
+    for (std::size_t i = 0; i < program->operations.size(); ++i) {
+      if (program->operations[i].out == number) found = found == -1 ? static_cast<Index>(i) : -2;
+    }
+    return found;
+  };
+  for (std::size_t i = 0; i < program->results.size(); ++i) {
+    auto const begin = program->results.begin(), self = begin + static_cast<Index>(i);
+    program->made.push_back(std::find(begin, self, *self) == self ? made_by(*self) : -1);
+  }
+  auto const all = static_cast<Index>(program->operations.size());
+  for (Index number = count; number < given; ++number) {
+    Index last = std::count(program->results.begin(), program->results.end(), number) ? all : -1;
+    for (Index i = 0; i < all; ++i) {
+      auto const &[code, out, operands] = program->operations[static_cast<std::size_t>(i)];
+      if (!std::count(operands, operands + 3, number)) continue;
+      bool const is_elementwise = code != ROW_MINIMUM && code != MATRIX_VECTOR;  // these read on after a first write
+      last = std::max(last, is_elementwise ? i : i + 1);
+    }
+    program->last_use.push_back(last);
+  }
+  return program;
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop

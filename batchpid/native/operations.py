@@ -1,0 +1,34 @@
+"""Operations of programs, and the extension that executes them; ``setup.py`` runs this file by its path."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.native.extensions import ROUNDED, Extension
+
+OPERATIONS = (
+    *("add", "subtract", "multiply", "divide", "maximum", "minimum"),
+    *("greater", "greater_equal", "less", "less_equal", "equal", "not_equal", "and", "or", "not"),
+    *("negative", "absolute", "rint", "ceil", "floor", "sqrt", "sign", "isfinite"),
+    *("where", "row_minimum", "matrix_vector", "multiply_add", "add_subtract"),
+    *("subtract_multiply", "clip"),
+)
+"""Operations of programs, as Code in program.h."""
+MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}
+"""Operations whose results are masks."""
+OPERATION = ("code", "out", "first", "second", "third")
+"""int32 numbers of an operation: its code, and registers; as Operation in program.h."""
+MOST_SUMMED = 128
+"""Largest number of terms for which a sum has NumPy's order."""
+
+
+def _tables() -> tuple[Any, ...]:
+    return OPERATIONS, OPERATION, MOST_SUMMED
+
+
+HEADERS = tuple(f"batchpid/native/{name}" for name in ("make_program.h", "extension.h", "program.h"))
+"""Headers of programs, which other extensions may include."""
+PROGRAM = Extension(
+    "batchpid.native._program", ("batchpid/native/program.cpp", *HEADERS), (*ROUNDED, "-pthread"), _tables
+)
+EXTENSIONS = {PROGRAM.name: PROGRAM}

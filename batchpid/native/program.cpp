@@ -1,0 +1,287 @@
+// Programs of operations on arrays (program.h) as a module of Python.
+
+#include "make_program.h"
+
+using namespace batchpid;
+
+namespace {
+
+constexpr char PROGRAM[] = "batchpid.program", BOUND[] = "batchpid.bound_program";
+constexpr Index WITH_LOCK = 1 << 14;  // numbers up to which the interpreter's lock is kept: a few microseconds
+
+// First fields of a dtype and of an array of NumPy: _PyArray_DescrNumPy2 and PyArrayObject_fields in
+// numpy/ndarraytypes.h, whose layouts all extensions compiled for NumPy 2 rely on. A buffer of Python would cost 0.2 us
+// per array, more than the law of a few envs.
+struct Dtype {
+  PyObject head;
+  PyTypeObject *type;
+  char kind, letter, byteorder, flags;
+  int number;
+};
+struct Array {
+  PyObject head;
+  char *data;
+  int dimensions;
+  Py_ssize_t *shape, *strides;
+  PyObject *base;
+  Dtype const *dtype;
+  int flags;
+};
+constexpr int CONTIGUOUS = 0x1, ALIGNED = 0x100, WRITEABLE = 0x400;
+constexpr int BOOL = 0, FLOAT = 11, DOUBLE = 12;  // numbers of dtypes
+
+PyTypeObject *array_type;
+PyObject *make_empty;
+
+// use(ndarray, empty): a type and a function of NumPy, which the process keeps.
+PyObject *use(PyObject *, PyObject *arguments) {
+  PyObject *type;
+  if (!PyArg_ParseTuple(arguments, "OO", &type, &make_empty)) return nullptr;
+  array_type = reinterpret_cast<PyTypeObject *>(type);
+  Py_INCREF(arguments);  // for good
+  Py_RETURN_NONE;
+}
+
+// Return the array in an object, or null: its class is NumPy's own, and it is contiguous, aligned and of this dtype.
+Array const *array_of(PyObject *object, int dtype) {
+  if (Py_TYPE(object) != array_type) return nullptr;
+  auto const *array = reinterpret_cast<Array const *>(object);
+  constexpr int needed = CONTIGUOUS | ALIGNED;
+  bool const is_native = array->dtype->byteorder == '=' || array->dtype->byteorder == '|';
+  return array->dtype->number == dtype && is_native && (array->flags & needed) == needed ? array : nullptr;
+}
+
+// look(array): address, shape, number of the dtype, and whether it can be written to, as this module reads them; None of
+// an array that is not contiguous.
+PyObject *look(PyObject *, PyObject *object) {
+  int const dtype = Py_TYPE(object) == array_type ? reinterpret_cast<Array const *>(object)->dtype->number : BOOL;
+  auto const *array = array_of(object, dtype);
+  if (array == nullptr || array->dimensions != 2) Py_RETURN_NONE;
+  return Py_BuildValue("Nnnii", PyLong_FromVoidPtr(array->data), array->shape[0], array->shape[1], dtype,
+                       (array->flags & WRITEABLE) != 0);
+}
+
+int dtype_of(Program const &program) { return program.single ? FLOAT : DOUBLE; }
+
+bool read_input(Program const &program, Index rows, PyObject *object, Input &input) {
+  auto const *array = array_of(object, dtype_of(program));
+  if (array == nullptr) return false;
+  Index const columns = program.columns, dimensions = array->dimensions;
+  auto const *shape = array->shape;
+  input.data = array->data;
+  if (dimensions == 2 && shape[0] == rows && shape[1] == columns) {
+    input.shape = Shape::FULL;
+  } else if ((dimensions == 1 && shape[0] == columns) || (dimensions == 2 && shape[0] == 1 && shape[1] == columns)) {
+    input.shape = Shape::ROW;
+  } else if (dimensions == 2 && shape[0] == rows && shape[1] == 1) {
+    input.shape = Shape::COLUMN;
+  } else if (dimensions == 3 && shape[0] == rows && shape[1] == columns && shape[2] == columns) {
+    input.shape = Shape::MATRIX;
+  } else {
+    input.shape = Shape::NUMBER;
+    return dimensions == 0 || (dimensions <= 2 && shape[0] == 1 && shape[dimensions - 1] == 1);
+  }
+  return true;
+}
+
+bool read_output(Program const &program, Index rows, PyObject *object, Output &output) {
+  auto const *mask = array_of(object, BOOL);
+  auto const *array = mask ? mask : array_of(object, dtype_of(program));
+  if (array == nullptr || !(array->flags & WRITEABLE) || array->dimensions != 2) return false;
+  output = {array->data, mask != nullptr};
+  return array->shape[0] == rows && array->shape[1] == program.columns;
+}
+
+// Return whether an output overlaps with another array than an input of its shape that is the same memory.
+bool overlaps(Program const &program, Index rows, Output const &output, Input const &input) {
+  Index const columns = program.columns, itemsize = program.itemsize();
+  Index const sizes[] = {1, columns, rows, rows * columns, rows * columns * columns};
+  auto const *read = static_cast<char const *>(input.data), *written = static_cast<char const *>(output.data);
+  Index const read_size = sizes[static_cast<int>(input.shape)] * itemsize;
+  Index const written_size = rows * columns * (output.is_mask ? 1 : itemsize);
+  if (read + read_size <= written || written + written_size <= read) return false;
+  return read != written || input.shape != Shape::FULL || output.is_mask;
+}
+
+bool fits(Program const &program, Index rows, std::vector<Input> const &inputs, std::vector<Output> const &outputs) {
+  bool good = static_cast<Index>(inputs.size()) == program.inputs && outputs.size() == program.results.size() &&
+              (rows == program.rows || std::count(program.shapes.begin(), program.shapes.end(), Shape::FULL) == 0);
+  auto const constants = static_cast<Index>(program.constants.size());
+  auto const is_matrix = [&](Index number) {
+    Index const i = number - constants;
+    return i >= 0 && i < program.inputs && inputs[static_cast<std::size_t>(i)].shape == Shape::MATRIX;
+  };
+  for (Operation const &each : program.operations) {
+    if (!good) return false;
+    bool const takes_matrix = each.code == MATRIX_VECTOR;  // whose third operand is a copy of the first
+    good = is_matrix(each.operands[0]) == takes_matrix && !is_matrix(each.operands[1]) &&
+           is_matrix(each.operands[2]) == takes_matrix;
+  }
+  for (std::int32_t result : program.results) good = good && !is_matrix(result);
+  for (Output const &output : outputs) {
+    for (Output const &other : outputs) good = good && (&other == &output || other.data != output.data);
+    for (Input const &input : inputs) good = good && !overlaps(program, rows, output, input);
+  }
+  return good;
+}
+
+void run_unlocked(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
+  if (rows * program.columns <= WITH_LOCK && threads == 1) return run(program, inputs, outputs, 0, rows);
+  Py_BEGIN_ALLOW_THREADS
+  if (threads == 1) {
+    run(program, inputs, outputs, 0, rows);
+  } else {
+    run_on_threads(program, inputs, outputs, rows, threads);
+  }
+  Py_END_ALLOW_THREADS
+}
+
+// program(...): see make_program.h.
+PyObject *make(PyObject *, PyObject *arguments) {
+  auto program = make_program(arguments);
+  if (program == nullptr) return nullptr;
+  return PyCapsule_New(program.release(), PROGRAM, [](PyObject *capsule) {
+    delete static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
+  });
+}
+
+bool read_all(Program const &program, Index rows, PyObject *arrays, std::vector<Input> &inputs) {
+  for (Py_ssize_t i = 0, count = PyTuple_Size(arrays); i < count; ++i) {
+    inputs.emplace_back();
+    if (!read_input(program, rows, PyTuple_GetItem(arrays, i), inputs.back())) return false;
+  }
+  return true;
+}
+
+bool read_all(Program const &program, Index rows, PyObject *arrays, std::vector<Output> &outputs) {
+  for (Py_ssize_t i = 0, count = PyTuple_Size(arrays); i < count; ++i) {
+    outputs.emplace_back();
+    if (!read_output(program, rows, PyTuple_GetItem(arrays, i), outputs.back())) return false;
+  }
+  return true;
+}
+
+// run(program, rows, inputs, outputs, threads): two tuples of arrays.
+PyObject *run_arrays(PyObject *, PyObject *arguments) {
+  PyObject *capsule, *read, *written;
+  Py_ssize_t rows;
+  int threads;
+  if (!PyArg_ParseTuple(arguments, "OnO!O!i", &capsule, &rows, &PyTuple_Type, &read, &PyTuple_Type, &written, &threads)) {
+    return nullptr;
+  }
+  auto const *program = static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
+  if (program == nullptr) return nullptr;
+  std::vector<Input> inputs;
+  std::vector<Output> outputs;
+  bool const good = read_all(*program, rows, read, inputs) && read_all(*program, rows, written, outputs);
+  if (!good || !fits(*program, rows, inputs, outputs)) return misfit();
+  run_unlocked(*program, inputs.data(), outputs.data(), rows, threads);
+  Py_RETURN_NONE;
+}
+
+// Program whose first inputs, and outputs but for the last, are the same arrays in each call.
+struct Bound {
+  PyObject *kept;    // arguments of bind, among them the program and the arrays
+  PyObject *output;  // arguments of numpy.empty
+  Program const *program;
+  Index rows;
+  int threads;
+  unsigned given, full;  // bits of the further inputs
+  std::vector<Input> inputs;
+  std::vector<Output> outputs;
+};
+constexpr std::size_t MOST = 32;  // inputs, outputs
+
+// bind(program, rows, inputs, outputs, given, full, output, threads): the first inputs and outputs; as bits, which of
+// the further inputs are arrays and not None, and which of these are (rows, columns); arguments of numpy.empty for the
+// last output.
+PyObject *bind(PyObject *, PyObject *arguments) {
+  PyObject *capsule, *read, *written;
+  auto bound = std::make_unique<Bound>();
+  if (!PyArg_ParseTuple(arguments, "OnO!O!IIO!i", &capsule, &bound->rows, &PyTuple_Type, &read, &PyTuple_Type, &written,
+                        &bound->given, &bound->full, &PyTuple_Type, &bound->output, &bound->threads)) {
+    return nullptr;
+  }
+  bound->program = static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
+  if (bound->program == nullptr) return nullptr;
+  Program const &program = *bound->program;
+  bool good = read_all(program, bound->rows, read, bound->inputs) &&
+              read_all(program, bound->rows, written, bound->outputs);
+  auto inputs = bound->inputs;
+  auto outputs = bound->outputs;
+  inputs.resize(static_cast<std::size_t>(program.inputs), {nullptr, Shape::FULL});
+  outputs.push_back({nullptr, false});
+  good = good && inputs.size() <= MOST && outputs.size() <= MOST && bound->inputs.size() <= inputs.size();
+  if (!good || !fits(program, bound->rows, inputs, outputs)) return misfit();
+  bound->kept = arguments;
+  Py_INCREF(arguments);
+  return PyCapsule_New(bound.release(), BOUND, [](PyObject *held) {
+    auto *mine = static_cast<Bound *>(PyCapsule_GetPointer(held, BOUND));
+    Py_DECREF(mine->kept);
+    delete mine;
+  });
+}
+
+// call(bound, out, *arrays): write and return the last output, a new array if out is None. Return NotImplemented, and do
+// nothing, if an array is not an ordinary one of a shape that broadcasts.
+PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
+  auto *bound = static_cast<Bound *>(PyCapsule_GetPointer(arguments[0], BOUND));
+  if (bound == nullptr) return nullptr;
+  Program const &program = *bound->program;
+  Input inputs[MOST];
+  Output outputs[MOST];
+  std::size_t read = bound->inputs.size();
+  std::size_t const written = bound->outputs.size();
+  std::copy_n(bound->inputs.data(), read, inputs);
+  std::copy_n(bound->outputs.data(), written, outputs);
+  unsigned given = 0;
+  bool good = true;
+  for (Py_ssize_t i = 2; i < count && good; ++i) {
+    unsigned const bit = 1u << (i - 2);
+    if (arguments[i] == Py_None) continue;
+    given |= bit;
+    good = (bound->given & bit) && read_input(program, bound->rows, arguments[i], inputs[read]) &&
+           (inputs[read].shape == Shape::FULL || (!(bound->full & bit) && inputs[read].shape != Shape::MATRIX));
+    ++read;
+  }
+  PyObject *out = arguments[1];
+  bool const is_new = out == Py_None;
+  good = good && given == bound->given;
+  if (good && !is_new) {
+    good = read_output(program, bound->rows, out, outputs[written]) && !outputs[written].is_mask;
+    for (std::size_t i = 0; i < read && good; ++i) good = !overlaps(program, bound->rows, outputs[written], inputs[i]);
+  }
+  if (!good) {
+    Py_INCREF(Py_NotImplemented);
+    return Py_NotImplemented;
+  }
+  if (!is_new) {
+    Py_INCREF(out);
+  } else {
+    out = PyObject_Call(make_empty, bound->output, nullptr);
+    if (out == nullptr) return nullptr;
+    if (!read_output(program, bound->rows, out, outputs[written])) return Py_DECREF(out), misfit();
+  }
+  run_unlocked(program, inputs, outputs, bound->rows, bound->threads);
+  return out;
+}
+
+template <class Function>
+PyCFunction method(Function function) {
+  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
+}
+
+PyMethodDef METHODS[] = {
+    {"use", use, METH_VARARGS, nullptr},
+    {"look", look, METH_O, nullptr},
+    {"program", make, METH_VARARGS, nullptr},
+    {"run", run_arrays, METH_VARARGS, nullptr},
+    {"bind", bind, METH_VARARGS, nullptr},
+    {"call", method(call), METH_FASTCALL, nullptr},
+    {nullptr, nullptr, 0, nullptr},
+};
+PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "_program", nullptr, -1, METHODS, nullptr, nullptr, nullptr, nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__program() { return batchpid::make_module(MODULE); }

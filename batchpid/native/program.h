@@ -1,0 +1,304 @@
+// Programs of operations on arrays (rows, columns), such as the control law of many envs: traced in Python
+// (tracing.py), run here on plain pointers. No call of Python, no exception, and no allocation after a thread's first
+// run. Every operation is rounded as NumPy's, in float or double.
+//
+// Rows are worked through in blocks that stay in the cache. An input of a block is read before an output of the same
+// memory is written, so an output may be the same array as an input of its shape (state in place). Other overlaps are not
+// allowed.
+//
+// Flags: -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math, and nothing of -ffast-math beyond.
+
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <system_error>
+#include <thread>
+#include <vector>
+
+#if defined(__x86_64__) && defined(__ELF__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define BATCHPID_CLONES __attribute__((target_clones("default", "avx2", "avx512f")))
+#else
+#define BATCHPID_CLONES
+#endif
+#define BATCHPID_INLINE inline __attribute__((always_inline))
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+using Index = std::ptrdiff_t;
+
+// OPERATIONS in operations.py. Masks are 1 and 0.
+enum Code : std::int32_t {
+  ADD, SUBTRACT, MULTIPLY, DIVIDE, MAXIMUM, MINIMUM, GREATER, GREATER_EQUAL, LESS, LESS_EQUAL, EQUAL, NOT_EQUAL, AND, OR,
+  NOT, NEGATIVE, ABSOLUTE, RINT, CEIL, FLOOR, SQRT, SIGN, FINITE, WHERE, ROW_MINIMUM, MATRIX_VECTOR,
+  MULTIPLY_ADD,       // a b + c, rounded twice
+  ADD_SUBTRACT,       // (a + b) - c
+  SUBTRACT_MULTIPLY,  // (a - b) c
+  CLIP,               // min(max(a, b), c)
+};
+
+struct Operation {
+  std::int32_t code, out, operands[3];  // numbers of registers
+};
+
+// Shapes of constants and inputs: (), (1, columns), (rows, 1), (rows, columns), (rows, columns, columns).
+enum class Shape : std::int32_t { NUMBER, ROW, COLUMN, FULL, MATRIX };
+
+struct Input {
+  void const *data;  // of row 0
+  Shape shape;
+};
+
+struct Output {
+  void *data;  // of row 0 of (rows, columns)
+  bool is_mask;  // bytes 0 and 1
+};
+
+// Numbers that a loop over a block passes at once, at least; a row that all rows share is repeated to that length.
+constexpr Index CHUNK = 128;
+// Bytes of a register in a block.
+constexpr Index BLOCK = 8192;
+
+// Registers are numbered: constants, inputs, temporaries. Immutable once made: any number of threads may run it.
+struct Program {
+  bool single = false;  // float, else double
+  Index columns = 0, chunk = 0, inputs = 0, registers = 0;
+  Index rows = 0;  // of constants (rows, columns)
+  std::vector<Operation> operations;
+  std::vector<std::int32_t> results;           // register of each output
+  std::vector<Index> made;                     // number of the operation that makes each result; -1: an operand, or twice
+  std::vector<Index> last_use;                 // number of the last operation that reads each input
+  std::vector<Shape> shapes;                   // of constants: ROW, repeated to a chunk, or FULL
+  std::vector<std::vector<double>> constants;  // of numbers of the program's type
+
+  Index itemsize() const { return single ? sizeof(float) : sizeof(double); }
+};
+
+namespace detail {
+
+template <class T>
+struct Operand {
+  T const *data;
+  Index step;  // numbers to the next chunk; 0: each chunk is the same
+};
+
+// Sum of the products of n numbers as NumPy's for n <= 128: in order below eight, else eight sums side by side; then
+// added to 0, as the sign of a sum of -0 tells.
+template <class T>
+BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
+  T sum = T(-0.0);
+  Index i = 0;
+  if (n >= 8) {
+    T s[8];
+    for (; i < 8; ++i) s[i] = a[i] * b[i];
+    for (; i + 8 <= n; i += 8) {
+      for (Index k = 0; k < 8; ++k) s[k] += a[i + k] * b[i + k];
+    }
+    sum = ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]));
+  }
+  for (; i < n; ++i) sum += a[i] * b[i];
+  return T(0) + sum;
+}
+
+// Apply an operation to n numbers, whole rows.
+template <class T>
+BATCHPID_INLINE void apply(Program const &program, Code code, Index n, T *out, Operand<T> x, Operand<T> y,
+                           Operand<T> z) {
+  Index const columns = program.columns, chunk = x.step && y.step && z.step ? n : program.chunk;
+#define EACH(expression)                                                             \
+  for (Index start = 0; start < n; start += chunk) {                                 \
+    T const *a = x.data, *b = y.data, *c = z.data;                                   \
+    T *o = out + start;                                                              \
+    Index const count = std::min(chunk, n - start);                                  \
+    _Pragma("GCC ivdep") for (Index i = 0; i < count; ++i) o[i] = T(expression);     \
+    static_cast<void>(a), static_cast<void>(b), static_cast<void>(c);                \
+    x.data += x.step, y.data += y.step, z.data += z.step;                            \
+  }                                                                                  \
+  break
+#define MAX(a, b) ((a) > (b) || (a) != (a) ? (a) : (b))
+#define MIN(a, b) ((a) < (b) || (a) != (a) ? (a) : (b))
+  switch (code) {
+    case ADD: EACH(a[i] + b[i]);
+    case SUBTRACT: EACH(a[i] - b[i]);
+    case MULTIPLY: case AND: EACH(a[i] * b[i]);
+    case DIVIDE: EACH(a[i] / b[i]);
+    case MAXIMUM: case OR: EACH(MAX(a[i], b[i]));
+    case MINIMUM: EACH(MIN(a[i], b[i]));
+    case GREATER: EACH(a[i] > b[i] ? 1 : 0);
+    case GREATER_EQUAL: EACH(a[i] >= b[i] ? 1 : 0);
+    case LESS: EACH(a[i] < b[i] ? 1 : 0);
+    case LESS_EQUAL: EACH(a[i] <= b[i] ? 1 : 0);
+    case EQUAL: EACH(a[i] == b[i] ? 1 : 0);
+    case NOT_EQUAL: EACH(a[i] != b[i] ? 1 : 0);
+    case NOT: EACH(1 - a[i]);
+    case NEGATIVE: EACH(-a[i]);
+    case ABSOLUTE: EACH(std::fabs(a[i]));
+    case RINT: EACH(std::nearbyint(a[i]));
+    case CEIL: EACH(std::ceil(a[i]));
+    case FLOOR: EACH(std::floor(a[i]));
+    case SQRT: EACH(std::sqrt(a[i]));
+    case SIGN: EACH(a[i] > 0 ? 1 : a[i] < 0 ? -1 : a[i] == 0 ? 0 : a[i]);
+    case FINITE: EACH(a[i] - a[i] == 0 ? 1 : 0);
+    case WHERE: EACH(a[i] != 0 ? b[i] : c[i]);
+    case MULTIPLY_ADD: EACH(a[i] * b[i] + c[i]);
+    case ADD_SUBTRACT: EACH(a[i] + b[i] - c[i]);
+    case SUBTRACT_MULTIPLY: EACH((a[i] - b[i]) * c[i]);
+    case CLIP: EACH(MIN(MAX(a[i], b[i]), c[i]));
+    case ROW_MINIMUM:
+      for (Index row = 0; row < n; row += columns) {
+        T const *a = x.data + (x.step ? row : row % program.chunk);
+        T least = a[0];
+        for (Index i = 1; i < columns; ++i) least = MIN(least, a[i]);
+        std::fill_n(out + row, columns, least);
+      }
+      break;
+    case MATRIX_VECTOR:  // x (rows, columns, columns)
+      for (Index row = 0; row < n; row += columns) {
+        T const *b = y.data + (y.step ? row : row % program.chunk);
+        for (Index i = row; i < row + columns; ++i) out[i] = sum_of_products(x.data + i * columns, b, columns);
+      }
+      break;
+  }
+#undef EACH
+#undef MAX
+#undef MIN
+}
+
+// Write n numbers of a register.
+template <class T>
+BATCHPID_INLINE void write(Output const &output, Index at, Index n, Index chunk, Operand<T> from) {
+  if (from.step) chunk = n;
+  for (Index start = 0; start < n; start += chunk, from.data += from.step) {
+    Index const count = std::min(chunk, n - start);
+    if (output.is_mask) {
+      char *to = static_cast<char *>(output.data) + at + start;
+      for (Index i = 0; i < count; ++i) to[i] = from.data[i] != 0;
+    } else if (T *to = static_cast<T *>(output.data) + at + start; to != from.data) {
+      for (Index i = 0; i < count; ++i) to[i] = from.data[i];
+    }
+  }
+}
+
+// Work area of the calling thread, of at least this many bytes; it grows, and is freed with the thread.
+inline char *work_area(std::size_t bytes) {
+  constexpr std::size_t LINE = 64;
+  thread_local std::vector<char> area;
+  if (area.size() < bytes + LINE) area.resize(bytes + LINE);
+  return area.data() + (LINE - reinterpret_cast<std::uintptr_t>(area.data()) % LINE);
+}
+
+// Bytes of a block's registers, and of their table.
+inline std::size_t work_size(Program const &program, Index block) {
+  std::size_t const padded = static_cast<std::size_t>(block * program.itemsize() + 127) / 64 * 64;
+  auto const slots = static_cast<std::size_t>(program.registers) - program.constants.size();
+  return static_cast<std::size_t>(program.registers) * sizeof(Operand<double>) + 64 + slots * padded;
+}
+
+// Return whether a result can be made in its output: no input of the same memory is read later on.
+inline bool is_made_in_place(Program const &program, Input const *inputs, Output const *outputs, std::size_t result) {
+  Index const made = program.made[result];
+  if (made < 0 || outputs[result].is_mask) return false;
+  for (Index i = 0; i < program.inputs; ++i) {
+    if (inputs[i].data == outputs[result].data && program.last_use[static_cast<std::size_t>(i)] > made) return false;
+  }
+  return true;
+}
+
+template <class T>
+BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Output const *outputs, Index first,
+                              Index rows) {
+  Index const columns = program.columns, chunk = program.chunk, last = (first + rows) * columns;
+  Index const most = BLOCK / static_cast<Index>(sizeof(T)) / chunk, all = (rows * columns + chunk - 1) / chunk;
+  Index const block = std::min(std::max<Index>(1, most), all) * chunk;
+  Index const slot = static_cast<Index>((block * sizeof(T) + 127) / 64 * 64 / sizeof(T));
+  auto const constants = static_cast<Index>(program.constants.size());
+  char *area = work_area(work_size(program, block));
+  auto *at = reinterpret_cast<Operand<T> *>(area);
+  T *slots = reinterpret_cast<T *>(area + (program.registers * sizeof(Operand<T>) + 63) / 64 * 64);
+  for (Index i = 0; i < program.inputs; ++i) {  // those that all blocks share
+    T *repeated = slots + i * slot;
+    auto const *from = static_cast<T const *>(inputs[i].data);
+    at[constants + i] = {repeated, inputs[i].shape == Shape::COLUMN ? chunk : 0};
+    if (inputs[i].shape == Shape::NUMBER) std::fill_n(repeated, chunk, from[0]);
+    if (inputs[i].shape != Shape::ROW) continue;
+    for (Index row = 0; row < chunk; row += columns) std::copy_n(from, columns, repeated + row);
+  }
+  for (Index i = constants + program.inputs; i < program.registers; ++i) at[i] = {slots + (i - constants) * slot, chunk};
+  std::uint64_t in_place = 0;  // bits of results
+  for (std::size_t i = 0; i < std::min<std::size_t>(64, program.results.size()); ++i) {
+    in_place |= static_cast<std::uint64_t>(is_made_in_place(program, inputs, outputs, i)) << i;
+  }
+  for (Index start = first * columns; start < last; start += block) {
+    Index const n = std::min(block, last - start), row = start / columns;
+    for (Index i = 0; i < constants; ++i) {
+      auto const *from = reinterpret_cast<T const *>(program.constants[i].data());
+      at[i] = program.shapes[i] == Shape::FULL ? Operand<T>{from + start, chunk} : Operand<T>{from, 0};
+    }
+    for (Index i = 0; i < program.inputs; ++i) {
+      auto const *from = static_cast<T const *>(inputs[i].data);
+      if (inputs[i].shape == Shape::FULL) at[constants + i] = {from + start, chunk};
+      if (inputs[i].shape == Shape::MATRIX) at[constants + i] = {from + start * columns, chunk};
+      if (inputs[i].shape != Shape::COLUMN) continue;
+      T *repeated = slots + i * slot;
+      for (Index j = 0; j * columns < n; ++j) std::fill_n(repeated + j * columns, columns, from[row + j]);
+    }
+    for (std::size_t i = 0; i < program.results.size(); ++i) {
+      if (i < 64 && in_place >> i & 1) at[program.results[i]] = {static_cast<T *>(outputs[i].data) + start, chunk};
+    }
+    for (Operation const &each : program.operations) {
+      auto const *operands = each.operands;
+      apply(program, static_cast<Code>(each.code), n, const_cast<T *>(at[each.out].data), at[operands[0]],
+            at[operands[1]], at[operands[2]]);
+    }
+    for (std::size_t i = 0; i < program.results.size(); ++i) {
+      write(outputs[i], start, n, chunk, at[program.results[i]]);
+    }
+  }
+}
+
+BATCHPID_CLONES static void run_single(Program const &program, Input const *inputs, Output const *outputs, Index first,
+                                       Index rows) {
+  run_rows<float>(program, inputs, outputs, first, rows);
+}
+
+BATCHPID_CLONES static void run_double(Program const &program, Input const *inputs, Output const *outputs, Index first,
+                                       Index rows) {
+  run_rows<double>(program, inputs, outputs, first, rows);
+}
+
+}  // namespace detail
+
+// Run a program on some rows; inputs and outputs have its type and number. MATRIX_VECTOR needs a matrix.
+inline void run(Program const &program, Input const *inputs, Output const *outputs, Index first_row, Index rows) {
+  (program.single ? detail::run_single : detail::run_double)(program, inputs, outputs, first_row, rows);
+}
+
+// Run a program on all rows with the help of further threads; the result does not depend on their number.
+inline void run_on_threads(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
+  // Rows that a thread takes at once: some blocks, and few enough to keep all threads busy to the end.
+  Index const slab = std::max<Index>(1, std::min(4 * BLOCK / program.columns, rows / (4 * threads)));
+  std::atomic<Index> next{0};
+  auto const work = [&] {
+    for (Index row; (row = next.fetch_add(slab)) < rows;) {
+      run(program, inputs, outputs, row, std::min(slab, rows - row));
+    }
+  };
+  std::vector<std::thread> others;
+  others.reserve(static_cast<std::size_t>(threads));
+  try {
+    while (static_cast<int>(others.size()) + 1 < threads) others.emplace_back(work);
+  } catch (std::system_error const &) {  // the system has no more: those that run do all the work
+  }
+  work();
+  for (std::thread &other : others) other.join();
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop

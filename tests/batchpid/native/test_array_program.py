@@ -1,0 +1,155 @@
+"""Programs of array functions give the bytes of NumPy, for all shapes of inputs and any number of threads."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_compiled_law import bits, numbers
+
+import batchpid as bp
+from batchpid import friction, guard
+from batchpid.actuators import STAGES
+from batchpid.actuators import Coefficients as ActuatorCoefficients
+from batchpid.actuators.envelope import Envelope
+from batchpid.native import array_program
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.availability import every_operation, program_status
+from batchpid.native.tracing import trace
+
+pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
+DTYPES = st.sampled_from([np.float64, np.float32])
+SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9, 16, 33, 100]))
+
+
+def assert_identical(ours, theirs):
+    for mine, expected in zip(ours, theirs, strict=True):
+        assert bits(mine) == bits(np.broadcast_to(expected, mine.shape))
+
+
+@given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
+def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
+    rng, (rows, columns) = np.random.default_rng(seed), shape
+    shapes = st.sampled_from([shape, (1, columns), (rows, 1), (1, 1)])
+    inputs = [numbers(rng, shape, 0.2, dtype), *(numbers(rng, data.draw(shapes), 0.2, dtype) for _ in range(2))]
+    inputs.append(numbers(rng, (*shape, columns), 0.01, dtype))
+    wide = [*np.broadcast_arrays(*inputs[:3]), inputs[3]]
+    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
+        program = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4)))
+    with np.errstate(all="ignore"):
+        assert_identical(program(*inputs), every_operation(*wide))
+
+
+@given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
+def test_constants_of_one_row_of_all_rows_and_numbers(shape, dtype, seed, data):
+    def function(k, high, x):
+        xp = x.__array_namespace__()
+        return [xp.minimum(k * x + (1 - k), high), -k < x, k + -0.0]
+
+    rng = np.random.default_rng(seed)
+    shapes = st.sampled_from([shape, (1, shape[1]), ()])
+    k, high = (np.asarray(numbers(rng, data.draw(shapes), 0.2, dtype)) for _ in range(2))
+    x = numbers(rng, shape, 0.2, dtype)
+    program = ArrayProgram(trace(function, 2, 1, dtype), [k, high], 1, shape, dtype)
+    out = [x, np.empty(shape, bool), np.empty(shape, dtype)]
+    with np.errstate(all="ignore"):
+        expected = function(k.reshape(k.shape or (1, 1)), high, x.copy())
+    assert program(x, out=out) is out
+    assert_identical(out, expected)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    program = ArrayProgram(trace(lambda a, b: [a + b, a > b], 0, 2), (), 2, (4, 3))
+    a, b, masks = np.ones((4, 3)), np.ones((4, 3)), np.empty((4, 3), bool)
+    rows = np.ones((5, 3))
+    for inputs, out in (
+        ((a,), None),
+        ((a, b.astype(np.float32)), None),
+        ((a, b[:2]), None),
+        ((a, b > 0), None),
+        ((a, np.ones((4, 3, 3))), None),
+        ((a, b), [a]),
+        ((a, b), [np.empty((4, 3), np.float32), masks]),
+        ((a, b), [np.empty((3, 4)).T, masks]),
+        ((a, b), [np.broadcast_to(1.0, (4, 3)), masks]),
+        ((rows[1:], b), [rows[:-1], masks]),
+        ((a, rows[:1]), [rows[:-1], masks]),
+    ):
+        with pytest.raises(ValueError, match="do not fit"):
+            program(*inputs, out=out)
+    assert program(a, b, out=[a, masks])[0] is a
+    assert (a == 2).all()
+
+
+def test_results_may_be_written_over_inputs_that_are_read_later():
+    def swap(a, b):
+        total = a + b
+        return [total - a, b - 1.0 + a, total]
+
+    a, b = np.random.default_rng(0).normal(size=(2, 700, 9))
+    out = [a.copy(), b.copy(), np.empty_like(a)]
+    ArrayProgram(trace(swap, 0, 2), (), 2, a.shape)(*out[:2], out=out)
+    assert_identical(out, swap(a, b))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    "options", [{}, {"rate": 2.0}, {"acceleration": [30.0, np.inf]}, {"continuous": [True, False]}]
+)
+def test_the_guard_can_be_traced(options, dtype):
+    limits = bp.make_guard(2, lower=-1.0, upper=[1.0, np.inf], **options, dtype=dtype)
+    rng, shape = np.random.default_rng(0), (60, 2)
+    inputs = [numbers(rng, shape, 0.1, dtype) for _ in range(3)]
+    given = [leaf for leaf in limits if leaf is not None]
+
+    def function(*arrays):
+        rest = iter(arrays)
+        mine = guard.Guard(*(None if leaf is None else next(rest) for leaf in limits))
+        state, changed = guard.advance(mine, guard.GuardState(next(rest), next(rest)), next(rest), 1e-3)
+        return [*state, changed]
+
+    program = ArrayProgram(trace(function, len(given), 3, dtype), given, 3, shape, dtype)
+    with np.errstate(all="ignore"):
+        assert_identical(program(*inputs), function(*given, *inputs))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("static", [None, 2.0])
+def test_friction_can_be_traced(static, dtype):
+    rng, shape = np.random.default_rng(0), (60, 2)
+    k = [np.full((1, 2), value, dtype) for value in (1.0, 0.1, static) if value is not None]
+    inputs = [*(numbers(rng, shape, 0.1, dtype) for _ in range(6)), (rng.random(shape) < 0.5).astype(dtype)]
+
+    def function(*arrays):
+        rubs, (effort, velocity, *state) = friction.Friction(*arrays[: len(k)]), arrays[len(k) :]
+        new, total = friction.advance(rubs, friction.FrictionState(*state), effort, velocity)
+        return [new.effort, new.sliding, total]
+
+    program = ArrayProgram(trace(function, len(k), 7, dtype), k, 7, shape, dtype)
+    with np.errstate(all="ignore"):
+        assert_identical(program(*inputs), function(*k, *inputs))
+
+
+@pytest.mark.parametrize("stage", STAGES._fields)
+def test_the_stages_of_actuators_can_be_traced(stage):
+    rng, shape = np.random.default_rng(0), (60, 2)
+    names = "intake", "strength", "bias", "play", "position_resolution", "velocity_resolution", "turns"
+    ends = "stall", "reverse", "slope", "limit", "least"
+    values = rng.uniform(0.5, 1.0, (len(names) + 2 * len(ends), 1, 2))
+    inputs = [numbers(rng, shape, 0.1, float) for _ in range({"limits": 2, "play": 3}.get(stage, 4))]
+
+    def function(*arrays):
+        k, first, second = (arrays[a:b] for a, b in ((0, 7), (7, 12), (12, 17)))
+        envelopes = {
+            name: Envelope(**dict(zip(ends, each, strict=True)))
+            for name, each in (("envelope", first), ("commands", second))
+        }
+        coefficients = ActuatorCoefficients(**dict(zip(names, k, strict=True)), **envelopes)
+        return getattr(STAGES, stage)(coefficients, *arrays[17:])
+
+    program = ArrayProgram(trace(function, 17, len(inputs)), list(values), len(inputs), shape)
+    with np.errstate(all="ignore"):
+        assert_identical(program(*inputs), function(*values, *inputs))

@@ -1,0 +1,239 @@
+"""BatchPID by the native extension: the bytes of NumPy, whatever the options, inputs, shapes and threads."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.native import array_program
+from batchpid.native.availability import SWITCH, program_status
+
+needs_extension = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
+DT = 1 / 2000
+OPTIONS = st.fixed_dictionaries(
+    {"kp": st.just(40.0)},
+    optional={
+        "ki": st.sampled_from([0.0, 50.0, [[5.0]]]),
+        "kd": st.sampled_from([0.0, 2.0]),
+        "effort_limit": st.sampled_from([0.0, 5.0, 80.0]),
+        "effort_rate_limit": st.just(900.0),
+        "integral_limit": st.just(0.2),
+        "derivative_filter_time": st.just(0.01),
+        "setpoint_weight": st.just(0.7),
+        "setpoint_weight_derivative": st.just(0.3),
+        "weight_origin": st.just("start"),
+        "first_derivative": st.just("kick"),
+        "deadband": st.just(0.3),
+        "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
+        "integration": st.just("integrate_first"),
+        "non_finite": st.sampled_from(["zero", "hold"]),
+        "continuous": st.just(True),
+    },
+)
+EVERYTHING = {
+    "kp": 40.0,
+    "ki": 5.0,
+    "kd": 2.0,
+    "effort_limit": 87.0,
+    "derivative_filter_time": 0.01,
+    "anti_windup": "back_calculation",
+}
+
+
+def params_of(joints, options, dtype):
+    """Return params with these options, without those that do not go together."""
+    try:
+        return bp.make_params(joints, **options, dtype=dtype)
+    except InvalidArgumentError as error:
+        options = {name: value for name, value in options.items() if name not in (error.argument, "anti_windup")}
+        return params_of(joints, options, dtype)
+
+
+def in_numpy(*arguments, **options):
+    """Return a controller that NumPy computes."""
+    with mock.patch.dict("os.environ", {SWITCH: "0"}):
+        return bp.BatchPID(*arguments, **options)
+
+
+def bits(leaf):
+    """Return dtype, shape and bits of an array, with one NaN for all."""
+    return None if leaf is None else (leaf.dtype, leaf.shape, np.where(np.isnan(leaf), np.nan, leaf).tobytes())
+
+
+def numbers(rng, shape, odd, dtype):
+    """Return numbers of many sizes; a share ``odd`` of them is zero, infinite or not a number."""
+    values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 3, shape)
+    special = rng.choice([0.0, -0.0, np.inf, -np.inf, np.nan], shape)
+    return np.where(rng.random(shape) < odd, special, values).astype(dtype)
+
+
+@needs_extension
+@given(
+    OPTIONS,
+    st.sampled_from([1, 2, 7, 8, 9, 20, 130]),
+    st.sampled_from([1, 2, 5, 57, 120, 300]),
+    st.sampled_from([np.float64, np.float32]),
+    st.sampled_from([0.0, 0.1]),
+    st.booleans(),
+    st.integers(1, 4),
+    st.integers(0, 2**32),
+    st.data(),
+)
+def test_a_native_controller_is_bit_identical_to_numpy(options, joints, envs, dtype, odd, terms, threads, seed, data):
+    rng, shape = np.random.default_rng(seed), (envs, joints)
+    if data.draw(st.booleans(), "gains of each env"):
+        options = {**options, "kp": rng.uniform(1, 50, shape)}
+    params = params_of(joints, options, dtype)
+    setpoint_shape = data.draw(st.sampled_from([shape, (1, joints), (joints,), (envs, 1), ()]), "setpoint")
+    present = data.draw(st.tuples(*[st.booleans()] * 3), "optional inputs")
+    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
+        ours = bp.BatchPID(params, envs, DT, terms=terms, threads=threads)
+        theirs = in_numpy(params, envs, DT, terms=terms)
+        for step in range(4):
+            r, y = numbers(rng, setpoint_shape, odd, dtype), numbers(rng, shape, odd, dtype)
+            rest = [numbers(rng, shape, odd, dtype) if one else None for one in present]
+            with np.errstate(all="ignore"):
+                expected = theirs(r, y, *rest)
+            out = data.draw(st.sampled_from([None, np.empty(shape, dtype), y]), "out")
+            found = ours(r, y, *rest, out=out)
+            assert out is None or found is out
+            assert bits(found) == bits(expected)
+            if terms:
+                assert [*map(bits, ours.terms)] == [*map(bits, theirs.terms)]
+            if step % 2:
+                assert [*map(bits, ours.state)] == [*map(bits, theirs.state)]
+
+
+def both(options=EVERYTHING, envs=5, joints=3):
+    params = bp.make_params(joints, **options)
+    return bp.BatchPID(params, envs, DT), in_numpy(params, envs, DT), np.random.default_rng(0).normal(size=(9, envs, 3))
+
+
+@needs_extension
+def test_a_controller_says_whether_it_is_native():
+    ours, theirs, _ = both()
+    assert (ours.native, theirs.native) == (True, False)
+    assert "'numpy' (native)" in repr(ours)
+
+
+def test_efforts_and_states_do_not_change_under_the_caller():
+    ours, theirs, y = both()
+    kept = []
+    for step in range(8):
+        arrays = [ours(y[8], y[step]), *(leaf for leaf in ours.state if leaf is not None)]
+        if step % 3 == 0:
+            kept += [(each, each.copy()) for each in arrays]
+        np.testing.assert_array_equal(arrays[0], theirs(y[8], y[step]))
+        if step == 4:
+            ours(y[8], y[0])
+            theirs(y[8], y[0])
+    for array, before in kept:
+        np.testing.assert_array_equal(array, before)
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda pid: pickle.loads(pickle.dumps(pid))])
+def test_a_copy_goes_its_own_way(copied):
+    ours, theirs, y = both()
+    for step in range(3):
+        ours(y[8], y[step])
+        theirs(y[8], y[step])
+    other = copied(ours)
+    assert other.native == ours.native
+    for step in range(3):
+        other(y[7], y[0])
+        np.testing.assert_array_equal(ours(y[8], y[step]), theirs(y[8], y[step]))
+    state = ours.state
+    other.reset(y[0])
+    assert all(a is b is None or np.array_equal(a, b) for a, b in zip(state, ours.state, strict=True))
+
+
+def test_reset_track_and_other_params_take_effect_in_between():
+    ours, theirs, y = both()
+    for pid in (ours, theirs):
+        for step in range(3):
+            pid(y[8], y[step])
+    before = ours.state
+    for act in (
+        lambda pid: pid.reset(y[3], np.arange(5) < 2, keep_integral=True),
+        lambda pid: pid.track(y[8, :1], y[4], 3.0, y[5, :1]),
+        lambda pid: setattr(pid, "params", pid.params.replace(kp=9.0, effort_rate_limit=300.0)),
+        lambda pid: setattr(pid, "params", pid.params.replace(anti_windup="conditional", effort_rate_limit=None)),
+    ):
+        for pid in (ours, theirs):
+            act(pid)
+        for step in range(3):
+            np.testing.assert_array_equal(ours(y[8], y[step]), theirs(y[8], y[step]))
+            np.testing.assert_array_equal(ours(2.0, y[step], feedforward=y[6]), theirs(2.0, y[step], feedforward=y[6]))
+    assert not np.array_equal(before.integral, ours.state.integral)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        np.asfortranarray,
+        lambda rows: rows.astype(np.float32).astype(rows.dtype.newbyteorder()),
+        lambda rows: rows.view(np.dtype(float, metadata={"unit": "rad"})),
+        lambda rows: np.concatenate([rows, rows], axis=1)[:, : rows.shape[1]],
+        lambda rows: np.frombuffer(b"...." + rows.tobytes(), np.uint8)[4:].view(float).reshape(rows.shape),
+        lambda rows: rows.view(np.recarray),
+        lambda rows: rows.tolist(),
+    ],
+    ids=["columns first", "byte order", "metadata", "a part", "unaligned", "a subclass", "lists"],
+)
+def test_inputs_may_be_any_arrays(change):
+    ours, theirs, y = both()
+    for step in range(4):
+        one = change(np.float32(y[step]).astype(float))
+        np.testing.assert_array_equal(ours(y[8], one, feedforward=one), theirs(y[8], one, feedforward=one))
+
+
+def test_out_may_be_an_input_or_overlap_with_one():
+    ours, theirs, y = both()
+    for step in range(4):
+        expected = theirs(y[8], y[step])
+        np.testing.assert_array_equal(ours(y[8], y[step], out=y[step]), expected)
+        rows = np.concatenate([y[7, :1], y[7]])
+        expected = theirs(rows[1:].copy(), y[6])
+        assert np.shares_memory(ours(rows[1:], y[6], out=rows[:-1]), rows)
+        np.testing.assert_array_equal(rows[:-1], expected)
+
+
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        (np.zeros((5, 3), np.float32), r"is float32 \(5, 3\), not float64 \(5, 3\); .*np.empty"),
+        (np.zeros((3, 5)), r"is float64 \(3, 5\), not float64 \(5, 3\)"),
+        (np.zeros((3, 5)).T, "is not contiguous"),
+        (np.broadcast_to(0.0, (5, 3)), "cannot be written to"),
+        ([[0.0] * 3] * 5, "is a list"),
+    ],
+    ids=["dtype", "shape", "order", "read-only", "list"],
+)
+def test_a_wrong_out_is_refused_and_changes_nothing(out, said):
+    for pid in both()[:2]:
+        y = np.ones((5, 3))
+        pid(2.0, y)
+        before = pid.state
+        for _ in range(2):  # before and after a fast call
+            with pytest.raises(InvalidArgumentError, match=f"out: {said}"):
+                pid(2.0, y, out=out)
+            np.testing.assert_array_equal(pid.state.integral, before.integral)
+            pid(2.0, y)
+            before = pid.state
+
+
+def test_out_is_for_numpy():
+    pytest.importorskip("jax")
+    pid = bp.BatchPID(bp.make_params(3, 1.0, dtype=np.float32), 5, DT, "jax")
+    with pytest.raises(InvalidArgumentError, match="out: is not for backend 'jax'"):
+        pid(1.0, np.zeros((5, 3)), out=np.zeros((5, 3), np.float32))
+    with pytest.raises(InvalidArgumentError, match="threads"):
+        bp.BatchPID(bp.make_params(3, 1.0), 5, DT, threads=0)
