@@ -35,6 +35,7 @@ def built(extension, definition):
 
 
 load("batchpid.native.extensions")
+load("batchpid.native.operations")
 setup(
     ext_modules=[
         built(extension, definition)

@@ -49,6 +49,10 @@ class Namespace:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
 
+    def atleast_2d(self, value: Any) -> Any:
+        """Return ``value``, which has rows and columns."""
+        return value
+
     def zeros_like(self, _: Any) -> Symbol:
         """Return the number 0."""
         return self.symbol(0.0)

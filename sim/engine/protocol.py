@@ -150,6 +150,9 @@ class CompiledStep(Protocol):
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
 
+    def __call__(self, *arrays: Float64) -> int:
+        """Do one sim step: (effort, qpos, qvel, passive force), each (envs, dof); return the status."""
+
     def left(self) -> list[int]:
         """Return the envs that :meth:`CompiledPack.look` has to be told of after the last sim step."""
 

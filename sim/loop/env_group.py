@@ -12,12 +12,14 @@ from batchpid.actuators import ActuatorState, advance_measurement
 from batchpid.elementwise import clip
 from batchpid.friction import FrictionState
 from batchpid.guard import GuardState
+from sim.engine import native
 from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import obstacle
 from sim.loop.control_step import StepState
 from sim.loop.custom import OwnController
 from sim.loop.faults import FaultContainment, far, finite, near
+from sim.loop.native_executor import NativeExecutor
 from sim.loop.numpy_executor import NumPyExecutor, passive_forces, with_model
 from sim.loop.pid_law import PIDLaw
 from sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
@@ -74,10 +76,14 @@ class EnvGroup:
         layout = make_layout(options, self._acting_params, self._actuators)
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
-        self._executor: NumPyExecutor | XLAExecutor = NumPyExecutor(options, pack, layout, constants)
-        compiles = options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators)
-        if compiles and isinstance(pack, CompiledPack):
+        self._executor: NumPyExecutor | XLAExecutor
+        steps = isinstance(pack, CompiledPack) and native.status().active and layout.coupling is None
+        if not isinstance(pack, CompiledPack) or not steps or layout.control == "drive":
+            self._executor = NumPyExecutor(options, pack, layout, constants)
+        elif options.backend == "jax" and not obstacle(options, self._actuators):
             self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
+        else:
+            self._executor = NativeExecutor(options, pack, layout, constants)
         self._measured = self._executor.measure()
 
     def _write_drives(self) -> None:
@@ -164,7 +170,6 @@ class EnvGroup:
                     self._contain(rows(before), done, outputs.returned)
             if not (near(self._qpos) and finite(self.pack.read_qvel())):
                 self._contain(self._qpos, substeps, None)
-            self._state = self._state._replace(matrix=None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
 

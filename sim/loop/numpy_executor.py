@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ControllerError
+from sim.engine import native
 from sim.engine.engines import scene_dynamics
+from sim.engine.native.mass_matrix import NativeMassMatrix
 from sim.engine.protocol import DrivenPack, EnginePack, RobotModel
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
@@ -60,15 +62,15 @@ class NumPyExecutor:
         self._speed_limit = options.speed_limit
         self._controller = None if isinstance(options.control, str) else options.control
         self._reads_qvel = needs_qvel(layout, constants, options.speed_limit)
+        self._reads_force = self._gravity and not layout.measures
 
     def measure(self) -> Measured:
         """Return a reading of the robots."""
         pack = self._pack
-        reads_force = self._gravity and not self._layout.measures
         return Measured(
             pack.read_qpos(),
             pack.read_qvel() if self._reads_qvel else None,
-            pack.passive_force(self._gravity, self._coriolis) if reads_force else None,
+            pack.passive_force(self._gravity, self._coriolis) if self._reads_force else None,
         )
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
@@ -82,18 +84,23 @@ class NumPyExecutor:
                 if self._controller is None:
                     raise
                 raise ControllerError(type(self._controller).__name__, error, index + 1) from error
-            if outputs.target is not target and isinstance(
-                pack, DrivenPack
-            ):  # drives' targets cost a call for each joint
+            # Drives' targets cost a call for each joint.
+            if outputs.target is not target and isinstance(pack, DrivenPack):
                 known = outputs.target_rate is rate
                 pack.write_drive_target(outputs.target, None if known else _zeros_for_none(outputs))
                 target, rate = outputs.target, outputs.target_rate
-            pack.write_qf(outputs.qf)
-            pack.step(index % COUPLING_STEPS == 0)
-            before, measured = measured.qpos, self.measure()
-            if failed := not sound(measured, self._speed_limit):
+            before = measured.qpos
+            measured, failed = self._advance(outputs.qf, index)
+            if failed:
                 break
         return Ran(state, outputs, measured, before, index + 1, failed)
+
+    def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
+        """Do a sim step under efforts ``qf``; return the reading, and whether an env may have failed."""
+        self._pack.write_qf(qf)
+        self._pack.step(index % COUPLING_STEPS == 0)
+        measured = self.measure()
+        return measured, not sound(measured, self._speed_limit)
 
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as NumPy's."""
@@ -130,7 +137,12 @@ def _zeros_for_none(outputs: Outputs) -> Float64:
 
 
 def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
-    """Return the function of the mass matrix of the description of the robots."""
+    """Return the function of the mass matrix of the description of the robots.
+
+    Where the extension is used, every executor takes its mass matrix: the last bits of Pinocchio's differ.
+    """
+    if pack.spec.fixed_base and native.status().active:
+        return NativeMassMatrix(pack.spec)
 
     @cache
     def dynamics() -> RobotModel:

@@ -18,18 +18,15 @@ from batchpid.friction import Friction
 from batchpid.jax_settings import own_settings
 from sim.engine.engines import scene_dynamics
 from sim.engine.native import xla
-from sim.engine.native.interface import STATUS
 from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from sim.loop.custom import OwnController, controller_errors
 from sim.loop.jitted import padded, put
+from sim.loop.native_executor import LOOK
 from sim.loop.numpy_executor import Ran, passive_forces
 from sim.loop.step_constants import needs_qvel
 from sim.options import RunnerOptions
-
-_LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
-"""Bits of the status of a sim step after which an env may have failed."""
 
 
 class Bodies(NamedTuple):
@@ -123,7 +120,7 @@ class XLAExecutor:
             pack.look(native.left())
             if self._bound is not pack.calls:
                 measured = self.measure()
-        return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & _LOOK))
+        return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & LOOK))
 
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as NumPy's, a new array."""

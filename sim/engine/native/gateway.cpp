@@ -7,6 +7,7 @@
 
 #include "../../../batchpid/native/extension.h"
 #include "sim_step.h"
+#include "tick.h"
 #include "xla_call.h"
 
 using namespace batchpid;
@@ -158,6 +159,81 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return PyLong_FromLong(status);
 }
 
+constexpr char BOUND[] = "batchpid.bound_program";
+
+// bind(arguments of make_program, inputs, outputs): pairs of an array (contiguous, kept alive by the caller) and the
+// number of its Shape, and arrays.
+PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto bound = std::make_unique<BoundProgram>();
+  bound->program = make_program(arguments[0]);
+  if (bound->program == nullptr) return nullptr;
+  Program const &program = *bound->program;
+  Index const numbers = program.rows * program.columns;
+  if (program.single || PyTuple_Size(arguments[1]) != program.inputs ||
+      PyTuple_Size(arguments[2]) != static_cast<Py_ssize_t>(program.results.size())) {
+    return misfit();
+  }
+  for (Py_ssize_t i = 0; i < program.inputs; ++i) {
+    PyObject *pair = PyTuple_GetItem(arguments[1], i);
+    auto const shape = static_cast<Shape>(PyLong_AsLong(PyTuple_GetItem(pair, 1)));
+    Buffer array;
+    Index const count = shape == Shape::MATRIX ? numbers * program.columns : numbers;
+    if (!array.open(PyTuple_GetItem(pair, 0), count, sizeof(double), PyBUF_C_CONTIGUOUS)) return nullptr;
+    bound->inputs.push_back({array.as<void>(), shape});
+  }
+  for (Py_ssize_t i = 0; i < PyTuple_Size(arguments[2]); ++i) {
+    Buffer array;
+    if (!array.open(PyTuple_GetItem(arguments[2], i), numbers, 0, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) return nullptr;
+    bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
+  }
+  for (Operation const &each : program.operations) {  // products need a matrix
+    Index const from = each.operands[0] - static_cast<Index>(program.constants.size());
+    bool const is_matrix = from >= 0 && from < program.inputs && bound->inputs[from].shape == Shape::MATRIX;
+    if (each.code == MATRIX_VECTOR && !is_matrix) return misfit();
+  }
+  return PyCapsule_New(bound.release(), BOUND, [](PyObject *capsule) {
+    delete static_cast<BoundProgram *>(PyCapsule_GetPointer(capsule, BOUND));
+  });
+}
+
+// tick(bound program, address of a Tick, address of a Group, begin, until, end) -> (steps done, Status)
+PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[0], BOUND));
+  auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
+  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
+  if (bound == nullptr || arrays == nullptr || group == nullptr) return nullptr;
+  if (bound->program->rows != static_cast<Index>(group->gateway->robots.size()) ||
+      bound->program->columns != group->gateway->dof || arrays->dof != group->gateway->dof) {
+    return misfit();
+  }
+  std::int64_t step = PyLong_AsLongLong(arguments[3]);
+  std::int64_t const until = PyLong_AsLongLong(arguments[4]), end = PyLong_AsLongLong(arguments[5]);
+  std::int32_t status = 0;
+  PyObject *done = without_gil([&] { status = run_tick(*bound, *arrays, *group, step, until, end); });
+  if (done == nullptr) return nullptr;
+  Py_DECREF(done);
+  return Py_BuildValue("Li", static_cast<long long>(step), static_cast<int>(status));
+}
+
+// mass_matrices(tree, bodies, qpos, out, rows, dof): of each row of qpos (rows, dof), as tick makes them.
+PyObject *mass_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), dof = PyLong_AsSsize_t(arguments[5]);
+  Buffer tree, bodies, qpos, out;
+  if (!tree.open(arguments[0], 2 * dof, sizeof(std::int32_t), PyBUF_C_CONTIGUOUS) ||
+      !bodies.open(arguments[1], 25 * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !qpos.open(arguments[2], rows * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !out.open(arguments[3], rows * dof * dof, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
+    return nullptr;
+  }
+  return without_gil([&] {
+    std::vector<BodyState<double>> states;
+    for (Py_ssize_t row = 0; row < rows; ++row) {
+      mass_matrix(dof, tree.as<std::int32_t>(), bodies.as<BodyRow<double>>(), qpos.as<double>() + row * dof,
+                  out.as<double>() + row * dof * dof, states);
+    }
+  });
+}
+
 // xla_functions(): their addresses, by name.
 PyObject *xla_functions(PyObject *, PyObject *) {
   PyObject *functions = PyDict_New();
@@ -187,6 +263,9 @@ PyMethodDef METHODS[] = {
     {"step", step, METH_O, nullptr},
     {"contacts", method(contacts), METH_FASTCALL, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
+    {"bind", method(bind), METH_FASTCALL, nullptr},
+    {"tick", method(tick), METH_FASTCALL, nullptr},
+    {"mass_matrices", method(mass_matrices), METH_FASTCALL, nullptr},
     {"xla_functions", xla_functions, METH_NOARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

@@ -1,7 +1,7 @@
 """Interface between Python and the native extensions: files, flags and tables.
 
 The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` runs this file by its path,
-before batchpid is installed: it may import that module and the standard library only.
+before batchpid is installed: it may import that module, :mod:`batchpid.native.operations` and the standard library.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import ctypes
 from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
+from batchpid.native.operations import HEADERS, PROGRAM
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -48,13 +49,32 @@ class Group(ctypes.Structure):
     ]
 
 
+class Tick(ctypes.Structure):
+    """Arrays of the sim steps of a tick, as Tick in tick.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "qf")),
+        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping", "matrix")),
+        ("timestep", ctypes.c_double),
+        ("dof", ctypes.c_int64),
+        ("whole", ctypes.c_int32),
+        ("matrix_steps", ctypes.c_int32),
+    ]
+
+
+def _layout(structure: type[ctypes.Structure]) -> list[tuple[str, int, int]]:
+    """Return the fields of a structure, with their places and sizes."""
+    return [
+        (field, getattr(structure, field).offset, getattr(structure, field).size) for field, *_ in structure._fields_
+    ]
+
+
 def _files(*names: str) -> tuple[str, ...]:
     return (*(f"sim/engine/native/{name}" for name in names), "batchpid/native/extension.h")
 
 
 def _gateway_tables() -> tuple[Any, ...]:
-    group = [(field, getattr(Group, field).offset, getattr(Group, field).size) for field, *_ in Group._fields_]
-    return SYMBOLS, STATUS, FARTHEST, group, list(BODY.items())
+    return SYMBOLS, STATUS, FARTHEST, _layout(Group), _layout(Tick), list(BODY.items()), PROGRAM.tables()
 
 
 def _batch_dynamics_tables() -> tuple[Any, ...]:
@@ -64,8 +84,11 @@ def _batch_dynamics_tables() -> tuple[Any, ...]:
 EXTENSIONS = {
     "_gateway": Extension(
         "sim.engine.native._gateway",
-        _files("gateway.cpp", "buffer.h", "gateway.h", "rigid_body.h", "sim_step.h", "xla_call.h"),
-        ("-std=c++17", "-O2"),
+        (
+            *_files("gateway.cpp", "buffer.h", "gateway.h", "rigid_body.h", "sim_step.h", "tick.h", "xla_call.h"),
+            *HEADERS,
+        ),
+        (*ROUNDED, "-pthread"),
         _gateway_tables,
     ),
     "_batch_dynamics": Extension(

@@ -1,0 +1,88 @@
+// Sim steps of a tick of a group of robots in one call: mass matrices, control step, and the engine, in turn.
+//
+// The control step is a Program, traced from sim/loop/control_step.py. Its state is in the arrays that it reads and
+// writes. Mass matrices of the law are made here, since no Program can: every `matrix_steps` sim steps, as there.
+
+#pragma once
+
+#include "../../../batchpid/native/make_program.h"
+#include "rigid_body.h"
+#include "sim_step.h"
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+// Arrays (robots, dof) of double, which Python owns: Tick in interface.py.
+struct Tick {
+  double *qpos, *qvel, *passive;  // reading, before and after each sim step
+  double *before;                 // positions before the last sim step
+  double const *qf;               // an output of the program
+  std::int32_t const *tree;       // (dof, 2), of the description
+  double const *bodies;           // (dof, 25)
+  double const *armature;         // (dof,), or null
+  double const *damping;          // (dof,), or null
+  double *matrix;                 // (robots, dof, dof), or its diagonal, or null
+  double timestep;
+  std::int64_t dof;
+  std::int32_t whole;             // the law takes the whole matrix
+  std::int32_t matrix_steps;
+};
+
+// A program with its arrays.
+struct BoundProgram {
+  std::unique_ptr<Program> program;
+  std::vector<Input> inputs;
+  std::vector<Output> outputs;
+};
+
+// Write M + armature + dt B of each robot, at the pose in the middle of so many sim steps.
+inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
+  auto const n = static_cast<std::size_t>(tick.dof);
+  thread_local std::vector<BodyState<double>> bodies;
+  thread_local std::vector<double> pose, found;
+  pose.resize(n);
+  found.resize(n * n);
+  double const ahead = 0.5 * static_cast<double>(steps - 1) * tick.timestep;
+  for (std::int64_t row = 0; row < robots; ++row) {
+    for (std::size_t j = 0; j < n; ++j) {
+      std::size_t const at = static_cast<std::size_t>(row) * n + j;
+      pose[j] = tick.qpos[at] + ahead * tick.qvel[at];
+    }
+    auto const *rows = reinterpret_cast<BodyRow<double> const *>(tick.bodies);
+    mass_matrix(tick.dof, tick.tree, rows, pose.data(), found.data(), bodies);
+    for (std::size_t j = 0; j < n; ++j) {
+      double &entry = found[j * n + j];
+      if (tick.armature != nullptr) entry += tick.armature[j];
+      if (tick.damping != nullptr) entry += tick.timestep * tick.damping[j];
+    }
+    double *to = tick.matrix + static_cast<std::size_t>(row) * (tick.whole ? n * n : n);
+    if (tick.whole) {
+      std::copy(found.begin(), found.end(), to);
+    } else {
+      for (std::size_t j = 0; j < n; ++j) to[j] = found[j * n + j];
+    }
+  }
+}
+
+// Run the sim steps from `step` to `until`, of a tick of `end` steps; return the status of the last, and count in `step`.
+inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group &group, std::int64_t &step,
+                             std::int64_t until, std::int64_t end) {
+  auto const robots = static_cast<std::int64_t>(group.gateway->robots.size());
+  auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
+  std::int32_t status = 0;
+  while (step < until && status == 0) {
+    if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
+      write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
+    }
+    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+    std::memcpy(tick.before, tick.qpos, bytes);
+    status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
+    ++step;
+  }
+  return status;
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop
