@@ -5,7 +5,8 @@ are each input read once and each output written once: setpoint, measurement, fe
 and filtered rate in; effort, integral, measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is
 that over the best time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays of the
 same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy on the GPU where JAX has
-one. Compilation is never timed. "jax" is :class:`batchpid.BatchPID`; "jax in blocks" is
+one. Compilation is never timed. "native", "numpy" and "jax" are :class:`batchpid.BatchPID`, the first two with and
+without the extension; efforts of "native" are written into kept arrays (``out=``). "jax in blocks" is
 :func:`batchpid.blocks.advance_in_blocks` under shard_map with a device for each core, whose efforts are written over
 those of the step before last.
 """
@@ -13,6 +14,7 @@ those of the step before last.
 import os
 import time
 from functools import cache
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,7 @@ import simple_pid
 
 import batchpid as bp
 from batchpid.blocks import advance_in_blocks
+from batchpid.native.availability import SWITCH
 from batchpid.reference import SimplePID
 
 numba = pytest.importorskip("numba")
@@ -40,10 +43,10 @@ ARRAYS = 10
 SIZES = [1, 64, 4096, 2**16, 2**20]
 
 
-def inputs(num_envs):
+def inputs(num_envs, dtype=np.float32):
     """Return setpoint, two measurements to alternate between, and feedforward."""
     rng = np.random.default_rng(0)
-    return [rng.normal(size=(num_envs, JOINTS)).astype(np.float32) for _ in range(4)]
+    return [rng.normal(size=(num_envs, JOINTS)).astype(dtype) for _ in range(4)]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -108,9 +111,26 @@ def _by_hand(kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, i
             last[i, j], rate[i, j], effort[i, j] = y[i, j], v, s
 
 
-def numpy_step(num_envs):
-    r, y0, y1, ff = inputs(num_envs)
-    pid, turn = bp.BatchPID(PARAMS, num_envs, DT), [y0, y1]
+def native_step(num_envs, dtype=np.float32, threads=None):
+    """Return a call of BatchPID by the native extension, which writes over the efforts of the call before last."""
+    r, y0, y1, ff = inputs(num_envs, dtype)
+    pid, turn = bp.BatchPID(PARAMS.replace(dtype=dtype), num_envs, DT, threads=threads), [y0, y1]
+    outs = [np.empty_like(r), np.empty_like(r)]
+    if not pid.native:
+        pytest.skip("there is no extension")
+
+    def call():
+        turn.reverse()
+        outs.reverse()
+        return pid(r, turn[0], feedforward=ff, out=outs[0])
+
+    return call
+
+
+def numpy_step(num_envs, dtype=np.float32):
+    r, y0, y1, ff = inputs(num_envs, dtype)
+    with mock.patch.dict(os.environ, {SWITCH: "0"}):
+        pid, turn = bp.BatchPID(PARAMS.replace(dtype=dtype), num_envs, DT), [y0, y1]
 
     def call():
         turn.reverse()
@@ -210,6 +230,7 @@ def simple():
 
 
 KERNELS = {
+    "native": native_step,
     "numpy": numpy_step,
     "jax": jax_step,
     "jax in blocks": jax_step_in_blocks,
@@ -252,6 +273,45 @@ def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, 
         np.testing.assert_allclose(first, effort, rtol=1e-3, atol=1e-2)
         compare(f"law, {num_envs} envs", kernel, over, seconds / least)
     found[num_envs, kernel] = first, least
+
+
+@pytest.mark.parametrize(("num_envs", "threads"), [(64, 1), (4096, 1), (2**20, 1), (2**20, 2)])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_native_against_numpy_and_memory(benchmark, compare, most, dtype, num_envs, threads):
+    """Least times of rounds in turn: the law by the extension and by NumPy, and the triad on as many threads."""
+    num_envs, threads = min(num_envs, most.rows), min(threads, numba.config.NUMBA_NUM_THREADS)
+    a, b, c = np.ones((3, num_envs * JOINTS), dtype)
+    calls = {
+        "native": native_step(num_envs, dtype, threads),
+        "numpy": numpy_step(num_envs, dtype),
+        "triad": lambda: _triad(a, b, c, dtype(2)),
+    }
+    times = {name: [] for name in calls}
+    repeat = max(1, min(most.ticks, 2**17 // num_envs))
+
+    def rounds():
+        for name, call in calls.items():
+            began = time.perf_counter()
+            for _ in range(repeat):
+                call()
+            times[name].append((time.perf_counter() - began) / repeat)
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        rounds()
+        for each in times.values():
+            each.clear()  # compilation
+        benchmark.pedantic(rounds, rounds=min(10, most.rounds))
+    finally:
+        numba.set_num_threads(before)
+    assert calls["native"]().tobytes() == calls["numpy"]().tobytes()
+    least = {name: min(each) for name, each in times.items()}
+    bound = ARRAYS / 3 * least["triad"]
+    benchmark.extra_info |= {f"us, {name}": round(1e6 * seconds, 2) for name, seconds in least.items()}
+    setup = f"law, {num_envs} envs, {np.dtype(dtype)}, {threads} threads"
+    compare(setup, "native", "numpy", least["numpy"] / least["native"])
+    compare(setup, "native", "bound by the triad's memory traffic", bound / least["native"])
 
 
 @pytest.mark.parametrize("kernel", SCALARS)

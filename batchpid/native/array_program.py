@@ -93,7 +93,7 @@ class ArrayProgram:
         try:
             self._run(self._program, self.shape[0], arrays, tuple(out), self._threads)
         except ValueError:  # the extension takes NumPy's own class alone, contiguous and aligned
-            plain = tuple([np.require(each, requirements=["C", "A", "E"]) for each in arrays])
+            plain = tuple([np.asarray(np.require(each, requirements=["C", "A"])) for each in arrays])
             self._run(self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads)
         return out
 

@@ -2,8 +2,8 @@
 
 C++ code repeats tables of the Python code, so an extension works with the Python code that it was built with and with
 no other. ``setup.py`` compiles a digest of the tables and one of the sources into each extension, and :func:`load`
-compares them. ``setup.py`` runs this file by its path, before batchpid is installed: it may import the standard library
-only, as the modules that define extensions.
+compares them. ``setup.py`` imports this module without its package, before NumPy is installed: it may import the
+standard library only. The modules that define extensions may import it, too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Operations of programs, and the extension that executes them; ``setup.py`` runs this file by its path."""
+"""Operations of programs, and the extension that executes them.
+
+``setup.py`` imports this module without its package: it may import the standard library and the module of extensions.
+"""
 
 from __future__ import annotations
 

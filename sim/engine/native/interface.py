@@ -1,7 +1,7 @@
 """Interface between Python and the native extensions: files, flags and tables.
 
-The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` runs this file by its path,
-before batchpid is installed: it may import that module, :mod:`batchpid.native.operations` and the standard library.
+The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` imports this module without its
+package: it may import that module, :mod:`batchpid.native.operations` and the standard library only.
 """
 
 from __future__ import annotations
