@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from batchpid.errors import ControllerError
 from sim.engine import native
 from sim.engine.engines import scene_dynamics
-from sim.engine.native.mass_matrix import NativeMassMatrix
+from sim.engine.native_mass_matrix import NativeMassMatrix
 from sim.engine.protocol import DrivenPack, EnginePack, RobotModel
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step

@@ -1,0 +1,72 @@
+"""Closed loop over the bare engine, in this process: the share of the time that is the engine's own.
+
+Pandas under their default gains (mass matrix) and the URDF's friction, held at several poses. The bare engine steps the
+same robots at the same poses under PhysX's drives, pack by pack. Processor time: another program disturbs it less.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+import numpy as np
+import pytest
+
+from sim import Robot, Runner
+from sim.benchmark.tutorial import tutorial_settings
+from sim.benchmark.workload import Workload
+from sim.engine.sapien.pack import Pack
+
+ENVS, TICKS, ROUNDS, POSES, PACK = 32, 10, 5, 6, 4
+
+
+class BareEngine:
+    """Robots at ``pose`` under PhysX's drives, without gravity and control."""
+
+    def __init__(self, workload: Workload, pose: np.ndarray) -> None:
+        settings, self._substeps = tutorial_settings(workload.robot), workload.substeps
+        sizes = [min(PACK, workload.num_envs - first) for first in range(0, workload.num_envs, PACK)]
+        spec = workload.scene(gravity=False)
+        self._packs = [Pack(spec, size, system_size=PACK, isolates=False) for size in sizes]
+        for pack in self._packs:
+            rows = np.tile(pose, (pack.size, 1))
+            pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
+            pack.write_state(range(pack.size), rows, np.zeros_like(rows))
+            pack.write_drive_target(rows + 0.01)
+
+    def run(self, ticks: int) -> None:
+        for _ in range(ticks):
+            for pack in self._packs:
+                for _ in range(self._substeps):
+                    pack.step()
+
+
+def engine_share(pose, physics, most):
+    """Return the speed of the closed loop over that of the bare engine at one pose, in each round."""
+    envs, ticks, rounds = min(ENVS, most.envs), min(TICKS, most.ticks), min(ROUNDS, most.rounds)
+    workload = Workload(Robot.load("panda"), envs, workers=0, physics=physics, ticks=ticks)
+    bare, found = BareEngine(workload, pose), []
+    setpoints = np.broadcast_to(pose, (ticks, envs, len(pose)))
+    with Runner(workload.robot, envs, workers=0, physics=physics, substeps=workload.substeps) as runner:
+        for _ in range(rounds + 1):
+            runner.reset(qpos=pose + 0.01)
+            began = time.process_time()
+            qpos = runner.rollout(setpoints).qpos
+            between = time.process_time()
+            bare.run(ticks)
+            found.append((time.process_time() - between) / (between - began))
+            assert np.abs(qpos[-1] - (pose + 0.01)).max() > 1e-3, "the robots did not move"
+    return found[1:]
+
+
+@pytest.mark.parametrize("physics", ["accurate", "fast"])
+def test_engine_share(benchmark, compare, most, physics):
+    benchmark.group = "closed loop over the bare engine, in one process"
+    robot = Robot.load("panda")
+    poses = np.clip(robot.sample(POSES, seed=0), robot.lower + 0.02, robot.upper - 0.02)
+    ratios = benchmark.pedantic(
+        lambda: [statistics.median(engine_share(pose, physics, most)) for pose in poses], rounds=1
+    )
+    benchmark.extra_info["share"] = [round(ratio, 3) for ratio in ratios]
+    compare(f"panda, {physics}, {POSES} poses", "closed loop, default gains", "bare engine", statistics.median(ratios))
+    print("\n" + ", ".join(f"{ratio:.3f}" for ratio in ratios))
