@@ -54,16 +54,14 @@ struct Input {
   void const *data;  // of row 0
   Shape shape;
 };
-
 struct Output {
-  void *data;  // of row 0 of (rows, columns)
+  void *data;    // of row 0 of (rows, columns)
   bool is_mask;  // bytes 0 and 1
 };
 
 // Numbers that a loop over a block passes at once, at least; a row that all rows share is repeated to that length.
 constexpr Index CHUNK = 128;
-// Bytes of a register in a block.
-constexpr Index BLOCK = 8192;
+constexpr Index BLOCK = 8192;  // bytes of a register in a block
 
 // Registers are numbered: constants, inputs, temporaries. Immutable once made: any number of threads may run it.
 struct Program {
@@ -88,8 +86,7 @@ struct Operand {
   Index step;  // numbers to the next chunk; 0: each chunk is the same
 };
 
-// Sum of the products of n numbers as NumPy's for n <= 128: in order below eight, else eight sums side by side; then
-// added to 0, as the sign of a sum of -0 tells.
+// Sum of n products as NumPy's for n <= 128, added to 0: in order below eight, else eight sums side by side.
 template <class T>
 BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
   T sum = T(-0.0);
@@ -230,9 +227,9 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
     for (Index row = 0; row < chunk; row += columns) std::copy_n(from, columns, repeated + row);
   }
   for (Index i = constants + program.inputs; i < program.registers; ++i) at[i] = {slots + (i - constants) * slot, chunk};
-  std::uint64_t in_place = 0;  // bits of results
+  std::uint64_t in_place = 0;  // bits of the first 64 results
   for (std::size_t i = 0; i < std::min<std::size_t>(64, program.results.size()); ++i) {
-    in_place |= static_cast<std::uint64_t>(is_made_in_place(program, inputs, outputs, i)) << i;
+    in_place |= std::uint64_t{is_made_in_place(program, inputs, outputs, i)} << i;
   }
   for (Index start = first * columns; start < last; start += block) {
     Index const n = std::min(block, last - start), row = start / columns;
