@@ -55,7 +55,7 @@ class NativeExecutor(NumPyExecutor):
         super().__init__(options, pack, layout, constants)
         self._step: CompiledStep | None = None
         self._bound: object = None
-        self._ticks: dict[Any, TickProgram] = {}
+        self._ticks: dict[tuple[bool, bool], TickProgram] = {}
         self._compiles = is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
@@ -112,8 +112,8 @@ class NativeExecutor(NumPyExecutor):
         return self._step
 
     def _program(self, state: StepState, command: Command) -> TickProgram:
-        """Return the program for the leaves that state and command have."""
-        key = structure((state._replace(matrix=None, age=None), command))
+        """Return the program for commands with or without rate and feedforward."""
+        key = command.setpoint_rate is None, command.feedforward is None
         if key not in self._ticks:
             self._ticks[key] = TickProgram(self._pack, self._layout, self._constants, state, command, self._reads_force)
         return self._ticks[key]
@@ -195,7 +195,9 @@ class TickProgram:
             for array, value in zip(self.measured, measured, strict=True):
                 if value is not None:
                     array[...] = value
-        _write(self._command, command)
+        for array, value in zip(self._command, command, strict=True):
+            if array is not None:
+                array[...] = value
 
     def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
         """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the status."""

@@ -150,6 +150,9 @@ def test_jax_runs_the_same_function(case):
 
 @pytest.mark.parametrize("backend", ["numpy", "jax"])
 def test_every_executor_calls_it(panda, backend, monkeypatch):
+    """The third, native one: test_native_executor.py."""
+    if backend == "numpy":
+        monkeypatch.setenv("BATCHPID_NATIVE", "0")
     calls = []
 
     def recorded(layout, constants, state, command, measured, step):
