@@ -163,8 +163,9 @@ def measure_rates(
 def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
-    Measured in this process with a worker's share of the envs. "control" is everything but calls on the engine. The
-    time of the clock calls is included: about one percent. "waiting" is the mean time of a tick of
+    Measured in this process with a worker's share of the envs, and in NumPy, with native calls into the engine where
+    there are such: in a native tick the phases cannot be told apart. "control" is everything but calls on the engine.
+    The time of the clock calls is included: about one percent. "waiting" is the mean time of a tick of
     :meth:`Runner.step` beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
@@ -176,6 +177,7 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     loop.ticks[0].command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
+        group.execute_in_numpy()
         _time_calls(group.pack, spent)
     total = sum(loop.run(1, workload.substeps, False, False) for _ in range(workload.ticks))
     loop.close()

@@ -163,7 +163,15 @@ class CompiledStep(Protocol):
 
 @runtime_checkable
 class CompiledPack(EnginePack, Protocol):
-    """Pack whose sim steps a program of XLA can make."""
+    """Pack whose sim steps native code and programs of XLA can make.
+
+    Attributes
+    ----------
+    steps_read_force
+        Whether a compiled step reads the force of :meth:`passive_force`; otherwise that has to be called.
+    """
+
+    steps_read_force: bool
 
     @property
     def calls(self) -> object:

@@ -86,6 +86,10 @@ class EnvGroup:
             self._executor = NativeExecutor(options, pack, layout, constants)
         self._measured = self._executor.measure()
 
+    def execute_in_numpy(self) -> None:
+        """Run sim steps in NumPy until something changes, call by call: so the phases of a step can be timed."""
+        self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
+
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
         if isinstance(self.pack, DrivenPack) and self._options.control == "drive":

@@ -56,7 +56,9 @@ class NativeExecutor(NumPyExecutor):
         self._step: CompiledStep | None = None
         self._bound: object = None
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
-        self._compiles = is_compiled(layout, constants, pack.dof)
+        self._steps_read_force = pack.steps_read_force
+        reads_all = pack.steps_read_force or not self._reads_force
+        self._compiles = reads_all and is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until Python has to look."""
@@ -88,7 +90,11 @@ class NativeExecutor(NumPyExecutor):
         """Do a sim step by one native call; otherwise as :meth:`NumPyExecutor._advance`."""
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._native_step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
-        measured = Measured(qpos, qvel, passive if self._reads_force else None)
+        if not self._reads_force:
+            passive = None
+        elif not self._steps_read_force:
+            passive = self._pack.passive_force(self._gravity, self._coriolis)
+        measured = Measured(qpos, qvel, passive)
         return (self._look(status, measured) if status else measured), bool(status & LOOK)
 
     def _native_step(self, *arrays: Float64) -> int:
@@ -107,7 +113,8 @@ class NativeExecutor(NumPyExecutor):
         pack = self._pack
         if self._step is None or self._bound is not pack.calls:
             limit = None if self._speed_limit is None else np.asarray(self._speed_limit)
-            force = (self._gravity, self._coriolis) if self._reads_force else (False, False)
+            reads_force = self._reads_force and self._steps_read_force
+            force = (self._gravity, self._coriolis) if reads_force else (False, False)
             self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit)
         return self._step
 

@@ -61,7 +61,11 @@ class Pack(SingleOwner):
         Watch over the contacts.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
+    steps_read_force
+        Whether :meth:`compiled_step` reads the force of :meth:`passive_force`.
     """
+
+    steps_read_force = True
 
     def __init__(
         self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
