@@ -170,8 +170,8 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
         law = self.runner.params.continuous if self.runner.control == "pid" else None
         turns = np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
-        own_turns = np.zeros(size)
-        self._setpoint_turns = np.minimum(self._turns, turns[self._independent]) if own is None else own_turns
+        joint_turns = np.minimum(self._turns, turns[self._independent])
+        self._setpoint_turns = joint_turns if own is None else np.zeros(size)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._goal, self._setpoint = np.zeros((self.num_envs, joints)), np.zeros((self.num_envs, size))
         self._observation = np.zeros((self.num_envs, 3 * joints), np.float32)
@@ -336,16 +336,8 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
 def _finite_bounds(command: CommandSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the bounds of a command; raise InvalidArgumentError if one is infinite."""
     low, high = np.asarray(command.lower), np.asarray(command.upper)
-    remedy = "give the controller command = sim.CommandSpec(names, units, lower=..., upper=...)"
-    entries(
-        "control",
-        low,
-        np.isfinite(low) & np.isfinite(high),
-        "has no bounds",
-        command.names,
-        kind="entry",
-        remedy=remedy,
-    )
+    good, remedy = np.isfinite(low) & np.isfinite(high), "let its command be a sim.CommandSpec with lower= and upper="
+    entries("control", low, good, "has no bounds", command.names, kind="entry", remedy=remedy)
     return low, high
 
 

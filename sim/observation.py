@@ -153,7 +153,8 @@ class RunInfo:
     @property
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
-        return self.command == joint_command(self.joint_names, self.units, None)
+        own = self.own_command
+        return self.control != "effort" if own is None else (own.names, own.units) == (self.joint_names, self.units)
 
     def units_of(self, name: str) -> tuple[str, ...]:
         """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it has no columns."""

@@ -62,7 +62,7 @@ class Controller(Protocol):
     ) -> tuple[Any, Any]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
 
-        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros.
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros within its bounds.
         ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward. The
         arrays are read-only copies, which the controller may keep.
         """

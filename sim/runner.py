@@ -79,6 +79,9 @@ class TickRecorder(Protocol):
         """
 
 
+_Axis = tuple[AxisKind, tuple[str, ...]]
+
+
 class _Books(NamedTuple):
     """Everything about a runner that changes with its commands, apart from the workers."""
 
@@ -182,7 +185,10 @@ class Runner(SingleOwner):
         self.timestep, self.substeps = options.timestep, options.substeps
         params = options.check_params(default_params(robot, control) if params is None else params)
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
-        self._command_kind: AxisKind = "joint" if options.own_command is None else "entry"
+        own = options.own_command
+        of_command: _Axis = ("joint" if own is None else "entry", options.command.names)
+        self._axes: tuple[_Axis, ...] = (of_command, of_command, ("joint", robot.joint_names))
+        """Last axis of each array of a command: its kind, and the names of its columns."""
         self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
         self._stability = StabilityCheck(robot, self.timestep) if self.control == "pid" else None
@@ -190,7 +196,6 @@ class Runner(SingleOwner):
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
         self._has_warned = self._has_warned_of_contact = False
-        own = options.own_command
         entry_names = None if own is None else own.names
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault, entry_names)
         contacts = None
@@ -754,15 +759,15 @@ class Runner(SingleOwner):
 
         Positions of followers become those that their leaders mean for them; efforts act on leaders in the loop.
         """
-        of_command = self._command_kind, self.command.names
-        axes: Command = Command(of_command, of_command, ("joint", self._joint_names))
-        rows = [
-            None
-            if value is None
-            else array(name, value, (*ticks, self.num_envs, len(names)), names, finite=self._finite, kind=kind)
-            for (name, value), (kind, names) in zip(given.items(), axes, strict=True)
-        ]
-        command = Command._make(rows)
+        envs: tuple[int, ...] = (*ticks, self.num_envs)
+        command = Command._make(
+            [
+                None
+                if value is None
+                else array(name, value, (*envs, len(names)), names, finite=self._finite, kind=kind)
+                for (name, value), (kind, names) in zip(given.items(), self._axes, strict=True)
+            ]
+        )
         if (coupling := self.robot.coupling) is None or not self.options.sets_positions:
             return command
         setpoint, rate, feedforward = command

@@ -20,7 +20,7 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
 
     Coordinates: ``time`` [s], ``env``, ``joint`` (names) and ``unit`` (rad or m, by joint). Every variable has a
     ``long_name`` and ``units``; "rad|m" means the joint's own ``unit``. The setpoint of a control with a command of its
-    own has the dimension ``entry`` in place of ``joint``, and its units are ``entry_unit``. The arrays are not copied.
+    own has the dimension ``entry`` in place of ``joint``, with the units ``entry_unit``. The arrays are not copied.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
     units = {name: quantity.unit for name, quantity in RECORDED.items()}
     entries: dict[str, Any] = {}
     if own is not None:
-        columns["setpoint"], units["setpoint"] = ("entry",), "entry_unit"
+        columns["setpoint"], units["setpoint"] = ("entry",), "|".join(dict.fromkeys(own.units))
         entries = {
             "entry": list(own.names),
             "entry_unit": ("entry", list(own.units), {"long_name": "unit of the entry"}),

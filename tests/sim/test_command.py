@@ -249,7 +249,7 @@ def test_limits_and_guard_are_for_joint_positions(arm):
         warnings.simplefilter("error", SetpointWarning)
         with make(arm) as runner:
             runner.step([50.0, 50.0])
-    with pytest.raises(InvalidArgumentError, match=r"^guard: limits joint positions.*use control 'pid' or 'drive'"):
+    with pytest.raises(InvalidArgumentError, match=r"^guard: limits positions of joints.*use control 'pid' or 'drive'"):
         RunnerOptions(arm, 1, control=Cartesian(), guard=True)
 
 
