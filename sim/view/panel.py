@@ -63,9 +63,8 @@ class Panel:
             self._joint = self._control(gui.add_dropdown("Joint", self._names, initial_value=self._names[first]))
             checkbox = gui.add_checkbox("Show its setpoint", True)
             self._show_setpoint = self._control(checkbox)
-            self._entries = gui.add_html("")  # numbers of a setpoint that is no pose
             checkbox.visible = data.frame().info.sets_positions
-            self._entries.visible = not checkbox.visible
+            self._entries = None if checkbox.visible else gui.add_html("")  # numbers of a setpoint that is no pose
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
             adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
@@ -121,7 +120,7 @@ class Panel:
         self._status.content = "  \n".join(lines)
         if isinstance(data, Playback):
             self._time.value = time
-        if self._entries.visible:
+        if self._entries is not None:
             numbers = _numbers(frame.info.command, frame.setpoint[0, self.env])
             self._entries.content = f'<p style="{_ENTRY_STYLE}">{html.escape(f"setpoint: {numbers}")}</p>'
 

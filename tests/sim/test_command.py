@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import warnings
 from types import SimpleNamespace
 
@@ -15,6 +17,7 @@ from sim import (
     CommandSpec,
     FaultWarning,
     Recorder,
+    RecoveryWarning,
     Robot,
     Runner,
     RunnerOptions,
@@ -121,6 +124,19 @@ def test_a_command_has_any_size(arm, more, backend):
         for _ in range(5):
             seen, expected = runner.step(setpoint), plain.step(goals())
         np.testing.assert_array_equal(seen.qpos, expected.qpos)
+
+
+def test_commands_are_replayed_for_a_lost_worker(arm):
+    setpoints = np.random.default_rng(4).uniform(0.5, 1.0, (4, N, 3))
+    control = Shapes(1)
+    with make(arm, control, workers=2) as runner:
+        runner.rollout(setpoints)
+        os.kill(runner.pids[1], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            seen = runner.rollout(setpoints)
+    with make(arm, control) as runner:
+        runner.rollout(setpoints)
+        assert_identical(seen, runner.rollout(setpoints))
 
 
 def test_a_jitted_call_at_each_sim_step_takes_it_too(arm):
@@ -259,6 +275,9 @@ def test_commands_of_joints_have_their_names_and_units(panda):
         options = RunnerOptions(panda, 1, control=control)
         assert options.command == CommandSpec(panda.joint_names, units)
         assert options.own_command is None
+        info = panda.run_info(control=options.control_name)
+        assert (info.command, info.sets_positions) == (options.command, control != "effort")
+        assert info.units_of("qvel") == ("rad/s",) * 7 + ("m/s", "m/s")
 
 
 # -- faults -----------------------------------------------------------------------------------------------------------
@@ -437,7 +456,8 @@ def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
     view = View(playback, port=18090)
     try:
         shown = []
-        view.panel._entries = SimpleNamespace(visible=view.panel._entries.visible, content="")
+        assert view.panel._entries is not None
+        view.panel._entries = SimpleNamespace(content="")
         for _ in range(3):
             playback.advance()
             view._show(playback.frame(), 0)
