@@ -754,20 +754,17 @@ class Runner(SingleOwner):
         """Return an argument as an array (envs, dof), checked."""
         return array(name, value, self._shape, self._joint_names, finite=self._finite)
 
-    def _read_command(self, given: Mapping[str, ArrayLike | None], ticks: tuple[int, ...] = ()) -> Command:
+    def _read_command(self, given: Mapping[str, Any], ticks: tuple[int, ...] = ()) -> Command:
         """Return a command (*ticks, envs, ...) of the arguments ``given``, checked.
 
         Positions of followers become those that their leaders mean for them; efforts act on leaders in the loop.
         """
-        envs: tuple[int, ...] = (*ticks, self.num_envs)
-        command = Command._make(
-            [
-                None
-                if value is None
-                else array(name, value, (*envs, len(names)), names, finite=self._finite, kind=kind)
-                for (name, value), (kind, names) in zip(given.items(), self._axes, strict=True)
-            ]
-        )
+        rows = list[Any]()
+        for (name, value), (kind, names) in zip(given.items(), self._axes, strict=True):
+            shape = (*ticks, self.num_envs, len(names))
+            absent = value is None and rows  # the setpoint, which is first, cannot be
+            rows.append(None if absent else array(name, value, shape, names, finite=self._finite, kind=kind))
+        command = Command._make(rows)
         if (coupling := self.robot.coupling) is None or not self.options.sets_positions:
             return command
         setpoint, rate, feedforward = command

@@ -211,6 +211,8 @@ def test_errors_name_the_entry_of_the_command(arm):
             runner.step(np.ones((N, 2)))
         with pytest.raises(InvalidArgumentError, match=r"setpoint_rate.*\(2,\), not \(5, 3\)"):
             runner.step(np.ones(3), setpoint_rate=np.ones(2))
+        with pytest.raises(InvalidArgumentError, match=r"^setpoint: cannot be read as an array"):
+            runner.step(None)
         with pytest.raises(InvalidArgumentError, match=r"feedforward.*\(3,\), not \(5, 2\).*joints shoulder, elbow"):
             runner.step(np.ones(3), feedforward=np.ones(3))
         with pytest.raises(InvalidArgumentError, match=r"must have shape \(ticks, 5, 3\) or \(ticks, 3\)"):
