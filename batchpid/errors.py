@@ -20,8 +20,8 @@ class BatchPIDError(Exception):
 class InvalidArgumentError(BatchPIDError, ValueError):
     """An argument has a wrong type, shape, dtype, range or a non-finite entry.
 
-    Raised before anything is changed. ``argument``, ``joint``, ``env``, ``value`` and ``remedy`` hold the facts of
-    the message, for programs.
+    Raised before anything is changed. ``argument``, ``joint``, ``entry``, ``env``, ``value`` and ``remedy`` hold the
+    facts of the message, for programs; ``entry`` is the name in a command whose entries are not joints.
     """
 
     def __init__(
@@ -31,12 +31,14 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         *,
         remedy: str,
         joint: str | int | None = None,
+        entry: str | int | None = None,
         env: int | None = None,
         value: Any = None,
     ) -> None:
         self.argument, self.problem, self.remedy = argument, problem, remedy
-        self.joint, self.env, self.value = joint, env, value
-        where = "".join(f", {kind} {place!r}" for kind, place in (("joint", joint), ("env", env)) if place is not None)
+        self.joint, self.entry, self.env, self.value = joint, entry, env, value
+        places = {"joint": joint, "entry": entry, "env": env}
+        where = "".join(f", {kind} {place!r}" for kind, place in places.items() if place is not None)
         got = "" if value is None else f" (got {_SHORT.repr(value)})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,7 @@ from batchpid.errors import InvalidArgumentError
 
 S = TypeVar("S", bound=str)
 T = TypeVar("T")
+AxisKind = Literal["joint", "entry"]
 
 
 def integer(argument: str, value: Any, low: int, high: int) -> int:
@@ -149,20 +150,27 @@ def broadcast(
 
 
 def array(
-    argument: str, value: ArrayLike, shape: tuple[int, ...], joint_names: Sequence[str], *, finite: bool = True
+    argument: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    names: Sequence[str],
+    *,
+    finite: bool = True,
+    kind: AxisKind = "joint",
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
     A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
+    ``names`` are those of the last axis, which counts joints, or the entries of another ``kind`` of command.
     """
-    remedy = f"the last axis counts the joints {', '.join(joint_names)}"
+    remedy = f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
     result = read_array(argument, value)
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
     given, result = result, broadcast(argument, result, shape, remedy)
     # The sum of squares first: it costs a third, and is finite for most.
     if finite and not math.isfinite(np.vdot(given, given)) and not (good := np.isfinite(result)).all():
-        entries(argument, result, good, "is not finite", joint_names, remedy="pass finite numbers")
+        entries(argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers")
     return result
 
 
@@ -171,22 +179,25 @@ def entries(
     values: NDArray[Any],
     good: Any,
     problem: str,
-    joint_names: Sequence[str] | None = None,
+    names: Sequence[str] | None = None,
     *,
+    kind: AxisKind = "joint",
     remedy: str = "correct that entry",
 ) -> None:
     """Raise for the first entry of ``values`` (..., envs, joints), or (joints,), that is not ``good``.
 
-    The error names the joint, and the env where there are several; an entry of a scalar has neither.
+    The error names the joint, and the env where there are several; an entry of a scalar has neither. ``names`` and
+    ``kind`` as for :func:`array`.
     """
     if np.all(good):
         return
     index = tuple(int(n) for n in np.argwhere(~np.asarray(good))[0])
-    joint, value = index[-1] if index else None, values[index]
+    place, value = index[-1] if index else None, values[index]
+    where: dict[str, Any] = {kind: place if place is None or names is None else names[place]}
     raise InvalidArgumentError(
         argument,
         problem,
-        joint=joint if joint is None or joint_names is None else joint_names[joint],
+        **where,
         env=index[-2] if len(index) > 1 and values.shape[-2] > 1 else None,
         value=value.item() if isinstance(value, np.generic) else value,
         remedy=remedy,

@@ -16,6 +16,7 @@ for _name in ("batchpid", "assets"):
 
 import batchpid.startup  # noqa: F401 - checks the import path before NumPy is imported
 from sim.cluster import ClusterWarning, Ray
+from sim.command import CommandSpec
 from sim.loop.contact_log import MissedContact, MissedContactWarning
 from sim.loop.faults import Fault, FaultWarning
 from sim.loop.snapshot import Snapshot
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Choice",
     "ClusterWarning",
+    "CommandSpec",
     "Controller",
     "Fault",
     "FaultWarning",

@@ -20,7 +20,8 @@ from batchpid.elementwise import TURN, wrap
 from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError, MissingDependencyError
 from batchpid.keywords import check_keywords
 from batchpid.single_owner import SingleOwner
-from batchpid.validate import array, choice, env_mask, flag, integer, number
+from batchpid.validate import AxisKind, array, choice, entries, env_mask, flag, integer, number
+from sim.command import CommandSpec, own_command
 from sim.observation import Observation
 from sim.options import RunnerOptions
 from sim.robot.description import LIMIT_TOLERANCE
@@ -50,10 +51,13 @@ MAX_SPEED = 100.0
 class ReachVectorEnv(SingleOwner, VectorEnv):
     """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
-    Joints are the independent ones (:attr:`sim.Robot.independent`): followers move with their leaders.
+    Joints are the independent ones (:attr:`sim.Robot.independent`): followers move with their leaders. A setpoint has
+    one number for each of them, or those of the command of a :class:`sim.Controller`, within the bounds of its
+    :class:`sim.CommandSpec`.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
-    - *Action* (envs, joints) in [-1, 1]: the setpoint within the joint limits, or an increment of the setpoint.
+    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the setpoint. An episode
+      begins with the setpoint at the joints' pose, or with the ``neutral`` one of the command.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is within ``tolerance``.
       A joint without a range counts as 0.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if ``terminate_on_success``.
@@ -73,8 +77,8 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
     actions
         ``"setpoint"`` or ``"increment"``.
     max_increment
-        Change of the setpoint by an increment of 1, scalar or (joints,) [rad or m]; default the velocity limit times
-        the time of a step.
+        Change of the setpoint by an increment of 1, scalar or (size,) [rad or m]; default the velocity limit times the
+        time of a step. For increments of a command of its own a controller has no default.
     tolerance
         Largest error of a reached goal [rad or m].
     autoreset_mode
@@ -140,25 +144,36 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         self._span = np.where(span > LIMIT_TOLERANCE, span, np.inf)
         self._margin = np.where(continuous, 0.0, MARGIN * span)
         joints = len(self.joint_names)
+        self._own = own = own_command(options.get("control"))
+        self._setpoint_names, self._setpoint_low, self._setpoint_high = self.joint_names, self.low, self.high
+        if own is not None:
+            self._setpoint_names = own.names
+            self._setpoint_low, self._setpoint_high = _finite_bounds(own)
         if max_increment is None:
-            max_increment = np.minimum(fastest, MAX_SPEED) * substeps * timestep
-        self.max_increment = array("max_increment", max_increment, (1, joints), self.joint_names)[0]
+            if own is not None and self.actions == "increment":
+                remedy = f"give one number for each of {', '.join(own.names)}"
+                raise InvalidArgumentError("max_increment", "is needed for the command of this control", remedy=remedy)
+            max_increment = 0.0 if own is not None else np.minimum(fastest, MAX_SPEED) * substeps * timestep
+        size = len(self._setpoint_names)
+        self._kind: AxisKind = "joint" if own is None else "entry"
+        self.max_increment = array("max_increment", max_increment, (1, size), self._setpoint_names, kind=self._kind)[0]
         speed = np.full(joints, MAX_SPEED)
         beyond = np.where(continuous, 0.0, np.pi)
         self.single_observation_space = spaces.Box(
             np.concatenate([self.low - beyond, -speed, self.low]).astype(np.float32),
             np.concatenate([self.high + beyond, speed, self.high]).astype(np.float32),
         )
-        self.single_action_space = spaces.Box(-1.0, 1.0, (joints,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
         law = self.runner.params.continuous if self.runner.control == "pid" else None
         turns = np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
-        self._setpoint_turns = np.minimum(self._turns, turns[self._independent])
+        joint_turns = np.minimum(self._turns, turns[self._independent])
+        self._setpoint_turns = joint_turns if own is None else np.zeros(size)
         self._generators = np.random.default_rng().spawn(self.num_envs)
-        self._goal, self._setpoint = np.zeros((2, self.num_envs, joints))
+        self._goal, self._setpoint = np.zeros((self.num_envs, joints)), np.zeros((self.num_envs, size))
         self._observation = np.zeros((self.num_envs, 3 * joints), np.float32)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
@@ -198,7 +213,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
-        """Apply an action (envs, joints) for one step; return observation, reward, terminated, truncated and info."""
+        """Apply an action (envs, size) for one step; return observation, reward, terminated, truncated and info."""
         self.step_async(actions)
         return self.step_wait()
 
@@ -211,17 +226,18 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
             The last step that was begun has not been waited for.
         """
         self._expect_no_step("step_async")
-        action = np.clip(array("actions", actions, self._goal.shape, self.joint_names), -1.0, 1.0)
+        shape, low, high = self._setpoint.shape, self._setpoint_low, self._setpoint_high
+        action = np.clip(array("actions", actions, shape, self._setpoint_names, kind=self._kind), -1.0, 1.0)
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
         if self.actions == "setpoint":
-            setpoint = self.low + (action + 1) / 2 * (self.high - self.low)
+            setpoint = low + (action + 1) / 2 * (high - low)
         else:
             setpoint = self._setpoint + action * self.max_increment
-            setpoint = np.clip(wrap(setpoint, self._setpoint_turns, np), self.low, self.high)
+            setpoint = np.clip(wrap(setpoint, self._setpoint_turns, np), low, high)
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
-        self.runner.send(self._of_robot(setpoint))
+        self.runner.send(self._of_robot(setpoint) if self._own is None else setpoint)
         self._setpoint, self._is_stepping = setpoint, True
 
     def step_wait(self) -> tuple[Float32, NDArray[np.float64], Bool, Bool, dict[str, Any]]:
@@ -270,13 +286,14 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
 
     def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
         """Draw start and goal of the masked envs, and place their robots; ``streams`` are new ones of some envs."""
-        start = self._setpoint.copy()
+        start = np.tile(self._start, (self.num_envs, 1))
         for env in np.flatnonzero(mask).tolist():
             generator = self._generators[env]
             drawn = self._start + generator.uniform(-SPREAD, SPREAD, len(self.joint_names))
             start[env] = np.clip(wrap(drawn, self._turns, np), self.low, self.high)
             self._goal[env] = generator.uniform(self.low + self._margin, self.high - self._margin)
-        self._setpoint = start
+        first = start if self._own is None else np.asarray(self._own.neutral)
+        self._setpoint = np.where(mask[:, None], first, self._setpoint)
         self._steps[mask] = 0
         self._done = self._done & ~mask
         qpos, seeds = self._of_robot(start), np.zeros(self.num_envs, np.int64)
@@ -316,6 +333,14 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         return info | {f"_{key}": mask.copy() for key in values}
 
 
+def _finite_bounds(command: CommandSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the bounds of a command; raise InvalidArgumentError if one is infinite."""
+    low, high = np.asarray(command.lower), np.asarray(command.upper)
+    good, remedy = np.isfinite(low) & np.isfinite(high), "let its command be a sim.CommandSpec with lower= and upper="
+    entries("control", low, good, "has no bounds", command.names, kind="entry", remedy=remedy)
+    return low, high
+
+
 OWN_OPTIONS = tuple(inspect.signature(ReachVectorEnv).parameters)[:-1]
 """Arguments of :class:`ReachVectorEnv`, without the options of the runner."""
 RUNNER_OPTIONS = tuple({*inspect.signature(Runner).parameters} - {"robot", "num_envs", "substeps"})
@@ -345,7 +370,7 @@ class ReachEnv(SingleOwner, gymnasium.Env):
         return observation[0], self._single(info)
 
     def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
-        """Apply an action (joints,) for one step; return observation, reward, terminated, truncated and info."""
+        """Apply an action (size,) for one step; return observation, reward, terminated, truncated and info."""
         observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from batchpid.actuators import Actuators
 from batchpid.params import PIDParams
+from sim.command import CommandSpec, joint_command
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -108,7 +109,9 @@ class RunInfo:
     substeps: int | None = None
     """Sim steps of a tick."""
     control: str | None = None
-    """One of "pid", "drive", "effort"."""
+    """One of "pid", "drive", "effort"; of the caller's own controller the name of its class."""
+    own_command: CommandSpec | None = None
+    """Names and units of setpoints that are not one number for each joint."""
     compensate: str | None = None
     """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or "none"."""
     physics: str | None = None
@@ -142,10 +145,27 @@ class RunInfo:
     redraws: tuple[Redraw, ...] = ()
     """Episodes that began after that."""
 
-    def quantity(self, name: str) -> Quantity:
-        """Return the quantity ``name`` of :data:`RECORDED`; under control "effort" the setpoint is an effort."""
-        effort = name == "setpoint" and self.control == "effort"
-        return RECORDED[name]._replace(unit=OBSERVED["effort"].unit) if effort else RECORDED[name]
+    @property
+    def command(self) -> CommandSpec:
+        """Names and units of the setpoint's entries."""
+        return self.own_command or joint_command(self.joint_names, self.units, self.control)
+
+    @property
+    def sets_positions(self) -> bool:
+        """True if setpoints are joint positions."""
+        own = self.own_command
+        return self.control != "effort" if own is None else (own.names, own.units) == (self.joint_names, self.units)
+
+    def units_of(self, name: str) -> tuple[str, ...]:
+        """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it has no columns."""
+        quantity = RECORDED[name]
+        if name == "setpoint":
+            return self.command.units
+        return tuple(map(quantity.unit_for, self.units)) if quantity.per_joint else ()
+
+    def row_shape(self, name: str, num_envs: int) -> tuple[int, ...]:
+        """Return the shape of the quantity ``name`` of :data:`RECORDED` after a tick: (envs, columns) or (envs,)."""
+        return (num_envs, len(self.units_of(name))) if RECORDED[name].per_joint else (num_envs,)
 
     def for_envs(self, envs: slice | Any) -> RunInfo:
         """Return the info of some envs (a slice or an index array)."""
@@ -176,7 +196,8 @@ class Rollout:
     time: Float64
     """End of each tick (ticks,) [s]."""
     setpoint: Float64
-    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]."""
+    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. Of a control with
+    a command of its own (ticks, envs, size), in the order of ``info.command.names``."""
     observation: Observation
     """Observations, stacked."""
     tick: float

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, astuple, dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from batchpid.leaves import frozen
 from batchpid.read_only import read_only
 from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
 from sim.cluster import Ray
+from sim.command import CommandSpec, joint_command, own_command
 from sim.engine.engines import load_engine
 from sim.engine.protocol import Capability, Engine, require
 from sim.randomization.checks import check_params, check_robot, prepared_actuators
@@ -38,6 +40,9 @@ class Controller(Protocol):
 
     It is called at every sim step, in the worker processes, for some of the envs at a time: the effort of an env must
     depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
+
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
+    :class:`sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
@@ -57,6 +62,7 @@ class Controller(Protocol):
     ) -> tuple[Any, Any]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
 
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros within its bounds.
         ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward. The
         arrays are read-only copies, which the controller may keep.
         """
@@ -251,6 +257,16 @@ class RunnerOptions:
         """True if setpoints are joint positions."""
         return self.control in ("pid", "drive")
 
+    @cached_property
+    def own_command(self) -> CommandSpec | None:
+        """Command that a :class:`Controller` declares; None for commands of joints."""
+        return own_command(self.control)
+
+    @cached_property
+    def command(self) -> CommandSpec:
+        """Names and units of the setpoint's entries."""
+        return self.own_command or joint_command(self.robot.joint_names, self.robot.units, self.control)
+
     @property
     def scenes_per_system(self) -> int:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
@@ -336,12 +352,14 @@ class RunnerOptions:
             "ground": self.ground,
             "ignored_pairs": digest(robot.ignored_pairs),
             "guard": digest(self.guard),
+            "command": self.own_command and list(self.own_command.names),
             "randomization": None if self.randomization is None else self.randomization.to_dict(),
         }
 
 
 def _control(value: object) -> Any:
     if callable(value) and callable(getattr(value, "init", None)):
+        own_command(value)  # raises for one that is none
         return value
     return choice("control", value, get_args(ControlMode))
 

@@ -6,7 +6,7 @@ Longer than 300 lines because the public signatures and their documentation are 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from operator import methodcaller
@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.errors import BatchPIDError, CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.single_owner import SingleOwner
-from batchpid.validate import array, env_mask, instance, integer, read_array, within
+from batchpid.validate import AxisKind, array, env_mask, instance, integer, read_array, within
 from batchpid.versions import package_versions
 from sim.cluster import Ray
+from sim.command import CommandSpec
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import describe
 from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
@@ -72,10 +73,13 @@ class TickRecorder(Protocol):
     path: Path
 
     def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof).
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size).
 
         After an interrupt it is called again, with the same ``observation``; it is to be recorded once.
         """
+
+
+_Axis = tuple[AxisKind, tuple[str, ...]]
 
 
 class _Books(NamedTuple):
@@ -181,6 +185,10 @@ class Runner(SingleOwner):
         self.timestep, self.substeps = options.timestep, options.substeps
         params = options.check_params(default_params(robot, control) if params is None else params)
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
+        own = options.own_command
+        of_command: _Axis = ("joint" if own is None else "entry", options.command.names)
+        self._axes: tuple[_Axis, ...] = (of_command, of_command, ("joint", robot.joint_names))
+        """Last axis of each array of a command: its kind, and the names of its columns."""
         self._finite = options.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
         self._stability = StabilityCheck(robot, self.timestep) if self.control == "pid" else None
@@ -188,7 +196,8 @@ class Runner(SingleOwner):
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`sim.Recorder` sets it."""
         self._has_warned = self._has_warned_of_contact = False
-        faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault)
+        entry_names = None if own is None else own.names
+        faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault, entry_names)
         contacts = None
         if not options.collisions:
             engine = options.load_engine()
@@ -286,11 +295,12 @@ class Runner(SingleOwner):
         setpoint
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. What it has for a
             follower (:attr:`sim.Robot.coupling`) is replaced by what the leader's means for it; an effort acts on the
-            leader.
+            leader. A :class:`sim.Controller` with a command of its own takes (size,) or (envs, size): :attr:`command`.
         setpoint_rate
-            Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity.
+            Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity. Not for
+            a :class:`sim.Controller`, which ignores it.
         feedforward
-            Effort [N m or N] added to the passive force before saturation.
+            Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before saturation.
         substeps
             Sim steps of this tick; default the runner's.
         """
@@ -356,36 +366,33 @@ class Runner(SingleOwner):
         Parameters
         ----------
         setpoints
-            (ticks, envs, dof), or (ticks, dof) for all envs alike [rad or m].
+            (ticks, envs, dof), or (ticks, dof) for all envs alike [rad or m]; of another command (ticks, envs, size).
         setpoint_rates, feedforwards
-            The same shapes: see :meth:`step`.
+            Also with the ticks first: see :meth:`step`.
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        steps, pool, dof = self._received("rollout").steps, self._pool, self.robot.dof
+        steps, pool, size = self._received("rollout").steps, self._pool, self.command.size
         shape = read_array("setpoints", setpoints).shape
         if len(shape) not in (2, 3) or shape[0] == 0:
             raise InvalidArgumentError(
                 "setpoints",
-                f"must have shape (ticks, {self.num_envs}, {dof}) or (ticks, {dof})",
+                f"must have shape (ticks, {self.num_envs}, {size}) or (ticks, {size})",
                 value=shape,
-                remedy="repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, dof))",
+                remedy=f"repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, {size}))",
             )
         ticks = shape[0]
 
-        def read(name: str, value: ArrayLike) -> NDArray[np.float64]:
+        def of_ticks(name: str, value: ArrayLike) -> NDArray[np.float64]:
             rows = read_array(name, value)
-            return self._rows(name, rows[:, None] if rows.ndim == 2 else rows, (ticks, *self._shape))
+            return rows[:, None] if rows.ndim == 2 else rows
 
-        command = Command(
-            read("setpoints", setpoints),
-            None if setpoint_rates is None else read("setpoint_rates", setpoint_rates),
-            None if feedforwards is None else read("feedforwards", feedforwards),
-        )
-        command = self._coupled(command).map(np.array)  # a copy: ``progress`` may run code of the caller
+        given = {"setpoints": setpoints, "setpoint_rates": setpoint_rates, "feedforwards": feedforwards}
+        given = {name: None if value is None else of_ticks(name, value) for name, value in given.items()}
+        command = self._read_command(given, (ticks,)).map(np.array)  # a copy: ``progress`` may run code of the caller
         if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint)
-        seen = empty_observation(ticks, self.num_envs, dof)
+        seen = empty_observation(ticks, *self._shape)
         times = (steps + self.substeps * np.arange(1, ticks + 1)) * self.timestep
         info, done = self.info, 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
@@ -488,7 +495,8 @@ class Runner(SingleOwner):
         motors = initial_actuators(acting, *self._shape, self.timestep)
         stiction = self.options.has_stiction(acting)
         guarded = self.options.guard is not False
-        snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, guarded, sizes)
+        size = self.command.size
+        snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, guarded, sizes, size)
         request = Restore(replace(snapshot, actuators=actuators), draws)
 
         def commit(books: _Books, _: list[Any]) -> tuple[_Books, Observation]:
@@ -523,6 +531,7 @@ class Runner(SingleOwner):
             timestep=self.timestep,
             substeps=self.substeps,
             control=self.options.control_name,
+            own_command=self.options.own_command,
             compensate=self.options.compensate,
             physics=str(self.options.physics),
             collisions=self.options.collisions,
@@ -537,6 +546,11 @@ class Runner(SingleOwner):
             draws=None if self.options.randomization is None else self.draws,
             episodes=None if self.options.randomization is None else self.episodes,
         )
+
+    @property
+    def command(self) -> CommandSpec:
+        """Names and units of a setpoint's entries: the joints, or as a :class:`sim.Controller` declares them."""
+        return self.options.command
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -649,24 +663,20 @@ class Runner(SingleOwner):
         feedforward: ArrayLike | None,
         substeps: int | None,
     ) -> tuple[Command, int]:
-        """Return the command (1, envs, dof) and the sim steps of one tick, checked."""
+        """Return the command (1, envs, ...) and the sim steps of one tick, checked."""
         count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
-        command = Command(
-            self._rows("setpoint", setpoint),
-            None if setpoint_rate is None else self._rows("setpoint_rate", setpoint_rate),
-            None if feedforward is None else self._rows("feedforward", feedforward),
-        )
-        command = self._coupled(command)
+        given = {"setpoint": setpoint, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
+        command = self._read_command(given)
         if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint, stacklevel=4)
         return command.map(lambda rows: rows[None]), count
 
     def _run(self, command: Command, substeps: int) -> None:
-        """Run ticks under ``command`` (ticks, envs, dof)."""
+        """Run ticks under ``command`` (ticks, envs, ...)."""
         self._execute(*self._ticks(command, substeps), stacklevel=4)
 
     def _ticks(self, command: Command, substeps: int) -> tuple[Run, Commit[_Books]]:
-        """Return the request for ticks under ``command`` (ticks, envs, dof), after a checkpoint if one is due."""
+        """Return the request for ticks under ``command`` (ticks, envs, ...), after a checkpoint if one is due."""
         every, pool, ledger = self.options.checkpoint_steps, self._pool, self._ledger
         assert ledger is not None
         if every is not None and ledger.books.steps_since_checkpoint >= every:
@@ -740,17 +750,25 @@ class Runner(SingleOwner):
             self._ledger.settle(self._record)
         return self._ledger.books
 
-    def _rows(self, name: str, value: ArrayLike, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """Return an argument as an array of ``shape``, or else (envs, dof), checked."""
-        return array(name, value, shape or self._shape, self._joint_names, finite=self._finite)
+    def _rows(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
+        """Return an argument as an array (envs, dof), checked."""
+        return array(name, value, self._shape, self._joint_names, finite=self._finite)
 
-    def _coupled(self, command: Command) -> Command:
-        """Return ``command`` with followers as their leaders have them; efforts act on leaders in the loop."""
-        coupling, (setpoint, rate, feedforward) = self.robot.coupling, command
-        if coupling is None:
+    def _read_command(self, given: Mapping[str, Any], ticks: tuple[int, ...] = ()) -> Command:
+        """Return a command (*ticks, envs, ...) of the arguments ``given``, checked.
+
+        Positions of followers become those that their leaders mean for them; efforts act on leaders in the loop.
+        """
+        rows = list[Any]()
+        for (name, value), (kind, names) in zip(given.items(), self._axes, strict=True):
+            shape = (*ticks, self.num_envs, len(names))
+            absent = value is None and rows  # the setpoint, which is first, cannot be
+            rows.append(None if absent else array(name, value, shape, names, finite=self._finite, kind=kind))
+        command = Command._make(rows)
+        if (coupling := self.robot.coupling) is None or not self.options.sets_positions:
             return command
-        setpoint = coupling.positions(setpoint) if self.options.sets_positions else setpoint
-        return Command(setpoint, None if rate is None else coupling.rates(rate), feedforward)
+        setpoint, rate, feedforward = command
+        return Command(coupling.positions(setpoint), None if rate is None else coupling.rates(rate), feedforward)
 
     def _state(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         """Return positions or velocities (envs, dof) to reset to, checked."""

@@ -16,14 +16,14 @@ Layout = dict[str, tuple[tuple[int, ...], Any]]
 
 
 class Command(NamedTuple):
-    """Command of one tick, (envs, dof), or of several, (ticks, envs, dof); None where nothing is given."""
+    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is given."""
 
     setpoint: Any
-    """[rad or m]; under control "effort" the joint effort [N m or N]."""
+    """(envs, size), as :attr:`sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
     setpoint_rate: Any = None
-    """[rad/s or m/s]"""
+    """Rate of the setpoint, per second (envs, size)."""
     feedforward: Any = None
-    """Effort added before saturation [N m or N]."""
+    """Joint effort added before saturation (envs, dof) [N m or N]."""
 
     def map(self, function: Any) -> Command:
         """Return a command with ``function`` applied to each array that is given."""
@@ -32,6 +32,8 @@ class Command(NamedTuple):
 
 class FaultArrays(NamedTuple):
     """Last fault of each env (envs,): sim step (-1: none), joint, and index into :data:`sim.loop.faults.CAUSES`.
+
+    Where the cause is one of :data:`sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the entry of the command.
 
     Without collisions, ``missed_contact`` is the sim step of its first missed contact (0: none).
     """
@@ -53,10 +55,12 @@ class Arrays(NamedTuple):
     fault: FaultArrays
 
     @staticmethod
-    def layout(ticks: int, num_envs: int, dof: int) -> Layout:
-        """Return the layout of all fields, for :meth:`from_fields`."""
+    def layout(ticks: int, num_envs: int, dof: int, command_size: int | None = None) -> Layout:
+        """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size`` (dof) numbers."""
         row, table = (ticks, num_envs), (ticks, num_envs, dof)
-        layout: Layout = {f"command.{name}": (table, np.float64) for name in Command._fields}
+        setpoint = table if command_size is None else (*row, command_size)
+        sizes = Command(setpoint, setpoint, table)
+        layout: Layout = {f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()}
         for name, quantity in OBSERVED.items():
             layout[f"observation.{name}"] = (table if quantity.per_joint else row, quantity.dtype)
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}

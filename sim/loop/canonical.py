@@ -24,11 +24,12 @@ def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
     """
     robot = options.robot
     options = replace(options, num_envs=1, build=None, randomization=None, actuators=None)
-    layout = Arrays.layout(_TICKS, 1, robot.dof)
+    layout = Arrays.layout(_TICKS, 1, robot.dof, options.command.size)
     fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
     arrays = Arrays.from_fields(fields)
     start = robot.start[None]
-    arrays.command.setpoint[:] = robot.coupled(start + _STEP) if options.sets_positions else _STEP
+    neutral = np.asarray(options.command.neutral)
+    arrays.command.setpoint[:] = robot.coupled(start + _STEP) if options.sets_positions else neutral + _STEP
     loop = Loop(options, params, slice(0, 1), arrays)
     try:
         loop.reset(np.ones(1, bool), start, np.zeros_like(start))

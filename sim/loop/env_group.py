@@ -282,7 +282,7 @@ class EnvGroup:
                 containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._place_failed()
         neutral, failed = (
-            (self._qpos if self._options.sets_positions else 0.0, 0.0, 0.0),
+            (self._qpos if self._options.sets_positions else self._options.command.neutral, 0.0, 0.0),
             containment.failed[:, None],
         )
         both = zip(command, neutral, strict=True)

@@ -26,6 +26,8 @@ that name was not finite.
 "effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes, so new causes are
 appended at the end.
 """
+COMMAND_CAUSES = ("setpoint", "setpoint_rate")
+"""Causes in an entry of the command, which need not be a joint."""
 
 LONGEST = 10_000
 """Largest number of faults in a log."""
@@ -42,11 +44,13 @@ class Fault(NamedTuple):
     time: float
     """Time of that step [s]."""
     joint: str
-    """First joint that failed."""
+    """First joint that failed; with ``kind`` "entry" the first entry of the command that is not finite."""
     cause: str
     """One of :data:`CAUSES`."""
     action: str
     """``on_fault`` of the runner: "hold" or "reset"."""
+    kind: str = "joint"
+    """"joint", or "entry" for the setpoint of a command whose entries are not joints."""
 
     def __str__(self) -> str:
         known = {
@@ -56,7 +60,7 @@ class Fault(NamedTuple):
         }
         cause = known.get(self.cause, f"the {self.cause} given for it is not finite")
         action = "held until it is reset" if self.action == "hold" else "reset"
-        return f"env {self.env}, joint {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
+        return f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
 
 
 class FaultWarning(UserWarning):
@@ -66,10 +70,20 @@ class FaultWarning(UserWarning):
 class FaultLog:
     """Last :data:`LONGEST` faults of a runner's envs. Immutable; methods return a modified copy."""
 
-    def __init__(self, num_envs: int, joint_names: Sequence[str], timestep: float, action: str) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        joint_names: Sequence[str],
+        timestep: float,
+        action: str,
+        command_names: Sequence[str] | None = None,
+    ) -> None:
         self.faults: tuple[Fault, ...] = ()
         """Latest last."""
-        self._joint_names, self._timestep, self._action = joint_names, timestep, action
+        self._timestep, self._action = timestep, action
+        self._places = {cause: ("joint", joint_names) for cause in CAUSES}
+        if command_names is not None:
+            self._places |= dict.fromkeys(COMMAND_CAUSES, ("entry", command_names))
         self._steps = np.full(num_envs, -1)
 
     def without(self, mask: Bool) -> FaultLog:
@@ -92,8 +106,10 @@ class FaultLog:
         new = list[Fault]()
         for env in np.flatnonzero((log._steps >= 0) & (log._steps != self._steps)).tolist():
             step = int(log._steps[env])
-            joint, cause = self._joint_names[fault.joint[env]], CAUSES[fault.cause[env]]
-            new.append(Fault(env, step, step * self._timestep, joint, cause, self._action))
+            cause = CAUSES[fault.cause[env]]
+            kind, names = self._places[cause]
+            joint = names[fault.joint[env]]
+            new.append(Fault(env, step, step * self._timestep, joint, cause, self._action, kind))
         if new:
             log.faults = (*self.faults, *new)[-LONGEST:]
         return log

@@ -26,7 +26,7 @@ from batchpid.friction import FrictionState
 from batchpid.guard import GuardState
 from batchpid.npz import read_npz
 from batchpid.validate import file_path, integer, names
-from sim.loop.faults import CAUSES, FaultContainment
+from sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
 from sim.loop.tables import flatten, nest, widen
 
 EPISODE = "episode"
@@ -83,11 +83,12 @@ class EnvStates:
         actuators: dict[str, NDArray[Any]],
         guard: bool,
         engine_sizes: Sequence[int],
+        command_size: int,
     ) -> None:
         """Check that these are states of so many envs and joints, with as many values of the engine (envs,).
 
         ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
-        have Coulomb friction, ``guard`` whether there is a guard.
+        have Coulomb friction, ``guard`` whether there is a guard. ``command_size`` is that of a setpoint.
 
         Raises
         ------
@@ -117,9 +118,15 @@ class EnvStates:
             else:
                 continue
             raise InvalidArgumentError("snapshot", f"has {problem}", remedy="take a new one")
-        for name, count in (("joint", dof), ("cause", len(CAUSES))):
-            if not ((self.containment[name] >= 0) & (self.containment[name] < count)).all():
-                raise InvalidArgumentError("snapshot", f"names a {name} beyond {count}", remedy="take a new one")
+        joint, cause = self.containment["joint"], self.containment["cause"]
+        of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
+        for name, rows, counts in (
+            ("cause", cause, np.full(num_envs, len(CAUSES))),
+            ("joint", joint, np.where(of_command, command_size, dof)),
+        ):
+            if (bad := (rows < 0) | (rows >= counts)).any():
+                problem = f"names a {name} beyond {counts[bad][0]}"
+                raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
         for env, size in enumerate(engine_sizes):
             if size > self.engine.shape[1] or not np.isnan(self.engine[env, size:]).all():
                 raise InvalidArgumentError(
@@ -248,7 +255,8 @@ class Snapshot:
         motors = initial_actuators(actuators, num_envs, dof, about["timestep"])
         if (about.get("randomization") or {}).get("actuators"):
             motors = states.actuators  # the runner that restores it checks them
-        states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), ())
+        size = dof if about.get("command") is None else len(names("command", about["command"]))
+        states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size)
         return cls(about, steps, params, states, actuators, episodes)
 
     def __repr__(self) -> str:

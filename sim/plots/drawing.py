@@ -48,15 +48,21 @@ def draw_band(axes: Axes, time: NDArray[Any], values: NDArray[Any], colour: str)
 
 
 def draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> None:
-    """Draw the setpoint, one line where all envs share it, and the settling band around its last value."""
+    """Draw the setpoint of a joint, and the settling band around its last value."""
     setpoint = run.setpoint[..., joint]
-    shared = (setpoint == setpoint[:, :1]).all()
-    axes.plot(run.time, setpoint[:, 0] if shared else setpoint, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    shared = draw_entry(axes, run.time, setpoint)
     move = np.abs(setpoint[-1] - run.qpos[0, :, joint])
     move = move[np.isfinite(move)]
     if band is not None and shared and move.size:
         half = band * float(np.median(move))
         axes.axhspan(setpoint[-1, 0] - half, setpoint[-1, 0] + half, color=SETPOINT, alpha=0.2, lw=0)
+
+
+def draw_entry(axes: Axes, time: NDArray[Any], values: NDArray[Any]) -> bool:
+    """Draw one number of the setpoints (ticks, envs), as one line where all envs share it; return whether they do."""
+    shared = bool((values == values[:, :1]).all())
+    axes.plot(time, values[:, 0] if shared else values, color=SETPOINT, lw=1.1, ls="--", zorder=3)
+    return shared
 
 
 def draw_limits(axes: Axes, low: float, high: float) -> None:

@@ -23,6 +23,7 @@ from PIL import Image
 from batchpid.errors import InvalidArgumentError
 from batchpid.files import write_atomically
 from batchpid.validate import file_path
+from sim.command import CommandSpec
 from sim.observation import Rollout
 from sim.plots import drawing
 
@@ -41,6 +42,7 @@ def step_responses(
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
 
+    Setpoints that are not one number for each joint have axes of their own, one for each entry of the command.
     Not-finite samples are gaps; so is everything of an env from where ``ok`` is False.
 
     Parameters
@@ -58,8 +60,13 @@ def step_responses(
         The robot has no such joint.
     """
     run = _blank_failed(rollout)
-    figure, blocks = _figure(run, joints, rows=2, title=title)
-    for joint, (above, below) in blocks:
+    own = None if run.info.sets_positions else run.info.own_command
+    figure, blocks = _figure(run, joints, rows=2, title=title, command=own)
+    own_blocks = blocks[len(blocks) - own.size :] if own is not None else []
+    for entry, (axes,) in own_blocks:
+        values = rollout.setpoint[..., entry]
+        drawing.draw_entry(axes, run.time, np.where(np.isfinite(values), values, np.nan))
+    for joint, (above, below) in blocks[: len(blocks) - len(own_blocks)]:
         drawing.draw_limits(above, run.info.lower[joint], run.info.upper[joint])
         drawing.draw_setpoint(above, run, joint, band)
         drawing.draw_fan(above, run.time, run.qpos[..., joint], mark)
@@ -157,8 +164,10 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are no positions."""
     alive, seen = rollout.ok[..., None], rollout.observation
     blank = seen._replace(qpos=np.where(alive, seen.qpos, np.nan), effort=np.where(alive, seen.effort, np.nan))
-    position = np.isfinite(rollout.setpoint) & (rollout.info.control != "effort")
-    return replace(rollout, setpoint=np.where(position, rollout.setpoint, np.nan), observation=blank)
+    setpoint = np.full(seen.qpos.shape, np.nan)
+    if rollout.info.sets_positions:
+        setpoint = np.where(np.isfinite(rollout.setpoint), rollout.setpoint, np.nan)
+    return replace(rollout, setpoint=setpoint, observation=blank)
 
 
 def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
@@ -170,9 +179,16 @@ def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
     return [known[joint] for joint in joints or names]
 
 
-def _figure(run: Rollout, joints: Joints, *, rows: int, title: str) -> tuple[Figure, list[tuple[int, list[Axes]]]]:
-    """Return a figure with ``rows`` axes for each joint, in a grid; and (joint, axes) pairs."""
-    chosen = _joint_indices(run, joints)
+def _figure(
+    run: Rollout, joints: Joints, *, rows: int, title: str, command: CommandSpec | None = None
+) -> tuple[Figure, list[tuple[int, list[Axes]]]]:
+    """Return a figure with ``rows`` axes for each joint, then one for each entry of ``command``, in a grid.
+
+    The pairs are (joint, axes) and, after these, (entry, axes).
+    """
+    chosen = [(joint, run.info.joint_names[joint], rows) for joint in _joint_indices(run, joints)]
+    if command is not None:
+        chosen += [(entry, f"setpoint {label}", 1) for entry, label in enumerate(command.labels)]
     # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty cells.
     columns = min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
     lines = math.ceil(len(chosen) / columns)
@@ -186,9 +202,11 @@ def _figure(run: Rollout, joints: Joints, *, rows: int, title: str) -> tuple[Fig
     # One flat grid, so that the axes of a column are aligned.
     grid = figure.add_gridspec(lines * (rows + 1), columns, height_ratios=(*heights, between) * lines)
     blocks = []
-    for place, joint in enumerate(chosen):
+    for place, (index, name, parts) in enumerate(chosen):
         line, column = divmod(place, columns)
-        block = [figure.add_subplot(grid[line * (rows + 1) + row, column]) for row in range(rows)]
+        first = line * (rows + 1)
+        cells = [slice(first, first + rows)] if parts < rows else range(first, first + rows)
+        block = [figure.add_subplot(grid[cell, column]) for cell in cells]
         last = place + columns >= len(chosen)
         for axes in block:
             axes.tick_params(labelsize=drawing.SMALL, length=2, labelbottom=axes is block[-1] and last)
@@ -197,8 +215,8 @@ def _figure(run: Rollout, joints: Joints, *, rows: int, title: str) -> tuple[Fig
             axes.yaxis.set_major_locator(MaxNLocator(4))
         if last:
             block[-1].set_xlabel("time [s]", fontsize=drawing.SMALL)
-        block[0].set_title(run.info.joint_names[joint], fontsize=8, loc="left", pad=3, fontweight="bold")
-        blocks.append((joint, block))
+        block[0].set_title(name, fontsize=8, loc="left", pad=3, fontweight="bold")
+        blocks.append((index, block))
     return figure, blocks
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,8 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
     """Return ``rollout`` as a dataset with dimensions time, env and joint.
 
     Coordinates: ``time`` [s], ``env``, ``joint`` (names) and ``unit`` (rad or m, by joint). Every variable has a
-    ``long_name`` and ``units``; "rad|m" means the joint's own ``unit``. The arrays are not copied.
+    ``long_name`` and ``units``; "rad|m" means the joint's own ``unit``. The setpoint of a control with a command of its
+    own has the dimension ``entry`` in place of ``joint``, with the units ``entry_unit``. The arrays are not copied.
 
     Raises
     ------
@@ -30,17 +31,29 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
         import xarray
     except ImportError:
         raise MissingDependencyError("xarray", "a labelled dataset", "data") from None
-    info = rollout.info
+    info, own = rollout.info, rollout.info.own_command
+    columns = {name: ("joint",) if quantity.per_joint else () for name, quantity in RECORDED.items()}
+    units = {name: quantity.unit for name, quantity in RECORDED.items()}
+    entries: dict[str, Any] = {}
+    if own is not None:
+        columns["setpoint"], units["setpoint"] = ("entry",), "|".join(dict.fromkeys(own.units))
+        entries = {
+            "entry": list(own.names),
+            "entry_unit": ("entry", list(own.units), {"long_name": "unit of the entry"}),
+        }
+    elif info.control == "effort":
+        units["setpoint"] = units["effort"]
     return xarray.Dataset(
         {
             name: (
-                ("time", "env", "joint") if quantity.per_joint else ("time", "env"),
+                ("time", "env", *columns[name]),
                 getattr(rollout, name),
-                {"long_name": quantity.meaning, "units": info.quantity(name).unit},
+                {"long_name": quantity.meaning, "units": units[name]},
             )
             for name, quantity in RECORDED.items()
         },
         coords={
+            **entries,
             "time": ("time", rollout.time, {"long_name": "simulated time", "units": "s"}),
             "env": np.arange(rollout.num_envs),
             "joint": list(info.joint_names),

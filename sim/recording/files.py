@@ -25,6 +25,7 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.files import write_atomically
 from batchpid.npz import read_npz
 from batchpid.validate import file_path, instance, integer
+from sim.command import CommandSpec
 from sim.loop.faults import Fault
 from sim.observation import RECORDED, Observation, Redraw, Rollout, RunInfo
 from sim.recording.hdf5 import NOT_WRITTEN, read_hdf5
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 FORMAT = "batchpid-recording-1"
 HDF5 = (".h5", ".hdf5")
 _DRAW = "draw."  # in front of the names of draws
+_COMMAND_NAMES, _COMMAND_UNITS = "command_names", "command_units"
 CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
 DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
 """Dtype of each array of a recording."""
@@ -182,12 +184,12 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
     datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan)}
     datasets["time"].attrs["unit"] = ["s"]
     for name, quantity in RECORDED.items():
-        row = (num_envs, len(info.joint_names)) if quantity.per_joint else (num_envs,)
+        row = info.row_shape(name, num_envs)
         dtype = np.dtype(quantity.dtype)
         rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * dtype.itemsize))
         datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
         if quantity.per_joint:
-            datasets[name].attrs["unit"] = [info.quantity(name).unit_for(unit) for unit in info.units]
+            datasets[name].attrs["unit"] = list(info.units_of(name))
     datasets["checksum"] = file.create_dataset(
         "checksum", (0,), "i8", maxshape=(None,), chunks=(1024,), fillvalue=NOT_WRITTEN
     )
@@ -234,6 +236,8 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     """Return what is known of a run as numbers, texts, and arrays of them."""
     known = {name: value for name, value in vars(info).items() if value is not None}
     known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
+    if (command := known.pop("own_command", None)) is not None:
+        known |= {_COMMAND_NAMES: list(command.names), _COMMAND_UNITS: list(command.units)}
     if info.params is not None:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
     if info.actuators is not None:
@@ -276,7 +280,14 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         if np.shape(known[name]) != (len(names),):
             raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
     draws = {name.removeprefix(_DRAW): _numbers(rows) for name, rows in attributes.items() if name.startswith(_DRAW)}
-    return RunInfo(**{name: decode[name](value) for name, value in known.items()}, draws=draws or None)
+    command = None
+    if _COMMAND_NAMES in attributes:
+        command = CommandSpec(attributes[_COMMAND_NAMES].tolist(), attributes[_COMMAND_UNITS].tolist())
+    return RunInfo(
+        **{name: decode[name](value) for name, value in known.items()},
+        draws=draws or None,
+        own_command=command,
+    )
 
 
 def _numbers(value: NDArray[Any]) -> NDArray[Any]:
@@ -289,7 +300,7 @@ def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> No
     """Check that shapes agree and times are numbers."""
     ticks, dof = len(arrays["time"]), len(info.joint_names)
     envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0
-    shapes = {name: (ticks, envs, dof) if quantity.per_joint else (ticks, envs) for name, quantity in RECORDED.items()}
+    shapes = {name: (ticks, *info.row_shape(name, envs)) for name in RECORDED}
     for name, shape in ({"time": (ticks,)} | shapes).items():
         if arrays[name].shape != shape:
             raise ValueError(f"its {name} has shape {arrays[name].shape}, not {shape}")

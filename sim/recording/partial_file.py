@@ -50,7 +50,7 @@ class PartialFile(SingleOwner):
         self, path: Path, partial: Path, info: RunInfo, num_envs: int, tick: float, *, overwrite: bool
     ) -> None:
         self._path, self._partial, self._overwrite = path, partial, overwrite
-        self._chunk = max(files.CHUNK_BYTES, 8 * num_envs * len(info.joint_names))
+        self._chunk = max(files.CHUNK_BYTES, 8 * num_envs * max(len(info.joint_names), info.command.size))
         h5py = files.load_h5py()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -99,7 +99,7 @@ class Recorder(SingleOwner):
         seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
         info = replace(runner.info, seed=seed, complete=False)
         files.load_h5py()
-        self._row_bytes = sum(table.nbytes for table in runner.observe()) + 8 * runner.num_envs * runner.robot.dof
+        self._row_bytes = sum(table.nbytes for table in runner.observe()) + 8 * runner.num_envs * runner.command.size
         self._rows: SimpleQueue[_Row | None] = SimpleQueue()  # None: the end
         self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
         self._oldest = math.inf  # when the oldest row was recorded that is being written
@@ -122,7 +122,7 @@ class Recorder(SingleOwner):
             raise
 
     def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, dof). The runner calls it.
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size). The runner calls it.
 
         Repeated with the same ``observation``, after an interrupt, it has no effect.
         """

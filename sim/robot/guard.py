@@ -66,7 +66,7 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
     if guard is False or guard is None:
         return False
     if not sets_positions:
-        problem, remedy = "limits positions, which this control does not take", "use control 'pid' or 'drive'"
+        problem, remedy = "limits positions of joints, which this control does not take", "use control 'pid' or 'drive'"
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(robot, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from sim.observation import Rollout
 from sim.robot.limits import SetpointWarning
@@ -106,6 +107,9 @@ def step_response_metrics(
     Followers have the metrics of their leaders.
     Without ``with_effort`` those of the efforts are undefined (NaN), as under control "drive".
     """
+    if (own := rollout.info.own_command) is not None:
+        problem, remedy = f"has setpoints of {', '.join(own.names)}, not of joints", "pass a run with joint setpoints"
+        raise InvalidArgumentError("rollout", problem, remedy=remedy)
     metrics = step_metrics(
         rollout.tick,
         rollout.setpoint,

@@ -49,8 +49,11 @@ class Charts:
 
         dashed = {"width": 1, "dash": [6, 4]}
         limits = ({"label": f"{end} limit", "stroke": "#b6bcc6", **dashed} for end in ("lower", "upper"))
-        self._position = chart("position", *curves("qpos"), {"label": "setpoint", "stroke": "#4a82ff", **dashed})
+        self._sets_positions = data.frame().info.sets_positions
+        target = [{"label": "setpoint", "stroke": "#4a82ff", **dashed}] if self._sets_positions else []
+        self._position = chart("position", *curves("qpos"), *target)
         self._error = chart("error", *curves("error"))
+        self._error.visible = self._sets_positions
         self._effort = chart("effort", *limits, *curves("effort"))
 
     def update(self, env: int, joint: int) -> None:
@@ -60,7 +63,7 @@ class Charts:
             return
         past = history.time - history.time[-1]
         robots = env + data.per_group * np.arange(len(data.groups))
-        arrays = (history.qpos, history.setpoint, history.effort)
+        arrays = (history.qpos, history.setpoint if self._sets_positions else history.qpos, history.effort)
         qpos, setpoint, effort = (array[:, robots, joint].T.astype(np.float64) for array in arrays)
         # A far limit would flatten the curve, and a gap (NaN) would empty the chart: such a limit repeats the curve.
         largest = np.abs(effort).max()
@@ -69,7 +72,8 @@ class Charts:
             for limit in data.effort_limits(env, joint)
         ]
         described = data.robot.joints[joint]
-        positions = np.round([*qpos, setpoint[0]], 4)  # smaller differences make a flat line jitter
+        drawn = [*qpos, setpoint[0]] if self._sets_positions else qpos
+        positions = np.round(drawn, 4)  # smaller differences make a flat line jitter
         for chart, title, curves in (
             (self._position, f"{described.name} [{described.unit}]", positions),
             (self._error, f"setpoint - qpos [{described.unit}]", setpoint - qpos),

@@ -9,9 +9,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.validate import integer
+from sim.command import CommandSpec
 from sim.observation import Rollout
 from sim.robot.robot import Robot
 from sim.view.controls import Control, Requests
@@ -22,6 +24,7 @@ from sim.view.simulation import LiveSimulation
 
 _DIRECTIONS = dict(zip(("+x", "+y", "up", "-x", "-y", "down"), np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _FINDING_STYLE = "margin: 0.5em 1em; font-size: 0.8em; color: #b45309; overflow-wrap: anywhere"
+_ENTRY_STYLE = "margin: 0.5em 1em; font-size: 0.8em; overflow-wrap: anywhere"
 _MILLISECONDS = {"derivative_filter_time": 1e3}
 """Factor from a gain to the number on its slider, where that is not 1."""
 
@@ -58,7 +61,10 @@ class Panel:
             settings = data.robot.settings
             first = 0 if settings is None else int(np.argmax(np.abs(settings.target - data.robot.start)))
             self._joint = self._control(gui.add_dropdown("Joint", self._names, initial_value=self._names[first]))
-            self._show_setpoint = self._control(gui.add_checkbox("Show its setpoint", True))
+            checkbox = gui.add_checkbox("Show its setpoint", True)
+            self._show_setpoint = self._control(checkbox)
+            checkbox.visible = data.frame().info.sets_positions
+            self._entries = None if checkbox.visible else gui.add_html("")  # numbers of a setpoint that is no pose
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
             adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
@@ -114,6 +120,9 @@ class Panel:
         self._status.content = "  \n".join(lines)
         if isinstance(data, Playback):
             self._time.value = time
+        if self._entries is not None:
+            numbers = _numbers(frame.info.command, frame.setpoint[0, self.env])
+            self._entries.content = f'<p style="{_ENTRY_STYLE}">{html.escape(f"setpoint: {numbers}")}</p>'
 
     def _control(self, handle: Any) -> Control:
         return Control(handle, self._requests)
@@ -215,6 +224,12 @@ def short_names(robot: Robot) -> tuple[str, ...]:
     first, last = min(words), max(words)  # their common start is that of all names
     shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
     return tuple("_".join(each[shared - (shared > 0 and each[shared].isdigit()) :]) for each in words)
+
+
+def _numbers(command: CommandSpec, setpoint: NDArray[np.float64]) -> str:
+    """Return a setpoint (size,) as text: names, numbers and units."""
+    columns = zip(command.names, setpoint.tolist(), command.units, strict=True)
+    return ", ".join(f"{name} {value:.4g} {unit}".rstrip() for name, value, unit in columns)
 
 
 def _slider_step(width: float) -> float:

@@ -62,7 +62,7 @@ class RobotScene:
         self._add_surroundings(groups, ground)
 
     def update(self, frame: Rollout, selected: int, show_setpoint: bool) -> None:
-        """Place every robot, the ring under the selected one, and its setpoint if that is shown."""
+        """Place every robot, the ring under the selected one, and its setpoint if that is shown and is a pose."""
         positions, ok = self._layout.positions, frame.ok[0]
         with self._server.atomic():
             self._place(self._robots, self._kinematics.poses(frame.qpos[0]), positions)
@@ -71,6 +71,7 @@ class RobotScene:
                 for node, colours in zip(self._robots, self._colours, strict=True):
                     node.batched_colors = np.where(ok[:, None], colours, _DIVERGED_COLOUR)
             setpoint = frame.setpoint[0, selected]
+            show_setpoint = show_setpoint and frame.info.sets_positions
             if (shown := (selected, show_setpoint, setpoint.tobytes())) != self._shown_setpoint:
                 self._shown_setpoint = shown
                 self._ring.position = (*positions[selected][:2], self._layout.floor + 0.004)

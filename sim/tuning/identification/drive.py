@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.choices import PerMassMatrix
-from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
+from sim.loop.pid_law import PIDLaw
 
 Float64 = NDArray[np.float64]
 
@@ -42,7 +41,7 @@ class Law:
     def __init__(self, drive: Drive, qpos: Float64, qvel: Float64) -> None:
         params = drive.params
         assert params is not None
-        self._params, self._measured = params, drive.measured_rate
+        self._law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
         self._k = bp.discretise(params, drive.timestep * drive.substeps, len(qpos))
         self._state = bp.init(params, qpos)
 
@@ -50,12 +49,8 @@ class Law:
         self, setpoint: Float64, qpos: Float64, qvel: Float64, matrix: Float64, feedforward: Float64 | None
     ) -> Float64:
         """Advance the law by a step and return the efforts (n, joints)."""
-        units = self._params.gain_units
-        rate = qvel if self._measured else None
-        if isinstance(units, PerMassMatrix):
-            new = advance_with_mass_matrix(self._k, self._state, setpoint, qpos, matrix, rate, None, feedforward)
-        else:
-            k = self._k if units is None else per_inertia(self._k, np.diagonal(matrix, axis1=1, axis2=2))
-            new = bp.advance(k, self._state, setpoint, qpos, rate, None, feedforward)
-        self._state, effort = new[:2]
+        given = matrix if self._law.whole else np.diagonal(matrix, axis1=1, axis2=2)
+        self._state, effort, _ = self._law.advance(
+            self._k, self._state, (setpoint, None), qpos, qvel, feedforward, given
+        )
         return np.asarray(effort)

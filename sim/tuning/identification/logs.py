@@ -102,6 +102,9 @@ def logs_of_rollout(
     if info.joint_names != robot.joint_names:
         problem = f"is of the joints {', '.join(info.joint_names)}"
         raise InvalidArgumentError(source, problem, remedy=f"{robot.name!r} has {', '.join(robot.joint_names)}")
+    if info.own_command is not None:
+        problem = f"was made with setpoints of {', '.join(info.own_command.names)}, not of joints"
+        raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
     found: CommandKind = "effort" if info.control == "effort" else "setpoint"
     if kind is not None and kind != found:
         problem = f"was made under control {info.control!r} and holds {found}s"

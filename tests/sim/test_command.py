@@ -1,0 +1,533 @@
+"""Commands that are not one number for each joint: the position (x, y) of a two-link arm, through the whole program."""
+
+from __future__ import annotations
+
+import os
+import signal
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from identical import assert_identical
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from sim import (
+    CommandSpec,
+    FaultWarning,
+    Recorder,
+    RecoveryWarning,
+    Robot,
+    Runner,
+    RunnerOptions,
+    SetpointWarning,
+    Snapshot,
+    plots,
+    read_recording,
+    write_recording,
+)
+from tests.sim.tiny_urdf import INERTIAL, joint, link, robot, write
+
+N, LENGTH = 5, 1.0
+"""Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at 0."""
+XY = CommandSpec(("x", "z"), ("m", "m"), lower=(0.3, 0.3), upper=(1.2, 1.2), neutral=(0.8, 0.8))
+
+
+class Cartesian:
+    """PD of both joints toward the elbow-up solution of the inverse kinematics of (x, z), in NumPy or JAX."""
+
+    def __init__(self, command=XY):
+        self.command = command
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        xp = setpoint.__array_namespace__()
+        x, z = setpoint[:, 0], setpoint[:, 1]
+        cosine = (x * x + z * z) / (2 * LENGTH**2) - 1
+        elbow = xp.arccos(xp.clip(cosine, -1.0, 1.0))
+        target = xp.stack([xp.arctan2(x, z) - elbow / 2, elbow], -1)
+        return state, passive + 60.0 * (target - qpos) - 15.0 * qvel
+
+
+class Shapes(Cartesian):
+    """The same, with so many further numbers in a setpoint that nothing depends on."""
+
+    def __init__(self, more):
+        super().__init__(CommandSpec(tuple(f"number {k}" for k in range(2 + more))))
+
+
+class OfJoints(Cartesian):
+    """PD toward joint positions: a controller without a command of its own."""
+
+    def __init__(self):
+        super().__init__(None)
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, passive + 60.0 * (setpoint - qpos) - 15.0 * qvel
+
+
+@pytest.fixture(scope="session")
+def arm(tmp_path_factory):
+    """Two links of 1 m, the tool at the end of the second."""
+    limit = '<limit lower="-3" upper="3" effort="200" velocity="9"/>'
+    text = robot(
+        *(link(name, INERTIAL) for name in ("base", "upper", "lower")),
+        joint("shoulder", "base", "upper", inner=limit, origin="0 0 0"),
+        joint("elbow", "upper", "lower", inner=limit, origin=f"0 0 {LENGTH}"),
+    )
+    return Robot.load(write(tmp_path_factory.mktemp("arm"), text))
+
+
+def tool(qpos):
+    """Return (x, z) of the tool at ``qpos`` (..., 2)."""
+    first, both = qpos[..., 0], qpos.sum(-1)
+    return LENGTH * np.stack([np.sin(first) + np.sin(both), np.cos(first) + np.cos(both)], -1)
+
+
+def goals(num_envs=N):
+    return np.random.default_rng(3).uniform(0.5, 1.1, (num_envs, 2))
+
+
+def make(arm, control=None, num_envs=N, **options):
+    return Runner(arm, num_envs, control=control or Cartesian(), **({"workers": 0, "substeps": 20} | options))
+
+
+def run(arm, control=None, ticks=30, **options):
+    with make(arm, control, **options) as runner:
+        return runner.rollout(np.broadcast_to(goals(), (ticks, N, 2)))
+
+
+# -- the control reaches its setpoint, whatever runs it ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+def test_the_tool_reaches_its_command_in_any_number_of_workers(arm, backend):
+    if backend == "jax":
+        pytest.importorskip("jax")
+    rollout = run(arm, backend=backend, ticks=200)
+    np.testing.assert_allclose(tool(rollout.qpos[-1].astype(float)), goals(), atol=2e-3)
+    assert rollout.setpoint.shape == (200, N, 2)
+    assert_identical(run(arm, backend=backend, ticks=200, workers=2), rollout)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("more", [0, 1, 5])
+def test_a_command_has_any_size(arm, more, backend):
+    if backend == "jax":
+        pytest.importorskip("jax")
+    setpoint = np.concatenate([goals(), np.ones((N, more))], 1)
+    with make(arm, Shapes(more), backend=backend) as runner, make(arm, backend=backend) as plain:
+        assert runner.command.size == 2 + more
+        for _ in range(5):
+            seen, expected = runner.step(setpoint), plain.step(goals())
+        np.testing.assert_array_equal(seen.qpos, expected.qpos)
+
+
+def test_commands_are_replayed_for_a_lost_worker(arm):
+    setpoints = np.random.default_rng(4).uniform(0.5, 1.0, (4, N, 3))
+    control = Shapes(1)
+    with make(arm, control, workers=2) as runner:
+        runner.rollout(setpoints)
+        os.kill(runner.pids[1], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            seen = runner.rollout(setpoints)
+    with make(arm, control) as runner:
+        runner.rollout(setpoints)
+        assert_identical(seen, runner.rollout(setpoints))
+
+
+def test_a_jitted_call_at_each_sim_step_takes_it_too(arm):
+    """Actuators keep the control from being one program."""
+    pytest.importorskip("jax")
+    delayed = {"actuators": bp.make_actuators(2, command_delay=0.002)}
+    ours, theirs = (run(arm, backend=backend, ticks=5, **delayed) for backend in ("jax", "numpy"))
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=1e-9)
+
+
+def test_followers_do_not_enter_a_command(tmp_path):
+    """The efforts that a controller returns for followers act on leaders; setpoints are passed on as they are."""
+    mimic = '<limit lower="-3" upper="3" effort="200" velocity="9"/><mimic joint="elbow" multiplier="-1"/>'
+    limit = mimic.partition("<mimic")[0]
+    text = robot(
+        *(link(name, INERTIAL) for name in ("base", "upper", "lower", "finger")),
+        joint("shoulder", "base", "upper", inner=limit),
+        joint("elbow", "upper", "lower", inner=limit),
+        joint("tip", "lower", "finger", inner=mimic),
+    )
+    coupled = Robot.load(write(tmp_path, text))
+    assert coupled.coupling is not None
+
+    class Efforts(Cartesian):
+        def __call__(self, state, setpoint, qpos, qvel, passive):
+            return state, setpoint[:, :1] * np.ones_like(qpos)
+
+    setpoint = np.array([1.0, 2.0, 3.0, 4.0])
+    with make(coupled, Efforts(("a", "b", "c", "d"))) as runner:
+        runner.step(setpoint, setpoint_rate=setpoint)
+        np.testing.assert_array_equal(runner.rollout(setpoint[None]).setpoint[0], [setpoint] * N)
+
+
+def test_one_number_is_a_command_too(arm):
+    class Height(Cartesian):
+        def __call__(self, state, setpoint, qpos, qvel, passive):
+            assert setpoint.shape == (len(qpos), 1)
+            return super().__call__(state, np.hstack([setpoint, setpoint]), qpos, qvel, passive)
+
+    with make(arm, Height(("height",)), num_envs=2) as runner:
+        runner.step(0.7)
+        runner.step([0.7])
+        runner.step([[0.7], [0.9]])
+        assert runner.command == CommandSpec(("height",))
+
+
+def test_send_feedforward_and_rates(arm):
+    """A feedforward acts on joints; a rate has the shape of the setpoint, and a controller is not given it."""
+    with make(arm) as runner, make(arm) as other:
+        runner.send(goals(), setpoint_rate=[0.1, 0.2], feedforward=[5.0, 0.0])
+        seen = runner.recv()
+        np.testing.assert_array_equal(seen.qpos, other.step(goals(), feedforward=[5.0, 0.0]).qpos)
+        assert (seen.qpos != make_and_step(arm)).any()
+
+
+def make_and_step(arm):
+    with make(arm) as runner:
+        return runner.step(goals()).qpos
+
+
+# -- errors and warnings ----------------------------------------------------------------------------------------------
+
+
+def test_errors_name_the_entry_of_the_command(arm):
+    with make(arm, Shapes(1)) as runner:
+        bad = np.ones((N, 3))
+        bad[2, 1] = np.nan
+        with pytest.raises(InvalidArgumentError, match=r"^setpoint, entry 'number 1', env 2: is not finite") as caught:
+            runner.step(bad)
+        assert (caught.value.entry, caught.value.joint, caught.value.env) == ("number 1", None, 2)
+        with pytest.raises(InvalidArgumentError, match=r"\(5, 2\), not \(5, 3\) .* the entries number 0, number 1"):
+            runner.step(np.ones((N, 2)))
+        with pytest.raises(InvalidArgumentError, match=r"setpoint_rate.*\(2,\), not \(5, 3\)"):
+            runner.step(np.ones(3), setpoint_rate=np.ones(2))
+        with pytest.raises(InvalidArgumentError, match=r"^setpoint: cannot be read as an array"):
+            runner.step(None)
+        with pytest.raises(InvalidArgumentError, match=r"feedforward.*\(3,\), not \(5, 2\).*joints shoulder, elbow"):
+            runner.step(np.ones(3), feedforward=np.ones(3))
+        with pytest.raises(InvalidArgumentError, match=r"must have shape \(ticks, 5, 3\) or \(ticks, 3\)"):
+            runner.rollout(np.ones(3))
+        with pytest.raises(InvalidArgumentError, match=r"setpoints.*not \(4, 5, 3\)"):
+            runner.rollout(np.ones((4, N, 2)))
+        assert runner.rollout(np.ones((4, 3))).setpoint.shape == (4, N, 3)
+
+
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        ("xy", "a sequence of texts"),
+        (2, "a sequence of texts"),
+        (("x", 1), "a sequence of texts"),
+        ((), "different words"),
+        (("x", "x"), "different words"),
+        (("x", ""), "different words"),
+    ],
+)
+def test_a_command_that_is_none_is_refused_by_name(arm, command, problem):
+    with pytest.raises(InvalidArgumentError, match=f"^control: has an attribute 'command' .*{problem}.*CommandSpec"):
+        RunnerOptions(arm, 1, control=Cartesian(command))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"units": ("m",)}, r"^units: has 1 units for 2 names"),
+        ({"lower": (0, 1, 2)}, r"^lower: has shape \(3,\).*the entries x, y"),
+        ({"lower": 2.0, "upper": 1.0}, r"^lower, entry 'x': is not below the upper bound"),
+        ({"upper": np.nan}, r"^lower, entry 'x'"),
+        ({"upper": (1, 1), "neutral": (0, 3)}, r"^neutral, entry 'y': is not within the bounds \(got 3.0\)"),
+        ({"neutral": (np.inf, 0)}, r"^neutral, entry 'x': is not finite"),
+    ],
+)
+def test_a_spec_checks_its_fields(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        CommandSpec(("x", "y"), **options)
+
+
+def test_a_spec_fills_in_units_bounds_and_neutral():
+    spec = CommandSpec(["x", "y"], lower=(0.2, -1))
+    assert (spec.size, spec.units, spec.neutral) == (2, ("", ""), (0.2, 0.0))
+    assert spec.lower == (0.2, -1.0)
+    assert spec == CommandSpec(("x", "y"))
+    assert CommandSpec(("x", "y"), ("m", "")).labels == ("x [m]", "y")
+
+
+def test_limits_and_guard_are_for_joint_positions(arm):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SetpointWarning)
+        with make(arm) as runner:
+            runner.step([50.0, 50.0])
+    with pytest.raises(InvalidArgumentError, match=r"^guard: limits positions of joints.*use control 'pid' or 'drive'"):
+        RunnerOptions(arm, 1, control=Cartesian(), guard=True)
+
+
+def test_commands_of_joints_have_their_names_and_units(panda):
+    position, effort = ("rad",) * 7 + ("m", "m"), ("N m",) * 7 + ("N", "N")
+    for control, units in (("pid", position), ("drive", position), ("effort", effort), (OfJoints(), position)):
+        options = RunnerOptions(panda, 1, control=control)
+        assert options.command == CommandSpec(panda.joint_names, units)
+        assert options.own_command is None
+        info = panda.run_info(control=options.control_name)
+        assert (info.command, info.sets_positions) == (options.command, control != "effort")
+        assert info.units_of("qvel") == ("rad/s",) * 7 + ("m/s", "m/s")
+
+
+# -- faults -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("on_fault", "backend", "workers"),
+    [("hold", "numpy", 0), ("reset", "numpy", 2), ("hold", "jax", 2), ("reset", "jax", 0)],
+)
+def test_a_fault_names_the_entry_and_is_contained(arm, on_fault, backend, workers):
+    if backend == "jax":
+        pytest.importorskip("jax")
+    bad = np.concatenate([goals(), np.ones((N, 4))], 1)
+    bad[1, 5] = np.nan
+    bad[3, 0] = np.inf
+    good = np.where(np.isfinite(bad), bad, 1.0)
+    options = {"on_fault": on_fault, "on_invalid_input": "contain", "backend": backend, "workers": workers}
+    with make(arm, Shapes(4), **options) as runner, make(arm, Shapes(4), **options) as sound:
+        runner.step(good)
+        sound.step(good)
+        with pytest.warns(FaultWarning, match="env 1, entry 'number 5': the setpoint given for it is not finite"):
+            failed = runner.step(bad)
+        expected = sound.step(good)
+        np.testing.assert_array_equal(failed.ok, [True, False, True, False, True])
+        np.testing.assert_array_equal(failed.qpos[failed.ok], expected.qpos[failed.ok])
+        assert [(fault.env, fault.joint, fault.cause) for fault in runner.faults] == [
+            (1, "number 5", "setpoint"),
+            (3, "number 0", "setpoint"),
+        ]
+        state = runner.snapshot()
+        snapshot = Snapshot.load(saved(state))
+        seen = runner.step(good)
+        assert np.isfinite(seen.qpos).all()
+        if on_fault == "hold":
+            np.testing.assert_array_equal(seen.qpos[[1, 3]], failed.qpos[[1, 3]])
+        runner.restore(snapshot)
+        np.testing.assert_array_equal(runner.step(good).qpos, seen.qpos)
+        runner.reset(mask=~failed.ok)
+        assert runner.step(good).ok.all()
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def saved(snapshot):
+    snapshot.save("snapshot.npz")
+    return "snapshot.npz"
+
+
+def test_a_failed_env_has_the_neutral_setpoint(arm):
+    class Noting(Cartesian):
+        def __call__(self, state, setpoint, qpos, qvel, passive):
+            self.last = setpoint
+            return super().__call__(state, setpoint, qpos, qvel, passive)
+
+    control = Noting()
+    with make(arm, control, on_invalid_input="contain") as runner, pytest.warns(FaultWarning):
+        runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
+    np.testing.assert_array_equal(control.last, np.where(np.arange(N)[:, None] == 2, XY.neutral, goals()))
+
+
+def test_nan_efforts_of_a_failed_env_are_contained(arm):
+    """A controller that is NaN at its neutral setpoint cannot harm the others."""
+
+    class Unclipped(Cartesian):
+        def __call__(self, state, setpoint, qpos, qvel, passive):
+            state, effort = super().__call__(state, setpoint, qpos, qvel, passive)
+            return state, np.where((setpoint == 0).all(1, keepdims=True), np.nan, effort)
+
+    for on_fault in ("hold", "reset"):
+        control = Unclipped(("x", "z"))
+        with make(arm, control, on_invalid_input="contain", on_fault=on_fault) as runner, make(arm, control) as sound:
+            with pytest.warns(FaultWarning):
+                seen = runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
+            seen, expected = runner.step(goals()), (sound.step(goals()), sound.step(goals()))[1]
+            rows = np.arange(N) != 2
+            np.testing.assert_array_equal(seen.qpos[rows], expected.qpos[rows])
+            assert np.isfinite(seen.qpos).all()
+
+
+# -- snapshots --------------------------------------------------------------------------------------------------------
+
+
+def test_a_snapshot_is_for_the_same_command(arm):
+    with make(arm) as runner:
+        runner.step(goals())
+        snapshot = runner.snapshot()
+        expected = runner.step(goals())
+    with make(arm) as runner:
+        runner.restore(snapshot)
+        np.testing.assert_array_equal(runner.step(goals()).qpos, expected.qpos)
+    with (
+        make(arm, Cartesian(("x", "y", "z"))) as other,
+        pytest.raises(InvalidArgumentError, match=r"with command \['x', 'z'\], not \['x', 'y', 'z'\]"),
+    ):
+        other.restore(snapshot)
+
+
+def test_a_snapshot_that_names_an_entry_beyond_the_command_is_refused(arm):
+    with make(arm, on_invalid_input="contain") as runner:
+        with pytest.warns(FaultWarning):
+            runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
+        snapshot = runner.snapshot()
+        snapshot.states.containment["joint"][2] = 2
+        with pytest.raises(InvalidArgumentError, match="names a joint beyond 2"):
+            runner.restore(snapshot)
+
+
+# -- recordings, plots, view ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rollout(arm):
+    """A run of three numbers in a setpoint of two joints."""
+    command = CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
+    setpoints = np.random.default_rng(2).uniform(0.5, 1.1, (12, N, 3))
+    with make(arm, Cartesian(command)) as runner:
+        return runner.rollout(setpoints)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_recordings_hold_names_and_units(arm, rollout, suffix, tmp_path):
+    if suffix == ".h5":
+        pytest.importorskip("h5py")
+    read = read_recording(write_recording(rollout, tmp_path / f"run{suffix}"))
+    assert_identical(read, rollout)
+    assert read.info.command == rollout.info.command == CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
+    assert read.setpoint.shape == (12, N, 3)
+    assert not read.info.sets_positions
+    assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
+
+
+def test_the_recorder_streams_them(arm, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    setpoints = np.random.default_rng(1).uniform(0.5, 1.0, (9, N, 2))
+    with make(arm, workers=2) as runner, Recorder(tmp_path / "run.h5", runner):
+        rollout = runner.rollout(setpoints)
+    read = read_recording(tmp_path / "run.h5")
+    np.testing.assert_array_equal(read.setpoint, setpoints)
+    assert_identical(read, rollout)
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["setpoint"].attrs["unit"].tolist() == ["m", "m"]
+        assert file.attrs["command_names"].tolist() == ["x", "z"]
+
+
+def test_a_labelled_dataset_has_entries(rollout):
+    pytest.importorskip("xarray")
+    from sim.recording.dataset import to_dataset
+
+    data = to_dataset(rollout)
+    assert data.setpoint.dims == ("time", "env", "entry")
+    assert data.setpoint.sel(entry="z").shape == (12, N)
+    assert data.entry_unit.values.tolist() == ["m", "m", ""]
+    assert data.qpos.dims == ("time", "env", "joint")
+
+
+def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
+    titles = ["shoulder", "elbow", "setpoint x [m]", "setpoint z [m]", "setpoint gain <b>"]
+    figure = plots.step_responses(rollout, mark=1)
+    named = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_title(loc="left")}
+    assert list(named) == titles
+    lines = named["setpoint z [m]"].get_lines()
+    np.testing.assert_array_equal([line.get_ydata() for line in lines], rollout.setpoint[..., 1].T)
+    assert plots.save(figure, tmp_path / "picture.png").is_file()
+    for other in (plots.efforts(rollout), plots.comparison(rollout, rollout)):
+        assert [axes.get_title(loc="left") for axes in other.axes if axes.get_title(loc="left")] == titles[:2]
+
+
+def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
+    pytest.importorskip("viser")
+    from sim.view import Playback, View
+
+    playback = Playback(rollout, arm)
+    view = View(playback, port=18090)
+    try:
+        shown = []
+        assert view.panel._entries is not None
+        view.panel._entries = SimpleNamespace(content="")
+        for _ in range(3):
+            playback.advance()
+            view._show(playback.frame(), 0)
+            shown.append(view.panel._entries.content)
+        numbers = playback.frame().setpoint[0, 0]
+        assert f"x {numbers[0]:.4g} m, z {numbers[1]:.4g} m, gain &lt;b&gt; {numbers[2]:.4g}<" in shown[-1]
+        assert not view.panel._show_setpoint.handle.visible
+        assert not view._charts._error.visible
+        assert not any(node.visible for node in view._scene._setpoints)
+    finally:
+        view.close()
+
+
+def test_identification_and_metrics_refuse_such_runs(arm, rollout):
+    from sim.tuning.evaluation import step_response_metrics
+    from sim.tuning.identification.logs import logs_of_rollout
+
+    with pytest.raises(InvalidArgumentError, match=r"setpoints of x, z, gain <b>, not of joints"):
+        step_response_metrics(arm, rollout, np.zeros((N, 2)))
+    with pytest.raises(InvalidArgumentError, match=r"setpoints of x, z, gain <b>, not of joints"):
+        logs_of_rollout(arm, rollout)
+
+
+# -- Gymnasium --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("actions", ["setpoint", "increment"])
+def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
+    pytest.importorskip("gymnasium")
+    from sim.gym import ReachVectorEnv
+
+    increment = {"max_increment": [0.05, 0.1]} if actions == "increment" else {}
+    env = ReachVectorEnv(3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment)
+    given = []
+    send = env.runner.send
+    env.runner.send = lambda setpoint: given.append(setpoint) or send(setpoint)
+    assert env.single_action_space.shape == (2,)
+    assert env.single_observation_space.shape == (6,)
+    env.reset(seed=1)
+    for _ in range(6):
+        env.step(np.tile([1.0, -1.0], (3, 1)))
+    if actions == "setpoint":
+        np.testing.assert_array_equal(given[0], [[1.2, 0.3]] * 3)
+    else:
+        np.testing.assert_allclose(given[0], [[0.85, 0.7]] * 3)
+        np.testing.assert_allclose(given[3], [[1.0, 0.4]] * 3)
+        np.testing.assert_allclose(given[5], [[0.85, 0.7]] * 3)  # from the neutral setpoint of the next episode
+    with pytest.raises(InvalidArgumentError, match="actions, entry 'z', env 2"):
+        env.step(np.array([[0, 0], [0, 0], [0, np.nan]]))
+    env.close()
+
+
+def test_gymnasium_needs_bounds_and_increments(arm):
+    pytest.importorskip("gymnasium")
+    from sim.gym import ReachVectorEnv
+
+    with pytest.raises(InvalidArgumentError, match=r"^control, entry 'x': has no bounds"):
+        ReachVectorEnv(1, arm, control=Cartesian(("x", "z")), workers=0)
+    with pytest.raises(InvalidArgumentError, match=r"^max_increment: is needed.* x, z"):
+        ReachVectorEnv(1, arm, control=Cartesian(), actions="increment", workers=0)
+
+
+def test_the_single_gymnasium_env(arm):
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    from sim.gym import ReachEnv
+
+    env = ReachEnv(arm, control=Cartesian())
+    check_env(env, skip_render_check=True)
+    env.close()
