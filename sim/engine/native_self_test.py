@@ -1,6 +1,6 @@
 """Self-test of the native extensions, in a separate process: a result that differs from Python's is a failure.
 
-Calls into SAPIEN, sim steps and programs are compared bit by bit. The dynamics of many robots are compared with
+Calls into SAPIEN, sim steps, ticks and programs are compared bit by bit. The dynamics of many robots are compared with
 Pinocchio, which rounds differently, within a tolerance.
 """
 
@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import first_difference
+from batchpid.native.tracing import trace
 from sim.engine.batch_dynamics import (
     Friction,
     MovingJoints,
     NativeBatchDynamics,
     PinocchioBatchDynamics,
 )
-from sim.engine.native import python_calls
+from sim.engine.native import extension, python_calls
+from sim.engine.native.native_tick import NativeTick
 from sim.engine.sapien.building import build_scene, new_system
 from sim.engine.sapien.calls import PythonCalls
 from sim.engine.sapien.dynamics import Dynamics
@@ -52,6 +55,7 @@ def main() -> None:
     _compare_programs()
     _compare_calls()
     _compare_steps()
+    _compare_ticks()
     _compare_dynamics()
 
 
@@ -118,6 +122,48 @@ def _compare_steps() -> None:
             raise AssertionError("native and Python sim steps give different results")
     if not looks:
         raise AssertionError("no contact was listed")
+
+
+def _compare_ticks() -> None:
+    """Compare a native tick with its program and its native sim steps, called from Python one after another."""
+    every, shape = 3, (4, 2)
+    target = np.linspace((0.2, 0.1), (0.8, 0.3), 4)
+
+    def law(goal: Any, matrix: Any, qpos: Any, qvel: Any) -> list[Any]:
+        wanted = 30.0 * (goal - qpos) - 5.0 * qvel
+        return [(matrix * wanted[:, None, :]).sum(axis=-1)]
+
+    bodies = Dynamics(replace(_spec(), ground=False)).bodies
+    tree, table, armature = np.ascontiguousarray(bodies.tree, np.int32), bodies.table(), np.array([0.1, 0.2])
+    results = []
+    for in_ticks in (True, False):
+        pack = Pack(_spec(), 4, system_size=2)
+        qpos, qvel, passive, before, qf = np.zeros((5, *shape))
+        matrix, done = np.zeros((4, 2, 2)), 0
+        program = ArrayProgram(trace(law, 1, 3), [target], 3, shape)
+        arrays = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
+        own: dict[str, Any] = {"matrix": matrix, "tree": tree, "bodies": table, "armature": armature}
+        inputs = (matrix, qpos, qvel)
+        tick = NativeTick(program, inputs, (qf,), timestep=1e-2, matrix_steps=every, whole=True, **arrays, **own)
+        while done < STEPS:
+            step = pack.compiled_step(True, True, True, None)
+            if in_ticks:
+                done, status = tick.run(step.prepare(), done, STEPS, STEPS)
+            else:
+                if done % every == 0:
+                    ahead = 0.5 * (min(every, STEPS - done) - 1) * 1e-2
+                    extension("_gateway").mass_matrices(tree, table, qpos + ahead * qvel, matrix, *shape)
+                    matrix += np.diag(armature)
+                program(*inputs, out=(qf,))
+                status, done = step(qf, qpos, qvel, passive), done + 1
+            if status:
+                pack.look(step.left())
+        results.append([qpos, qvel, passive, qf, matrix])
+    for ours, theirs in zip(*results, strict=True):
+        if ours.tobytes() != theirs.tobytes():
+            raise AssertionError("native ticks and their parts give different results")
+    if not np.abs(results[0][0]).max() > 0.1:
+        raise AssertionError("no robot moved in a native tick")
 
 
 def _compare_calls() -> None:

@@ -8,7 +8,6 @@ at which the friction model takes the mass matrix.
 
 from __future__ import annotations
 
-import ctypes
 from functools import lru_cache
 from typing import Any
 
@@ -18,9 +17,9 @@ from numpy.typing import NDArray
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.tracing import Symbol, Trace, trace
-from sim.engine import native
 from sim.engine.engines import scene_dynamics
-from sim.engine.native.interface import STATUS, Tick
+from sim.engine.native.interface import STATUS
+from sim.engine.native.native_tick import NativeTick
 from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from sim.loop.arrays import Command
 from sim.loop.control_step import (
@@ -42,8 +41,6 @@ Float64 = NDArray[np.float64]
 
 LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
 """Bits of the status of a sim step after which an env may have failed."""
-FULL, MATRIX = 3, 4
-"""Numbers of shapes in program.h: (rows, columns), and a matrix for each row."""
 
 
 class NativeExecutor(NumPyExecutor):
@@ -171,28 +168,16 @@ class TickProgram:
         program = ArrayProgram(traced, leaves(constants), len(given), shape)
         results = [*leaves(fixed._replace(matrix=None)), self.outputs.qf, self.outputs.motor, self.outputs.saturated]
         results += [] if guarded is None else [guarded]
-        self._native = native.extension("_gateway")
-        pairs = tuple([(leaf, FULL if leaf.ndim == 2 else MATRIX) for leaf in given])
-        self._program = self._native.bind(program.arguments, pairs, tuple(results))
         arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
         if matrix is not None:
             bodies = scene_dynamics(pack.spec).bodies
-            arrays |= {
-                "matrix": self.state.matrix,
-                "tree": np.ascontiguousarray(bodies.tree, np.int32),
-                "bodies": bodies.table(),
-            }
-            more = {"armature": constants.armature, "damping": constants.damping}
-            arrays |= {name: np.ascontiguousarray(leaf, np.float64) for name, leaf in more.items() if leaf is not None}
-        self._tick = Tick(
-            timestep=constants.timestep,
-            dof=pack.dof,
-            whole=law is not None and law.whole,
-            matrix_steps=MASS_MATRIX_STEPS,
-            **{name: array.ctypes.data for name, array in arrays.items()},
+            tree = np.ascontiguousarray(bodies.tree, np.int32)
+            arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
+            arrays |= {"armature": constants.armature, "damping": constants.damping}
+        whole = law is not None and law.whole
+        self._tick = NativeTick(
+            program, given, results, timestep=constants.timestep, matrix_steps=MASS_MATRIX_STEPS, whole=whole, **arrays
         )
-        self._kept = given, results, arrays
-        self._address = ctypes.addressof(self._tick)
 
     def load(self, state: StepState, measured: Measured, command: Command) -> None:
         """Copy what is not in these arrays already."""
@@ -208,7 +193,7 @@ class TickProgram:
 
     def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
         """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the status."""
-        done, status = self._native.tick(self._program, self._address, step.prepare(), begin, until, end)
+        done, status = self._tick.run(step.prepare(), begin, until, end)
         if self.state.age is not None:
             self.state.age[...] += done - begin
         return done, status

@@ -29,10 +29,11 @@ OTHERS = {
     "BODY": interface.BODY | {"mass": 2},
     "DYNAMICS": interface.DYNAMICS[::-1],
     "STEP": interface.STEP[::-1],
+    "Tick": type("Tick", (ctypes.Structure,), {"_fields_": interface.Tick._fields_[::-1]}),
     "Group": type("Group", (ctypes.Structure,), {"_fields_": interface.Group._fields_[::-1]}),
 }
 USERS = {
-    "_gateway": {"SYMBOLS", "STATUS", "BODY", "Group"},
+    "_gateway": {"SYMBOLS", "STATUS", "BODY", "Tick", "Group"},
     "_batch_dynamics": {"BODY", "DYNAMICS", "STEP"},
 }
 

@@ -1,0 +1,71 @@
+"""Sim steps of a tick in one native call: a program of the control step, mass matrices, and the engine; see tick.h."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.native.array_program import ArrayProgram
+from sim.engine import native
+from sim.engine.native.interface import Tick
+
+FULL, MATRIX = 3, 4
+"""Numbers of shapes in program.h: (rows, columns), and a matrix for each row."""
+
+
+class NativeTick:
+    """Sim steps of a pack under a program, on arrays that stay the same.
+
+    Parameters
+    ----------
+    program
+        Program of the control step for the pack's envs.
+    inputs, outputs
+        Arrays that it reads and writes, (envs, dof), or (envs, dof, dof) for a matrix.
+    timestep
+        [s]
+    matrix_steps
+        Sim steps for which a mass matrix is kept within a tick.
+    whole
+        Whether ``matrix`` is the whole mass matrix or its diagonal.
+    arrays
+        Of the fields of :class:`sim.engine.native.interface.Tick`: the reading ``qpos``, ``qvel`` and ``passive``, the
+        positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``, ``tree`` and
+        ``bodies`` (:class:`sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping`` (dof,).
+    """
+
+    def __init__(
+        self,
+        program: ArrayProgram,
+        inputs: Sequence[NDArray[Any]],
+        outputs: Sequence[NDArray[Any]],
+        *,
+        timestep: float,
+        matrix_steps: int = 1,
+        whole: bool = False,
+        **arrays: NDArray[Any] | None,
+    ) -> None:
+        given = {name: array for name, array in arrays.items() if array is not None}
+        types = {name: np.int32 if name == "tree" else np.float64 for name in given}
+        for name, array in given.items():
+            if array.dtype != types[name] or not array.flags.c_contiguous:
+                raise ValueError(f"{name} is no contiguous array of {np.dtype(types[name])}")
+        self._native = native.extension("_gateway")
+        pairs = tuple([(array, FULL if array.ndim == 2 else MATRIX) for array in inputs])
+        self._program = self._native.bind(program.arguments, pairs, tuple(outputs))
+        addresses = {name: array.ctypes.data for name, array in given.items()}
+        dof = program.shape[1]
+        self._tick = Tick(timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, **addresses)
+        self._address = ctypes.addressof(self._tick)
+        self._kept = inputs, outputs, given
+
+    def run(self, group: int, begin: int, until: int, end: int) -> tuple[int, int]:
+        """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the last status.
+
+        ``group`` is the address of the native group: :meth:`sim.engine.protocol.CompiledStep.prepare`.
+        """
+        return self._native.tick(self._program, self._address, group, begin, until, end)
