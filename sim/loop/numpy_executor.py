@@ -13,7 +13,7 @@ from batchpid.errors import ControllerError
 from sim.engine import native
 from sim.engine.engines import scene_dynamics
 from sim.engine.native_mass_matrix import NativeMassMatrix
-from sim.engine.protocol import DrivenPack, EnginePack, RobotModel
+from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
 from sim.loop.arrays import Command
 from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from sim.loop.custom import OwnController
@@ -141,7 +141,7 @@ def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
 
     Where the extension is used, every executor takes its mass matrix: the last bits of Pinocchio's differ.
     """
-    if pack.spec.fixed_base and native.status().active:
+    if isinstance(pack, CompiledPack) and native.status().active:
         return NativeMassMatrix(pack.spec)
 
     @cache
