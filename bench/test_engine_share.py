@@ -1,7 +1,7 @@
-"""Closed loop over the bare engine, in this process: the share of the time that is the engine's own.
+"""Speed of the closed loop relative to the bare engine, in this process: the engine's share of the time.
 
 Pandas under their default gains (mass matrix) and the URDF's friction, held at several poses. The bare engine steps the
-same robots at the same poses under PhysX's drives, pack by pack. Processor time: another program disturbs it less.
+same robots at the same poses under PhysX's drives, pack by pack. Processor times: other programs disturb them less.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class BareEngine:
 
 
 def engine_share(pose, physics, most):
-    """Return the speed of the closed loop over that of the bare engine at one pose, in each round."""
+    """Return the speed of the closed loop relative to the bare engine at one pose, for each round."""
     envs, ticks, rounds = min(ENVS, most.envs), min(TICKS, most.ticks), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load("panda"), envs, workers=0, physics=physics, ticks=ticks)
     bare, found = BareEngine(workload, pose), []

@@ -18,13 +18,13 @@ from batchpid.validate import array, entries
 class CommandSpec:
     """Names, units and bounds of the numbers in a setpoint of one env.
 
-    A :class:`sim.Controller` has one as its attribute ``command`` if its setpoints are not one number for each joint.
-    Specs are equal if their names and units are.
+    A :class:`sim.Controller` whose setpoints are not one number per joint has a spec as its attribute ``command``.
+    Two specs are equal if their names and units are equal.
 
     Raises
     ------
     InvalidArgumentError
-        Names repeat, or a field has not one entry for each name.
+        Names repeat, or a field does not have one entry per name.
     """
 
     names: tuple[str, ...]
@@ -37,7 +37,7 @@ class CommandSpec:
     upper: ArrayLike = field(default=math.inf, compare=False)
     """Upper bounds (size,)."""
     neutral: ArrayLike | None = field(default=None, compare=False)
-    """Finite setpoint (size,) that the control is given for an env that has failed; default 0, within the bounds."""
+    """Finite setpoint (size,) for an env that has failed; default 0, clipped to the bounds."""
 
     def __post_init__(self) -> None:
         names = _texts("names", self.names)
@@ -73,9 +73,9 @@ class CommandSpec:
 
 
 def joint_command(joint_names: Sequence[str], units: Sequence[str], control: object) -> CommandSpec:
-    """Return the command of a control without one of its own: joint efforts under control "effort", else positions.
+    """Return the default command of a control: joint efforts under control "effort", else joint positions.
 
-    ``units`` are those of the joints' positions, "rad" or "m".
+    ``units`` are the units of the joint positions, "rad" or "m".
     """
     of_joints = ["N" if unit == "m" else "N m" for unit in units] if control == "effort" else units
     return CommandSpec(tuple(joint_names), tuple(of_joints))
@@ -87,7 +87,7 @@ def own_command(control: object) -> CommandSpec | None:
     Raises
     ------
     InvalidArgumentError
-        It is neither a CommandSpec nor a sequence of names.
+        The attribute is neither a CommandSpec nor a sequence of names.
     """
     given = None if isinstance(control, str) else getattr(control, "command", None)
     if given is None or isinstance(given, CommandSpec):

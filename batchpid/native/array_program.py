@@ -2,8 +2,8 @@
 
 With few envs, the overhead of a NumPy call is a hundred times its computation; with many, each call moves whole arrays
 to and from memory. A function is traced (:mod:`batchpid.native.tracing`), and the recorded operations are the program.
-It works through the rows in blocks that stay in the cache. Each operation is rounded as in NumPy, so that results are
-bit-identical, except for the sign of a NaN, which means nothing. There are no floating-point warnings.
+The program processes the rows in blocks that stay in the cache. Each operation is rounded as in NumPy, so results are
+bit-identical, except for the sign of a NaN, which has no meaning. Programs give no floating-point warnings.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from batchpid.native.operations import PROGRAM
 from batchpid.native.tracing import Trace
 
 NUMBERS_PER_THREAD = 2**17
-"""Numbers of an array for which a further thread is worth its start (50 us)."""
+"""Least share of an array, in numbers, for which another thread is worth its start (50 us)."""
 
 
 @cache
 def interpreter() -> Any:
-    """Return the extension, which has been told the types of NumPy; errors as :func:`extensions.load`."""
+    """Return the extension, initialised with NumPy's array type; errors as in :func:`extensions.load`."""
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
     rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
@@ -38,7 +38,7 @@ def interpreter() -> Any:
 
 
 def threads_for(numbers: int, threads: int | None = None) -> int:
-    """Return the number of threads for arrays of so many numbers: at most ``threads``, or the cores it may use."""
+    """Return the number of threads for arrays of ``numbers`` numbers: at most ``threads``, or the cores available."""
     most = numbers // NUMBERS_PER_THREAD
     if most < 2:
         return 1
@@ -50,7 +50,7 @@ def threads_for(numbers: int, threads: int | None = None) -> int:
 class ArrayProgram:
     """A trace with its first inputs fixed to ``constants``, for arrays (rows, columns) = ``shape`` of one dtype.
 
-    An array of constants is (rows, columns), (1, columns) or a number. ``inputs`` is the number of other inputs,
+    A constant is an array (rows, columns) or (1, columns), or a number. ``inputs`` is the number of other inputs,
     ``threads`` the largest number of threads (None: the cores that this process may use).
     """
 
@@ -77,11 +77,11 @@ class ArrayProgram:
         self._threads = threads_for(shape[0] * shape[1], threads)
 
     def __call__(self, *arrays: NDArray[Any], out: Sequence[NDArray[Any]] | None = None) -> Sequence[NDArray[Any]]:
-        """Return the results for the other inputs: new arrays, or ``out``, which is written to.
+        """Return the results for the other inputs, in new arrays or in ``out``.
 
         An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns) for products of
         matrices and vectors. An array of ``out`` is (rows, columns), of dtype bool for masks. It may be an input of
-        that shape, and may not overlap with another one.
+        that shape, and must not overlap any other array.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class ArrayProgram:
             out = [np.empty(self.shape, bool if is_mask else self.dtype) for is_mask in self.masks]
         try:
             self._run(self._program, self.shape[0], arrays, tuple(out), self._threads)
-        except ValueError:  # the extension takes NumPy's own class alone, contiguous and aligned
+        except ValueError:  # the extension takes plain ndarrays only, contiguous and aligned
             plain = tuple([np.asarray(np.require(each, requirements=["C", "A"])) for each in arrays])
             self._run(self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads)
         return out
@@ -100,17 +100,17 @@ class ArrayProgram:
     def bind(
         self, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]], given: int, full: int
     ) -> Callable[..., Any]:
-        """Return a fast call with the first inputs, and all outputs but the last, fixed to these arrays.
+        """Return a fast function with the first inputs, and all outputs but the last, fixed to these arrays.
 
-        The function is called with ``out`` and the further inputs, or None for each. It returns ``out``, or a new
-        array; or NotImplemented, having done nothing, if an array needs a check or conversion in Python.
+        Its arguments are ``out`` and the further inputs, each an array or None. It returns ``out`` or a new array. If
+        an array needs a check or conversion in Python, it does nothing and returns NotImplemented.
 
         Parameters
         ----------
         given
-            Bits of the further inputs that are arrays and not None.
+            Bit mask of the further inputs that are arrays (not None).
         full
-            Bits of the further inputs that have to be (rows, columns).
+            Bit mask of the further inputs that must be (rows, columns).
         """
         native, new = interpreter(), (self.shape, self.dtype)
         fixed = self._program, self.shape[0], tuple(inputs), tuple(outputs)

@@ -28,7 +28,7 @@ class ProgramStatus(NamedTuple):
 
 
 def program_status() -> ProgramStatus:
-    """Return whether native programs are used; a fault of the installation is one RuntimeWarning per process."""
+    """Return whether native programs are used; a faulty installation gives one RuntimeWarning per process."""
     if os.environ.get(SWITCH) == "0":
         return ProgramStatus(False, f"native programs are switched off by {SWITCH}=0")
     return _judged()
@@ -52,7 +52,7 @@ def _judged() -> ProgramStatus:
 
 
 def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
-    """Return the results of all operations of programs on arrays (rows, columns) and a matrix for each row."""
+    """Apply all operations of programs to arrays (rows, columns) and a matrix for each row; return the results."""
     xp = a.__array_namespace__()
     masks = a > b, a >= b, a < b, a <= b, a == b, a != b, xp.isfinite(a)
     some = (a > b) & (b < c), (a > b) | (b < c), ~(a > b)
@@ -65,7 +65,7 @@ def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
 
 
 def first_difference() -> str | None:
-    """Return how results of programs of all operations differ from NumPy's, or None: a millisecond.
+    """Return the first difference between native and NumPy's results of all operations, or None: takes 1 ms.
 
     Some inputs are zero, infinite or NaN.
     """
@@ -85,5 +85,5 @@ def first_difference() -> str | None:
 
 
 def _bits(array: Any) -> tuple[Any, bytes]:
-    """Return dtype and bytes of an array, with one NaN for all: their sign means nothing."""
+    """Return dtype and bytes of an array, with one value for all NaN, since their sign has no meaning."""
     return array.dtype, np.where(np.isnan(array), np.nan, array).tobytes()

@@ -1,4 +1,4 @@
-"""The law with its state as a native program, traced from :func:`batchpid.advance`, which is its only definition."""
+"""The law and its state as a native program, traced from :func:`batchpid.advance`, the only definition."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from batchpid.native.tracing import Symbol, Trace, trace
 from batchpid.state import PIDState, Terms
 
 _MEASUREMENT = 1
-"""Number of the measurement among the inputs: the one that is (envs, joints)."""
+"""Index of the measurement among the inputs: the only input that must be (envs, joints)."""
 
 
 @lru_cache(maxsize=256)
 def _trace(structures: tuple[tuple[Any, ...], ...], terms: bool, dtype: Any) -> tuple[Trace, tuple[int, ...]]:
-    """Return the trace of the law, and the leaves of the state that it returns before its other results.
+    """Return the law's trace, and the indices of the state leaves that it returns before its other results.
 
-    ``structures`` are those of coefficients, state and inputs: ``...`` in place of each array, None where one is
-    missing, or a choice of the law, which compares by its type.
+    ``structures`` describe coefficients, state and inputs: ``...`` for each array, None for a missing one, and the
+    choices of the law, which compare by type.
     """
     kept: list[int] = []
 
@@ -51,7 +51,7 @@ class CompiledLaw:
         self._programs: dict[tuple[bool, ...], tuple[ArrayProgram, tuple[int, ...]]] = {}
 
     def _program(self, leaves: tuple[Any, ...], size: int) -> tuple[ArrayProgram, tuple[int, ...]]:
-        """Return the program for a state of ``size`` leaves and inputs, and the leaves of the state that it returns."""
+        """Return the program for a state of ``size`` leaves and inputs, and the state indices that it returns."""
         key = tuple([leaf is None for leaf in leaves])
         if key not in self._programs:
             structures = tuple(map(_structure, (self._k, leaves[:size], leaves[size:])))
@@ -65,9 +65,9 @@ class CompiledLaw:
     def step(
         self, state: PIDState, inputs: tuple[NDArray[Any] | None, ...], out: NDArray[Any] | None
     ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any] | None]:
-        """Advance the law; return the new state, the effort, the terms, and a fast call of the following steps.
+        """Advance the law; return the new state, the effort, the terms, and a fast function for the next steps.
 
-        The arrays of ``state`` are written to and are those of the new state. The fast call advances this state in
+        The new state is written into the arrays of ``state``. The fast function advances this state in
         place, for ``out`` and the same kinds of inputs: see :meth:`ArrayProgram.bind`.
         """
         given = [each for each in inputs if each is not None]

@@ -1,4 +1,4 @@
-// Module of an extension, with the digests of what it was built from; see extensions.py.
+// Module of an extension, with digests of its tables and sources; see extensions.py.
 
 #pragma once
 

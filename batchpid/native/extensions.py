@@ -1,9 +1,9 @@
 """Native extensions: their files, digests, and loading of those that were built from the present files.
 
-C++ code repeats tables of the Python code, so an extension works with the Python code that it was built with and with
-no other. ``setup.py`` compiles a digest of the tables and one of the sources into each extension, and :func:`load`
+C++ code repeats tables of the Python code, so an extension works only with the Python code that it was built
+with. ``setup.py`` compiles a digest of the tables and one of the sources into each extension, and :func:`load`
 compares them. ``setup.py`` imports this module without its package, before NumPy is installed: it may import the
-standard library only. The modules that define extensions may import it, too.
+standard library only. Modules that define extensions may import this one.
 """
 
 from __future__ import annotations

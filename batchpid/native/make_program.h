@@ -1,4 +1,4 @@
-// A Program from the arguments that Python gives (ArrayProgram.arguments in array_program.py).
+// Makes a Program from Python's arguments: ArrayProgram.arguments in array_program.py.
 
 #pragma once
 
@@ -24,7 +24,7 @@ inline std::nullptr_t misfit() {
   return nullptr;
 }
 
-// Add a constant of one number, one row, or all rows, which is copied.
+// Add a copy of a constant: one number, one row, or all rows.
 template <class T>
 bool add_constant(Program &program, Py_buffer const &view) {
   Index const columns = program.columns, size = view.len / static_cast<Index>(sizeof(T));
@@ -41,7 +41,7 @@ bool add_constant(Program &program, Py_buffer const &view) {
 }
 
 // Arguments: operations, results (bytes of int32), registers, inputs, constants (a tuple of contiguous arrays), rows,
-// columns, single. Return null with an exception of Python if they do not fit.
+// columns, single. Return null with a Python exception if they do not fit.
 inline std::unique_ptr<Program> make_program(PyObject *arguments) {
   char const *operations, *results;
   Py_ssize_t operations_size, results_size;
@@ -57,7 +57,7 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
   program->results = values_of<std::int32_t>(results, results_size);
   program->single = single != 0;
   if (program->rows < 1 || program->columns < 1) return misfit();
-  // Whole vectors of numbers, unless the rows are long.
+  // A multiple of 8 numbers (whole SIMD vectors), unless the rows are long.
   program->chunk = program->columns;
   while (program->chunk < CHUNK || (program->chunk < 4 * CHUNK && program->chunk % 8)) program->chunk += program->columns;
   Py_ssize_t const count = PyTuple_Size(constants);
@@ -94,7 +94,7 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
     for (Index i = 0; i < all; ++i) {
       auto const &[code, out, operands] = program->operations[static_cast<std::size_t>(i)];
       if (!std::count(operands, operands + 3, number)) continue;
-      bool const is_elementwise = code != ROW_MINIMUM && code != MATRIX_VECTOR;  // these read on after a first write
+      bool const is_elementwise = code != ROW_MINIMUM && code != MATRIX_VECTOR;  // the others read after the first write
       last = std::max(last, is_elementwise ? i : i + 1);
     }
     program->last_use.push_back(last);

@@ -7,10 +7,10 @@ using namespace batchpid;
 namespace {
 
 constexpr char PROGRAM[] = "batchpid.program", BOUND[] = "batchpid.bound_program";
-constexpr Index WITH_LOCK = 1 << 14;  // numbers up to which the interpreter's lock is kept: a few microseconds
+constexpr Index WITH_LOCK = 1 << 14;  // most numbers computed with the GIL held: a few microseconds
 
 // First fields of a dtype and of an array of NumPy: _PyArray_DescrNumPy2 and PyArrayObject_fields in
-// numpy/ndarraytypes.h, whose layouts all extensions compiled for NumPy 2 rely on. A buffer of Python would cost 0.2 us
+// numpy/ndarraytypes.h. All extensions compiled for NumPy 2 rely on their layouts. A Python buffer would cost 0.2 us
 // per array, more than the law of a few envs.
 struct Dtype {
   PyObject head;
@@ -33,7 +33,7 @@ constexpr int BOOL = 0, FLOAT = 11, DOUBLE = 12;  // numbers of dtypes
 PyTypeObject *array_type;
 PyObject *make_empty;
 
-// use(ndarray, empty): a type and a function of NumPy, which the process keeps.
+// use(ndarray, empty): a type and a function of NumPy, kept until the process ends.
 PyObject *use(PyObject *, PyObject *arguments) {
   PyObject *type;
   if (!PyArg_ParseTuple(arguments, "OO", &type, &make_empty)) return nullptr;
@@ -42,7 +42,7 @@ PyObject *use(PyObject *, PyObject *arguments) {
   Py_RETURN_NONE;
 }
 
-// Return the array in an object, or null: its class is NumPy's own, and it is contiguous, aligned and of this dtype.
+// Return the array in an object; null unless its class is ndarray itself and it is contiguous, aligned, of this dtype.
 Array const *array_of(PyObject *object, int dtype) {
   if (Py_TYPE(object) != array_type) return nullptr;
   auto const *array = reinterpret_cast<Array const *>(object);
@@ -51,8 +51,8 @@ Array const *array_of(PyObject *object, int dtype) {
   return array->dtype->number == dtype && is_native && (array->flags & needed) == needed ? array : nullptr;
 }
 
-// look(array): address, shape, number of the dtype, and whether it can be written to, as this module reads them; None of
-// an array that is not contiguous.
+// look(array): address, shape, number of the dtype, and whether it is writeable, as read by this module; None for an
+// array that is not contiguous or not (rows, columns).
 PyObject *look(PyObject *, PyObject *object) {
   int const dtype = Py_TYPE(object) == array_type ? reinterpret_cast<Array const *>(object)->dtype->number : BOOL;
   auto const *array = array_of(object, dtype);
@@ -92,7 +92,7 @@ bool read_output(Program const &program, Index rows, PyObject *object, Output &o
   return array->shape[0] == rows && array->shape[1] == program.columns;
 }
 
-// Return whether an output overlaps with another array than an input of its shape that is the same memory.
+// Return whether an output overlaps an input. An input of the output's shape at the same address is allowed.
 bool overlaps(Program const &program, Index rows, Output const &output, Input const &input) {
   Index const columns = program.columns, itemsize = program.itemsize();
   Index const sizes[] = {1, columns, rows, rows * columns, rows * columns * columns};
@@ -179,7 +179,7 @@ PyObject *run_arrays(PyObject *, PyObject *arguments) {
   Py_RETURN_NONE;
 }
 
-// Program whose first inputs, and outputs but for the last, are the same arrays in each call.
+// Program with fixed arrays for its first inputs and for all outputs but the last.
 struct Bound {
   PyObject *kept;    // arguments of bind, among them the program and the arrays
   PyObject *output;  // arguments of numpy.empty
@@ -192,9 +192,9 @@ struct Bound {
 };
 constexpr std::size_t MOST = 32;  // inputs, outputs
 
-// bind(program, rows, inputs, outputs, given, full, output, threads): the first inputs and outputs; as bits, which of
-// the further inputs are arrays and not None, and which of these are (rows, columns); arguments of numpy.empty for the
-// last output.
+// bind(program, rows, inputs, outputs, given, full, output, threads): fix the first inputs and outputs. Bits of `given`
+// mark further inputs that are arrays (not None), bits of `full` those that must be (rows, columns). `output` holds the
+// arguments of numpy.empty for the last output.
 PyObject *bind(PyObject *, PyObject *arguments) {
   PyObject *capsule, *read, *written;
   auto bound = std::make_unique<Bound>();
@@ -222,8 +222,8 @@ PyObject *bind(PyObject *, PyObject *arguments) {
   });
 }
 
-// call(bound, out, *arrays): write and return the last output, a new array if out is None. Return NotImplemented, and do
-// nothing, if an array is not an ordinary one of a shape that broadcasts.
+// call(bound, out, *arrays): write and return the last output, a new array if out is None. Do nothing and return
+// NotImplemented if an array is not a plain ndarray of a shape that broadcasts.
 PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
   auto *bound = static_cast<Bound *>(PyCapsule_GetPointer(arguments[0], BOUND));
   if (bound == nullptr) return nullptr;

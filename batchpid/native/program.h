@@ -1,12 +1,12 @@
 // Programs of operations on arrays (rows, columns), such as the control law of many envs: traced in Python
-// (tracing.py), run here on plain pointers. No call of Python, no exception, and no allocation after a thread's first
-// run. Every operation is rounded as NumPy's, in float or double.
+// (tracing.py), run here on plain pointers. No Python calls, no exceptions, and no allocation after a thread's first
+// run. Every operation is rounded as in NumPy, in float or double.
 //
-// Rows are worked through in blocks that stay in the cache. An input of a block is read before an output of the same
-// memory is written, so an output may be the same array as an input of its shape (state in place). Other overlaps are not
+// Rows are processed in blocks that stay in the cache. In a block, an input is read before an output at its address is
+// written. An output may therefore be the same array as an input of its shape (state in place). No other overlap is
 // allowed.
 //
-// Flags: -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math, and nothing of -ffast-math beyond.
+// Flags: -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math, and no other part of -ffast-math.
 
 #pragma once
 
@@ -59,18 +59,18 @@ struct Output {
   bool is_mask;  // bytes 0 and 1
 };
 
-// Numbers that a loop over a block passes at once, at least; a row that all rows share is repeated to that length.
+// Least length of an inner loop over a block. A row that all rows share is repeated to at least this length.
 constexpr Index CHUNK = 128;
 constexpr Index BLOCK = 8192;  // bytes of a register in a block
 
-// Registers are numbered: constants, inputs, temporaries. Immutable once made: any number of threads may run it.
+// Registers are numbered: constants, inputs, temporaries. A Program is immutable, so any number of threads may run it.
 struct Program {
   bool single = false;  // float, else double
   Index columns = 0, chunk = 0, inputs = 0, registers = 0;
   Index rows = 0;  // of constants (rows, columns)
   std::vector<Operation> operations;
   std::vector<std::int32_t> results;           // register of each output
-  std::vector<Index> made;                     // number of the operation that makes each result; -1: an operand, or twice
+  std::vector<Index> made;                     // operation that makes each result; negative: an operand, or twice
   std::vector<Index> last_use;                 // number of the last operation that reads each input
   std::vector<Shape> shapes;                   // of constants: ROW, repeated to a chunk, or FULL
   std::vector<std::vector<double>> constants;  // of numbers of the program's type
@@ -83,10 +83,10 @@ namespace detail {
 template <class T>
 struct Operand {
   T const *data;
-  Index step;  // numbers to the next chunk; 0: each chunk is the same
+  Index step;  // numbers to the next chunk; 0 if all chunks are the same
 };
 
-// Sum of n products as NumPy's for n <= 128, added to 0: in order below eight, else eight sums side by side.
+// 0 plus the sum of n products, in NumPy's order for n <= 128: sequential below eight terms, else eight partial sums.
 template <class T>
 BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
   T sum = T(-0.0);
@@ -197,7 +197,7 @@ inline std::size_t work_size(Program const &program, Index block) {
   return static_cast<std::size_t>(program.registers) * sizeof(Operand<double>) + 64 + slots * padded;
 }
 
-// Return whether a result can be made in its output: no input of the same memory is read later on.
+// Return whether a result can be computed in its output: no later operation reads an input at the same address.
 inline bool is_made_in_place(Program const &program, Input const *inputs, Output const *outputs, std::size_t result) {
   Index const made = program.made[result];
   if (made < 0 || outputs[result].is_mask) return false;
@@ -218,7 +218,7 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
   char *area = work_area(work_size(program, block));
   auto *at = reinterpret_cast<Operand<T> *>(area);
   T *slots = reinterpret_cast<T *>(area + (program.registers * sizeof(Operand<T>) + 63) / 64 * 64);
-  for (Index i = 0; i < program.inputs; ++i) {  // those that all blocks share
+  for (Index i = 0; i < program.inputs; ++i) {  // inputs that all blocks share
     T *repeated = slots + i * slot;
     auto const *from = static_cast<T const *>(inputs[i].data);
     at[constants + i] = {repeated, inputs[i].shape == Shape::COLUMN ? chunk : 0};
@@ -276,7 +276,7 @@ inline void run(Program const &program, Input const *inputs, Output const *outpu
   (program.single ? detail::run_single : detail::run_double)(program, inputs, outputs, first_row, rows);
 }
 
-// Run a program on all rows with the help of further threads; the result does not depend on their number.
+// Run a program on all rows, on several threads. The result does not depend on their number.
 inline void run_on_threads(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
   // Rows that a thread takes at once: some blocks, and few enough to keep all threads busy to the end.
   Index const slab = std::max<Index>(1, std::min(4 * BLOCK / program.columns, rows / (4 * threads)));
@@ -290,7 +290,7 @@ inline void run_on_threads(Program const &program, Input const *inputs, Output c
   others.reserve(static_cast<std::size_t>(threads));
   try {
     while (static_cast<int>(others.size()) + 1 < threads) others.emplace_back(work);
-  } catch (std::system_error const &) {  // the system has no more: those that run do all the work
+  } catch (std::system_error const &) {  // no more threads available: the running ones do all the work
   }
   work();
   for (std::thread &other : others) other.join();

@@ -1,4 +1,4 @@
-"""Traces of array functions: the operations that a function makes, recorded by calling it with symbols for arrays."""
+"""Traces of array functions: a call with symbols in place of arrays records the operations of the function."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Namespace:
     def symbol(self, value: Any) -> Symbol:
         """Return the symbol of a number; a symbol is returned unchanged.
 
-        A number is rounded to the arrays' dtype. Under NumPy's promotion a scalar of a wider dtype would not be, which
-        is a TypeError.
+        A number is rounded to the arrays' dtype. A scalar of a wider dtype is a TypeError, because
+        NumPy would promote the arrays instead.
         """
         if isinstance(value, Symbol):
             return value
@@ -50,7 +50,7 @@ class Namespace:
         return lambda *values: self.apply(name, *values)
 
     def atleast_2d(self, value: Any) -> Any:
-        """Return ``value``, which has rows and columns."""
+        """Return ``value``, which already has rows and columns."""
         return value
 
     def zeros_like(self, _: Any) -> Symbol:
@@ -74,11 +74,11 @@ class Symbol:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Dtype of the array: bool, or that of all numbers."""
+        """Dtype of the array: bool for a mask, else the dtype of the trace."""
         return np.dtype(bool) if self.is_mask else self._namespace.dtype
 
     def astype(self, dtype: Any) -> Symbol:
-        """Return the numbers of a mask; a number stays as it is."""
+        """Return a mask as numbers; return numbers unchanged."""
         assert np.dtype(dtype) == self._namespace.dtype
         return self._namespace.apply("add", self, -0.0) if self.is_mask else self
 
@@ -183,12 +183,12 @@ class Trace(NamedTuple):
     results: bytes
     """Register of each result."""
     masks: tuple[bool, ...]
-    """Which results are masks."""
+    """Whether each result is a mask."""
     registers: int
     literals: tuple[float, ...]
     """Literal numbers: further constants, after the given ones."""
     prelude: Trace | None
-    """Operations on constants and literals alone, whose results are further constants."""
+    """Trace of the operations on constants and literals only; its results are further constants."""
 
 
 def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: Any = np.float64) -> Trace:
@@ -199,7 +199,7 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: Any 
     Raises
     ------
     AttributeError, AssertionError, TypeError
-        The function makes an operation that programs do not have.
+        The function uses an operation that programs do not have.
     """
     namespace = Namespace(dtype)
     given = [Symbol(namespace) for _ in range(constants + inputs)]
@@ -236,11 +236,11 @@ _PAIRS = {
     ("subtract", "multiply"): "subtract_multiply",
     ("maximum", "minimum"): "clip",
 }
-"""Pairs of operations that are one, each rounded: fewer passes over a block."""
+"""Pairs of operations that are fused, each still rounded, for fewer passes over a block."""
 
 
 def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operation]:
-    """Return the operations with pairs made one, where nothing else uses the result of the first."""
+    """Return the operations with pairs fused, where the result of the first is used only by the second."""
     uses = Counter(operand for _, operands, _ in operations for operand in operands) + Counter(results)
     found: dict[Symbol, _Operation] = {}
     for name, operands, result in operations:
@@ -264,7 +264,7 @@ def _assembled(
 ) -> Trace:
     """Return a trace of ``operations`` on the symbols ``order``.
 
-    A register is used again after the last use of its number. A result has one of its own, and may be made in place.
+    A register is reused after the last use of its value. Each result has a separate register, and may be made in place.
     """
     places = {symbol: place for place, symbol in enumerate(order)}
     last_use = {operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands}

@@ -18,7 +18,7 @@ def load_engine(name: str = "sapien") -> Engine:
     Raises
     ------
     InvalidArgumentError
-        There is none of this name.
+        No engine has this name.
     """
     engine: Engine = import_module(MODULES[choice("engine", name, MODULES)]).ENGINE
     return engine

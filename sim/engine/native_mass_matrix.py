@@ -14,7 +14,7 @@ from sim.engine.scene_spec import SceneSpec
 
 
 class NativeMassMatrix:
-    """Function of the mass matrices of robots of ``spec``, as native code makes them within a tick."""
+    """Mass matrices of the robot of ``spec``, by the native code that also runs within a tick."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self._spec, self._native = spec, native.extension("_gateway")

@@ -1,9 +1,9 @@
-"""Interface of a physics engine: what loop, robots and tuning ask of it.
+"""Interface between a physics engine and loop, robots and tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning compute with a
 :class:`RobotModel`. :func:`sim.engine.engines.load_engine` returns an :class:`Engine`, which makes both.
 
-What only some engines offer is a capability. :func:`require` raises an error where an engine lacks it.
+A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks it.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ FAILED = 1 << STATUS.index("failed")
 class EnginePack(Protocol):
     """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of its joints, SI units.
 
-    A method that returns an array returns a new one. What an env does depends on its own rows alone: not on the other
-    envs of the pack, nor on their number.
+    A method that returns an array returns a new one. The motion of an env depends on its own rows only, not on other
+    envs of the pack or their number.
 
     Attributes
     ----------
     size, dof
         Number of envs M, and of joints.
     first_env
-        Number of the first env among those of the runner.
+        Number of the first env within the runner.
     qf
-        Efforts last written, in the engine's precision; without those that the engine adds, as for coupled joints.
+        Efforts last written, in the engine's precision, without the engine's constraint efforts of coupled joints.
     friction
         Friction and damping that the loop has to apply to the joints; None where the engine applies them.
     armature
-        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], which is no part of :meth:`joint_mass_matrix`.
+        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in :meth:`joint_mass_matrix`.
     """
 
     spec: SceneSpec
@@ -75,11 +75,11 @@ class EnginePack(Protocol):
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
-        They are those of the model of ``spec`` at the present state, whatever the pack's variation.
+        They come from the model of ``spec`` at the present state, without the pack's variation.
         """
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
+        """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
 
         On a floating base they are the Schur complement by the base's six degrees of freedom.
         """
@@ -90,23 +90,23 @@ class EnginePack(Protocol):
     def step(self, update: bool = True) -> None:
         """Do one sim step of every env. Without ``update`` coupled joints may use the mass matrix of an earlier step.
 
-        A state that is not finite is no error: the loop finds it in what it reads next.
+        A non-finite state raises no error: the loop detects it in its next reading.
         """
 
     def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
         """Place the envs ``rows``: positions and velocities (len(rows), dof); zero efforts, the root at the origin.
 
-        Content of these envs goes back to its start. It recovers an env whose state is not finite.
+        Content of these envs returns to its start. The call recovers an env whose state is not finite.
         """
 
     def suspend(self, mask: Bool) -> None:
-        """Apply zero effort and no gravity to the robots of ``mask`` (M,), and both again to the others."""
+        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the others."""
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Change the robots ``rows`` to ``variation``, one row for each; the pack was made with one.
+        """Change the robots ``rows`` to ``variation``, one row for each; the pack was made with a variation.
 
         Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
         """
@@ -115,9 +115,9 @@ class EnginePack(Protocol):
         """Return the number of values in the state of each env."""
 
     def read_state(self) -> Float64:
-        """Return the state of every env (M, values), of which only the engine knows the meaning, for a snapshot.
+        """Return the state of every env (M, values) for a snapshot; only the engine can interpret it.
 
-        A row holds all that decides about the next steps of a new pack, and NaN after the size of its env.
+        A row determines all later steps of a new pack. Values beyond the size of its env are NaN.
         """
 
     def write_state_rows(self, states: Float64) -> None:
@@ -145,16 +145,16 @@ class DrivenPack(EnginePack, Protocol):
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, which a program of XLA makes (:func:`sim.engine.native.xla.sim_step`)."""
+    """Sim step of a pack as one native call, also from a program of XLA (:func:`sim.engine.native.xla.sim_step`)."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
 
     def __call__(self, *arrays: Float64) -> int:
-        """Do one sim step: (effort, qpos, qvel, passive force), each (envs, dof); return the status."""
+        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return the status."""
 
     def left(self) -> list[int]:
-        """Return the envs that :meth:`CompiledPack.look` has to be told of after the last sim step."""
+        """Return the envs to pass to :meth:`CompiledPack.look` after the last sim step."""
 
     @property
     def message(self) -> str:
@@ -163,30 +163,30 @@ class CompiledStep(Protocol):
 
 @runtime_checkable
 class CompiledPack(EnginePack, Protocol):
-    """Pack whose sim steps native code and programs of XLA can make.
+    """Pack whose sim steps can run in native code and in programs of XLA.
 
     Attributes
     ----------
     steps_read_force
-        Whether a compiled step reads the force of :meth:`passive_force`; otherwise that has to be called.
+        Whether a compiled step reads the passive force; otherwise call :meth:`passive_force`.
     """
 
     steps_read_force: bool
 
     @property
     def calls(self) -> object:
-        """Another object once a :meth:`compiled_step` that was made before is no longer valid."""
+        """Object that is replaced when earlier results of :meth:`compiled_step` become invalid."""
 
     def compiled_step(self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: Any) -> CompiledStep:
         """Return the sim step of the present robots.
 
-        ``gravity`` and ``coriolis`` are the parts of the passive force that it reads; without both it is zero.
-        ``velocities`` tells whether to read velocities; otherwise they are zero. Beyond ``speed_limit`` (dof,), if it
-        is given, the status says so.
+        ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without both it is zero.
+        Without ``velocities`` it reads zero velocities. The status reports speeds above ``speed_limit`` (dof,), if
+        given.
         """
 
     def look(self, left: list[int]) -> None:
-        """Do what Python has to do after a compiled step that stopped, and for the envs ``left``."""
+        """Handle a non-zero status of a compiled step, with the envs ``left`` from :meth:`CompiledStep.left`."""
 
 
 class RobotModel(description.Dynamics, Protocol):
@@ -222,7 +222,7 @@ class ContactRecord(Protocol):
         """Note that the robots of ``mask`` (M,) were placed."""
 
     def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into ``first`` (M,), where that is 0, for robots that overlap at ``qpos`` (M, dof)."""
+        """Write ``step`` into zero entries of ``first`` (M,), for robots with overlaps at ``qpos`` (M, dof)."""
 
 
 class Engine(description.RobotFunctions, Protocol):
@@ -233,7 +233,7 @@ class Engine(description.RobotFunctions, Protocol):
     name
         Value of the option ``engine``.
     capabilities
-        What it offers besides.
+        Its optional features.
     physics
         Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
     """
@@ -264,7 +264,7 @@ class Engine(description.RobotFunctions, Protocol):
         variation
             Differences of the robots from the model; None for robots that :meth:`EnginePack.vary` never changes.
         carrier, links
-            Link of the URDF that carries the payload, and those whose mass or center varies.
+            Link of the URDF that carries the payload, and links whose mass or center of mass varies.
 
         Raises
         ------
@@ -291,4 +291,4 @@ def require(engine: Engine, capability: Capability, argument: str) -> None:
     """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``."""
     if capability not in engine.capabilities:
         problem = f"needs an engine with the capability {capability!r}, which {engine.name!r} does not have"
-        raise InvalidArgumentError(argument, problem, remedy="leave it out, or use the engine 'sapien', which has all")
+        raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien', which has all")

@@ -14,9 +14,9 @@ from sim.robot.parts import Joint
 Float64 = NDArray[np.float64]
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds to the engine's scene of env ``env``; returns what poses are wanted of, or None.
+"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns the objects whose poses to read.
 
-That is entities, and names of the robot's links, also of those that are simulated as part of another.
+Objects are entities, and names of the robot's links, merged links included. None: no poses.
 """
 
 
@@ -26,7 +26,7 @@ class SceneSpec:
 
     ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
     ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are settings of the solver of
-    ``engine``, of a type of its own. With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
+    ``engine``, of the engine's type. With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
     Without ``collisions`` the robot has no shapes and there is no ground; masses and inertias stay.
     Specs that differ in ``build`` alone are equal.
     """
@@ -47,12 +47,12 @@ class SceneSpec:
 
 
 class Variation(NamedTuple):
-    """Differences of some robots from the model, one row each; None where there is none."""
+    """Differences of some robots from the model, one row each; None for no difference."""
 
     payload: Float64 | None = None
     """Mass added at the center of mass of a link (envs,) [kg]."""
     link_mass: Float64 | None = None
-    """Mass of each link of the URDF as a share of its own (envs, links); NaN for 1."""
+    """Mass of each link relative to its mass in the URDF (envs, links); NaN for 1."""
     center_of_mass: Float64 | None = None
     """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3 links) [m]: x, y, z of
     the first link, of the second, ..."""

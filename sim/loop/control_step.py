@@ -4,14 +4,13 @@ In this order, with setpoint r, joint positions q and velocities v, and passive 
 
     guard       r    = guard(r)                       limits of position, rate and acceleration
     sensors     y    = sensors(q), y' = sensors(v)
-    forward     f    = p + feedforward + friction that is known
+    forward     f    = p + feedforward + known friction
     law         u    = saturated(law(r, r', y, y', f))
     motors      m    = motors(u)
     friction    qf   = m - friction(m, v)             applied in the next sim step
 
-Executors call :func:`control_step` at every sim step and differ in the arrays that they call it with:
-:mod:`sim.loop.numpy_executor`, :mod:`sim.loop.xla_executor`. Everything that the control of a robot remembers from one
-step to the next is a :class:`StepState`.
+Executors call :func:`control_step` at every sim step, each with its own kind of arrays: :mod:`sim.loop.numpy_executor`,
+:mod:`sim.loop.xla_executor`. A :class:`StepState` is the whole state of the control between sim steps.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from sim.loop.arrays import Command
 from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, half_way
 
 REFRESH_STEPS = 64
-"""Sim steps of an env for which the friction model keeps the inertia that the joints show."""
+"""Sim steps of an env between updates of the friction model's inertia."""
 
 
 class StepState(NamedTuple):
@@ -44,7 +43,7 @@ class StepState(NamedTuple):
     """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
     friction: FrictionState = FrictionState()
     age: Any = None
-    """Sim steps since the friction model took its inertia (M,); None without Coulomb friction."""
+    """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb friction."""
     motors: ActuatorState | None = None
     """Motors and sensors; None for ideal ones."""
     guard: GuardState | None = None
@@ -85,7 +84,7 @@ class Outputs(NamedTuple):
     guarded: Any = None
     """Setpoints that the guard changed; None without guard."""
     returned: Any = None
-    """Effort that the caller's own controller returned; None with another control."""
+    """Effort that the caller's own controller returned; None for other controls."""
     target: Any = None
     """Position target of the engine's drives [rad or m]; None without drives."""
     target_rate: Any = None
@@ -97,7 +96,7 @@ class KnownFriction(NamedTuple):
     friction: Any
     """[N m or N]"""
     band: Any
-    """Half width in which the compensation is less [rad or m]."""
+    """Half width of the band of small errors in which the compensation is reduced [rad or m]."""
     turns: Any
     """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
 
@@ -133,42 +132,42 @@ def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
 
 
 class Model(NamedTuple):
-    """Functions that an executor gives to the control step, with results that do not depend on the executor."""
+    """Functions that an executor passes to the control step. Their results do not depend on the executor."""
 
     mass_matrix: Any = None
     """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
     joint_mass_matrix: Any = None
-    """qpos -> mass matrix that the joints show, with the armature of the motors."""
+    """qpos -> effective mass matrix of the joints, armature of the motors included."""
     passive_force: Any = None
-    """qpos, qvel -> passive force of the description, where the measured state is not the joints' state."""
+    """qpos, qvel -> passive force of the description, for a measured state that differs from the joints' state."""
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`sim.loop.pid_law.PIDLaw.advance`, perhaps compiled."""
+    """:meth:`sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
     controller: Any = None
     """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort)."""
     noise: Any = None
-    """coefficients and state of the sensors, qpos -> their noise, where it is drawn in advance."""
+    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
     stages: Stages = STAGES
 
 
 class Layout(NamedTuple):
-    """Everything about a control step that is not in an array; hashable."""
+    """Options of a control step that are not arrays; hashable."""
 
     control: str
     """"pid", "drive", "effort" or "custom"."""
     law: PIDLaw | None = None
-    """Of control "pid"."""
+    """Law of control "pid"."""
     coupling: Coupling | None = None
     measures: bool = False
-    """Whether the law sees the joints by sensors."""
+    """Whether the law takes the joints' state from sensors."""
     model: Model = Model()
 
 
 def control_step(
     layout: Layout, constants: Constants, state: StepState, command: Command, measured: Measured, step: Step
 ) -> tuple[StepState, Outputs]:
-    """Advance the control by one sim step; return its state and the efforts to apply. Nothing is written to."""
+    """Advance the control by one sim step; return its state and the efforts to apply. Inputs are not modified."""
     qpos, qvel, passive = measured
     guard, motors, guarded, seen, seen_rate = state.guard, state.motors, None, qpos, qvel
     limits: tuple[Any, Any] = (None, None)
@@ -194,7 +193,7 @@ def control_step(
 
 
 def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
-    """Return the mass matrix that the law takes (M, dof, dof): M + known armature + dt B, of leaders alone."""
+    """Return the law's mass matrix (M, dof, dof): M + known armature + dt B, for the leaders only."""
     xp, matrix = namespace(qpos), layout.model.mass_matrix(qpos)
     if constants.armature is not None:
         matrix = matrix + xp.diag(constants.armature)
@@ -204,13 +203,13 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
 
 
 def joint_mass_matrix(layout: Layout, qpos: Any) -> Any:
-    """Return the mass matrix that the friction model takes (M, dof, dof), of leaders alone."""
+    """Return the friction model's mass matrix (M, dof, dof), for the leaders only."""
     matrix = layout.model.joint_mass_matrix(qpos)
     return matrix if layout.coupling is None else layout.coupling.mass_matrix(matrix)
 
 
 def _guarded(layout: Layout, constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
-    """Return the guard's state, ``command`` with guarded setpoints and, where it has rates, theirs, and the changes.
+    """Return the guard's state, ``command`` with guarded setpoints and rates (if given), and the mask of changes.
 
     Followers move with their leaders.
     """
@@ -226,7 +225,7 @@ def _guarded(layout: Layout, constants: Constants, state: GuardState, command: C
 
 
 def _feedforward(layout: Layout, constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
-    """Return the passive force plus the caller's feedforward and known friction, of leaders; None for zero."""
+    """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
     if forward is not None and layout.coupling is not None:
         forward = layout.coupling.efforts(forward)
@@ -245,7 +244,7 @@ def _pid(
     limits: tuple[Any, Any],
     step: Step,
 ) -> tuple[StepState, Outputs]:
-    """qf = sat(PID(setpoint, qpos) + feedforward), with a mass matrix that is kept for MASS_MATRIX_STEPS."""
+    """qf = sat(PID(setpoint, qpos) + feedforward). A mass matrix is kept for MASS_MATRIX_STEPS."""
     law, matrix, qvel = layout.law, state.matrix, seen.qvel
     assert law is not None
 
@@ -298,7 +297,7 @@ def _effort(
     limits: tuple[Any, Any],
     step: Step,
 ) -> tuple[StepState, Outputs]:
-    """qf = sat(the caller's effort + feedforward); the setpoint is the effort. That of followers acts on leaders."""
+    """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
     total = command.setpoint if layout.coupling is None else layout.coupling.efforts(command.setpoint)
     return state, _saturated(constants, _sum(total, seen.passive), limits, step)
 
@@ -312,7 +311,7 @@ def _custom(
     limits: tuple[Any, Any],
     step: Step,
 ) -> tuple[StepState, Outputs]:
-    """qf = sat(the effort of the caller's own controller), which is given the feedforward."""
+    """qf = sat(effort of the caller's own controller). The feedforward is an input of the controller."""
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
     law, returned = layout.model.controller(state.law, command.setpoint, seen.qpos, seen.qvel, passive)
     total = returned if layout.coupling is None else layout.coupling.efforts(returned)
@@ -330,7 +329,7 @@ _CONTROLS: dict[str, Callable[..., tuple[StepState, Outputs]]] = {
 def apply_friction(
     layout: Layout, constants: Constants, state: StepState, motor: Any, measured: Measured
 ) -> tuple[FrictionState, Any, Any]:
-    """Return the state of the friction model, its age, and the effort to apply after that of the ``motor`` (M, dof)."""
+    """Return the friction model's state, its age, and the effort to apply for the motors' effort ``motor`` (M, dof)."""
     model, friction, age = constants.friction, state.friction, state.age
     if model.coulomb is not None:
         xp, due = namespace(age), age == REFRESH_STEPS
@@ -347,7 +346,7 @@ def apply_friction(
 
 
 def _saturated(constants: Constants, total: Any, limits: tuple[Any, Any], step: Step) -> Outputs:
-    """Return ``total`` within the limits of motors and params."""
+    """Return ``total`` clipped to the limits of motors and params."""
     xp = namespace(total, *limits)
     effort = clip(clip(total, *limits, xp), *constants.limits, xp)
     return Outputs(effort, effort, effort != total if step.observed else None)

@@ -22,7 +22,7 @@ Float64 = NDArray[np.float64]
 class OwnController:
     """Caller's own controller (:class:`sim.options.Controller`), checked; its state is a dictionary of arrays by name.
 
-    All groups of envs share it, so that they share its program of JAX.
+    All groups of envs share it, and thus its JAX program.
     """
 
     def __init__(self, options: RunnerOptions) -> None:
@@ -32,12 +32,12 @@ class OwnController:
         self._like: dict[str, Any] = {}
 
     def init(self, envs: int) -> dict[str, NDArray[Any]]:
-        """Return a copy of the controller's state at the start of ``envs`` envs, checked.
+        """Return a checked copy of the controller's initial state for ``envs`` envs.
 
         Raises
         ------
         InvalidArgumentError
-            An array of it does not have the envs as its first axis, or it differs from an earlier state at the start.
+            An array of the state does not have the envs as its first axis.
         """
         state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
@@ -46,7 +46,7 @@ class OwnController:
                 raise InvalidArgumentError(
                     "control",
                     f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {envs} envs",
-                    remedy="let every array of the state have the envs as its first axis",
+                    remedy="make the envs the first axis of every array of the state",
                 )
         return leaves
 
@@ -65,7 +65,7 @@ class OwnController:
         Raises
         ------
         InvalidArgumentError
-            It returned something unusable.
+            The controller returned an effort or a state of a wrong shape or dtype.
         """
         own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
         new, wanted = self._controller(unflatten(self._structure, state), *own)
@@ -75,12 +75,12 @@ class OwnController:
         return leaves, effort
 
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
-        """Call the controller in a program of JAX; otherwise as :meth:`__call__`.
+        """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
         Raises
         ------
         InvalidArgumentError
-            JAX cannot trace it, or it returns something else.
+            JAX cannot trace the controller, or it returns an effort or a state of a wrong shape or dtype.
         """
         import jax
 
@@ -100,7 +100,7 @@ class OwnController:
 
 
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:
-    """Return the state of the control of all envs at their start, by name."""
+    """Return the initial state of the control of all envs, as arrays by name."""
     if not isinstance(options.control, str):
         return flatten(_begin(options, options.num_envs))
     return bp.init(params, np.zeros((options.num_envs, options.robot.dof), np.float32)).leaves()
@@ -118,7 +118,7 @@ def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
 
 
 def _begin(options: RunnerOptions, envs: int) -> Any:
-    """Return the state of the caller's own controller at the start of ``envs`` envs."""
+    """Return the initial state of the caller's own controller for ``envs`` envs."""
     assert not isinstance(options.control, str)
     start = partial(options.control.init, options.robot, envs)
     if options.backend != "jax":
@@ -129,7 +129,7 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
 
 def _check_effort(effort: Any, qpos: Any) -> None:
     if effort.shape != qpos.shape:
-        rows = effort.shape[:1] == qpos.shape[:1]  # their number depends on how envs are grouped
+        rows = effort.shape[:1] == qpos.shape[:1]  # the number of rows depends on the groups
         got, wanted = (f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape for a in (effort, qpos))
         problem = f"returned an effort of shape {got}, not {wanted}"
         raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
@@ -141,7 +141,7 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> dict[str, Any
     Raises
     ------
     InvalidArgumentError
-        They have other names or shapes, or a dtype that does not fit.
+        Names or shapes differ, or a dtype cannot be cast.
     """
     new = {}
     for name in dict.fromkeys([*before, *leaves]):

@@ -1,4 +1,4 @@
-"""Group of envs that advance together: their state, and what resets, params, actuators and failures do to it."""
+"""Group of envs that advance together: their state, and its changes by resets, params, actuators and failures."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ Float64 = NDArray[np.float64]
 class EnvGroup:
     """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
 
-    ``envs`` are its rows of the loop's arrays, ``params`` those of these envs, ``controller`` is the caller's own or
-    None.
+    ``envs`` are its rows in the loop's arrays, and ``params`` the params of these envs. ``controller`` is the caller's
+    own, or None.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class EnvGroup:
         """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
         self._params = self._acting_params = params  # before and after the randomization
         self._own_actuators: bp.Actuators | None = None  # before the randomization
-        self._actuators: bp.Actuators | None = None  # after it, with effects on efforts or measurements
+        self._actuators: bp.Actuators | None = None  # after it; None without effect on efforts or measurements
         self._episode = np.zeros(pack.size, np.int64)
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
@@ -70,7 +70,7 @@ class EnvGroup:
         self._write_drives()
 
     def _prepare(self) -> None:
-        """Make constants and executor anew, for the present robots, params and actuators."""
+        """Make constants and executor for the present robots, params and actuators."""
         options, pack, motors = self._options, self.pack, self._state.motors
         constants = make_constants(options, pack, self._acting_params, self._actuators, motors)
         layout = make_layout(options, self._acting_params, self._actuators)
@@ -87,7 +87,7 @@ class EnvGroup:
         self._measured = self._executor.measure()
 
     def execute_in_numpy(self) -> None:
-        """Run sim steps in NumPy until something changes, call by call: so the phases of a step can be timed."""
+        """Run sim steps call by call in NumPy until the next change, so that the phases of a step can be timed."""
         self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
 
     def _write_drives(self) -> None:
@@ -102,7 +102,7 @@ class EnvGroup:
         return self._executor.rows(self._measured.qpos)
 
     def _take_state(self) -> StepState:
-        """Return the state of the control in arrays of NumPy, to be changed."""
+        """Convert the state of the control to NumPy arrays, which may be changed; return it."""
         self._state = self._executor.numpy_state(self._state)
         return self._state
 
@@ -127,7 +127,7 @@ class EnvGroup:
             self._state = with_friction(self._layout, self._constants, self._state, self.pack)
 
     def _take_actuators(self) -> bp.Actuators | None:
-        """Let efforts and measurements be those of the actuators with the draws applied; return these."""
+        """Put the actuators, with the draws applied, into effect; return them."""
         actuators = acting_actuators(self._options, self._own_actuators, self.draws)
         old, motors = self._state.motors, None
         self._actuators = actuators if actuators is not None and (actuators.measures or actuators.delivers) else None
@@ -142,7 +142,7 @@ class EnvGroup:
     def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
 
-        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite starts where it did last, and has failed.
+        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has failed.
         """
         containment = self._containment
         containment.clear(mask)
@@ -156,7 +156,7 @@ class EnvGroup:
         self._place_failed()
 
     def run(self, steps: int, substeps: int, command: Command) -> None:
-        """Run ``substeps`` sim steps under ``command``, after ``steps`` in the past."""
+        """Run ``substeps`` sim steps under ``command``, after ``steps`` earlier sim steps."""
         containment, done = self._containment, 0
         self._steps, containment.failed = steps, containment.suspended.copy()
         if containment.suspended.any() or not finite(*command):
@@ -214,7 +214,7 @@ class EnvGroup:
         )
 
     def write(self, pack: EnginePack, states: EnvStates) -> None:
-        """Continue with ``pack``, which is new, in the given state."""
+        """Continue with the new ``pack`` in the given state."""
         self.pack = pack
         if self._own_actuators is not None:
             pack.write_joints(self._take_actuators())
@@ -241,7 +241,7 @@ class EnvGroup:
             self._contacts.place(np.ones(pack.size, bool))
 
     def _vary(self, mask: NDArray[np.bool_]) -> None:
-        """Put the draws of the envs of ``mask`` (M,), which are to be placed, into effect."""
+        """Put the draws of the envs of ``mask`` (M,) into effect, before these envs are placed."""
         rows = np.flatnonzero(mask).tolist()
         if self._options.randomization is None or self.draws is None or not rows:
             return
@@ -261,7 +261,7 @@ class EnvGroup:
         containment, step = self._containment, self._steps + done
         qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
         bad = far(qpos) | ~np.isfinite(qvel)
-        # One step after the effort of one joint was NaN all joints are, so the effort shows where it began.
+        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first joint.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed
         if returned is not None:
@@ -275,7 +275,7 @@ class EnvGroup:
         self._place_failed()
 
     def _without_faults(self, command: Command) -> Command:
-        """Fail the envs whose commands are not finite; return commands that keep all failed envs where they are."""
+        """Mark the envs with non-finite commands as failed; return commands with neutral values for all failed envs."""
         containment = self._containment
         for cause, rows in command._asdict().items():
             if rows is not None:

@@ -1,4 +1,4 @@
-"""Laws compiled by JAX, and called once per sim step where the sim steps of a tick cannot be one program."""
+"""Laws compiled by JAX and called once per sim step, for ticks that cannot be one program."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from sim.loop.pid_law import PIDLaw
 from sim.options import Precision
 
 ROWS = 16
-"""The first axis of arrays in a program of JAX is a multiple of this, whatever the number of envs in a group.
+"""Number of which the rows in a JAX program are a multiple, for any number of envs in a group.
 
-So one program serves all groups, and an env's results do not depend on its group.
+Thus one program serves all groups, and an env's results do not depend on its group.
 """
 
 
 def program_rows(envs: int) -> int:
-    """Return the rows of a program for so many envs."""
+    """Return the number of rows in a program for ``envs`` envs."""
     return -(-envs // ROWS) * ROWS
 
 
 def padded(rows: Any) -> NDArray[Any]:
-    """Return ``rows`` (envs, ...) followed by copies of the first, up to the rows of a program."""
+    """Return ``rows`` (envs, ...) followed by copies of the first row, up to the number of rows in a program."""
     rows = np.asarray(rows)
     missing = program_rows(len(rows)) - len(rows)
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)]) if missing else rows
 
 
 def put(tree: Any) -> Any:
-    """Return a structure of arrays on the CPU, as JAX's."""
+    """Return a structure of arrays as JAX arrays on the CPU."""
     import jax
 
     return jax.device_put(tree, jax.local_devices(backend="cpu")[0])
 
 
 def jitted_law(dtype: Precision, envs: int, law: PIDLaw, *inputs: Any, observed: bool) -> Any:
-    """Return the result of :meth:`PIDLaw.advance`, compiled by JAX, for so many envs."""
+    """Return the result of :meth:`PIDLaw.advance`, compiled by JAX, for ``envs`` envs."""
     return _call(_law(law, observed), dtype, envs, *inputs)
 
 
 def jitted_controller(dtype: Precision, envs: int, controller: OwnController, *inputs: Any) -> Any:
-    """Return the result of :meth:`OwnController.traced`, compiled by JAX, for so many envs."""
+    """Return the result of :meth:`OwnController.traced`, compiled by JAX, for ``envs`` envs."""
     return _call(_jitted(controller.traced), dtype, envs, *inputs)
 
 
@@ -65,7 +65,7 @@ def _jitted(call: Callable[..., Any]) -> Any:
 
 
 def _call(function: Any, dtype: Precision, envs: int, *inputs: Any) -> Any:
-    """Return a structure of arrays (envs, ...) that a function of such, compiled by JAX, returns."""
+    """Call a jitted function with padded inputs (envs, ...); return its results as NumPy arrays (envs, ...)."""
     import jax
 
     with own_settings(dtype):

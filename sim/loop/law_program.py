@@ -23,9 +23,9 @@ from sim.loop.pid_law import PIDLaw
 
 @lru_cache(maxsize=256)
 def _trace_law(law: PIDLaw, structures: tuple[tuple[Any, ...], ...], observed: bool) -> tuple[Trace, list[int]]:
-    """Return the law's trace, and the leaves of the new state that it returns, before effort and saturation.
+    """Return the law's trace, and the indices of the state leaves that it returns, before effort and saturation.
 
-    ``structures`` are those of coefficients, state and other inputs: ... for an array, and what is none as it is.
+    ``structures`` describe coefficients, state and other inputs: ``...`` for each array, other values unchanged.
     """
     returned: list[int] = []
 
@@ -55,7 +55,7 @@ class LawProgram:
 
     @staticmethod
     def available(k: Coefficients) -> bool:
-        """Return whether there is an extension that runs the law with such coefficients."""
+        """Return whether the extension can run the law with these coefficients."""
         return k.kp.dtype == np.float64 and k.kp.shape[1] <= MOST_SUMMED and native.status().active
 
     def as_advance(self, law: PIDLaw, k: Coefficients, *inputs: Any, observed: bool = False) -> tuple[Any, ...]:
@@ -71,9 +71,9 @@ class LawProgram:
         *others: NDArray[np.float64] | None,
         observed: bool = False,
     ) -> tuple[Any, ...]:
-        """Return the new state, the effort, and if it is ``observed`` the mask of its saturation, else None.
+        """Return the new state, the effort, and the mask of saturated joints, or None unless ``observed``.
 
-        Arguments as those of :meth:`sim.loop.pid_law.PIDLaw.advance`.
+        Arguments as in :meth:`sim.loop.pid_law.PIDLaw.advance`.
         """
         inputs = (*command, qpos, qvel if self._law.measures_rate else None, *others)
         leaves = (*state, *inputs)

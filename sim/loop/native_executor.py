@@ -2,8 +2,8 @@
 
 :func:`sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on arrays
 that hold the state from step to step. Where it cannot be traced (sensors and motors, a caller's own controller), it
-runs in NumPy, and one native call applies the efforts, steps the engine and reads it. The same is done at the sim steps
-at which the friction model takes the mass matrix.
+runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the friction
+model updates its mass matrix runs in the same way.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class NativeExecutor(NumPyExecutor):
         self._compiles = reads_all and is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until Python has to look."""
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
         if not self._compiles:
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
@@ -80,11 +80,11 @@ class NativeExecutor(NumPyExecutor):
         return Ran(program.state, program.outputs, measured, program.before, done, failed)
 
     def numpy_state(self, state: StepState) -> StepState:
-        """Return a copy of ``state``, whose arrays the next sim steps change."""
+        """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
         return mapped(np.array, state)
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
-        """Do a sim step by one native call; otherwise as :meth:`NumPyExecutor._advance`."""
+        """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._native_step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
         if not self._reads_force:
@@ -98,7 +98,7 @@ class NativeExecutor(NumPyExecutor):
         return self._prepared()(*arrays)
 
     def _look(self, status: int, measured: Measured) -> Measured:
-        """Let the pack look after a sim step with this status; return the reading."""
+        """Handle the event that a sim step reported in ``status``; return the reading."""
         assert self._step is not None
         if status & FAILED:
             raise RuntimeError(self._step.message)
@@ -106,7 +106,7 @@ class NativeExecutor(NumPyExecutor):
         return measured if self._bound is self._pack.calls else self.measure()
 
     def _prepared(self) -> CompiledStep:
-        """Return the sim step of the present robots and systems."""
+        """Return the compiled sim step of the present robots and systems."""
         pack = self._pack
         if self._step is None or self._bound is not pack.calls:
             limit = None if self._speed_limit is None else np.asarray(self._speed_limit)
@@ -124,20 +124,20 @@ class NativeExecutor(NumPyExecutor):
 
 
 def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: laws of this package, with ideal motors, in float64."""
+    """Return whether the control step can be a program: PID or efforts, ideal motors, no coupling, float64."""
     fits = layout.control in ("pid", "effort") and constants.motors is None and layout.coupling is None
     return fits and dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))
 
 
 class TickProgram:
-    """Control step of a group of envs as a program, and the arrays that it works on.
+    """Control step of a group of envs as a program, and its arrays.
 
     Attributes
     ----------
     state, measured, outputs
         Arrays that the sim steps read and write.
     reading
-        ``measured``, with room for a passive force that nothing takes.
+        ``measured`` with an array for the passive force, even if it is not used.
     before
         Positions before the last sim step (M, dof).
     """
@@ -180,7 +180,7 @@ class TickProgram:
         )
 
     def load(self, state: StepState, measured: Measured, command: Command) -> None:
-        """Copy what is not in these arrays already."""
+        """Copy the arguments into the program's arrays, where they are not these arrays."""
         if state is not self.state:
             self._copy(state)
         if measured is not self.measured:
@@ -192,7 +192,7 @@ class TickProgram:
                 array[...] = value
 
     def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
-        """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the status."""
+        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status."""
         done, status = self._tick.run(step.prepare(), begin, until, end)
         if self.state.age is not None:
             self.state.age[...] += done - begin
@@ -216,7 +216,7 @@ class TickProgram:
 def _trace(layout: Layout, *structures: Any) -> Trace:
     """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
 
-    ``structures`` are those of constants, state, command and reading. Neither mass matrix nor friction are due.
+    ``structures`` describe constants, state, command and reading. No update of mass matrix or friction is due.
     """
 
     def function(*symbols: Symbol) -> list[Any]:
@@ -271,6 +271,6 @@ def filled(tree: Any, given: Any) -> Any:
 
 
 def _write(to: Any, values: Any) -> None:
-    """Copy the arrays of a nested tuple into those of another."""
+    """Copy the arrays of a nested tuple into another one of the same structure."""
     for array, value in zip(leaves(to), leaves(values), strict=True):
         array[...] = value

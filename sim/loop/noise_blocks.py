@@ -1,4 +1,4 @@
-"""Noise of sensors, drawn for many sim steps at once: a call of NumPy costs as much for ten steps as for one."""
+"""Noise of sensors, drawn for many sim steps at once: a NumPy call takes as long for ten steps as for one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class NoiseBlocks:
     def __call__(self, k: Coefficients, state: ActuatorState, like: NDArray[np.float64]) -> tuple[Any, Any] | None:
         """Return the noise of positions and velocities; None for sensors without noise.
 
-        A reset replaces the key, so an equal key means that all envs have made the same number of steps since.
+        A reset replaces the key. While the key is the same, all envs advance by the same number of steps.
         """
         if state.key is None:
             return None

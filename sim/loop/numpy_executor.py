@@ -36,13 +36,13 @@ class Ran(NamedTuple):
 
     state: StepState
     outputs: Outputs
-    """Of the last step."""
+    """Results of the last step."""
     measured: Measured
-    """After the last step."""
+    """Reading after the last step."""
     before: Any
     """qpos before the last step."""
     done: int
-    """Sim steps of the tick that are done: fewer than wanted where Python has to look."""
+    """Sim steps of the tick that are done; fewer than requested after an event: a possible contact or a failed env."""
     failed: bool
     """Whether an env may have failed."""
 
@@ -84,7 +84,7 @@ class NumPyExecutor:
                 if self._controller is None:
                     raise
                 raise ControllerError(type(self._controller).__name__, error, index + 1) from error
-            # Drives' targets cost a call for each joint.
+            # Writing the drives' targets costs a call for each joint.
             if outputs.target is not target and isinstance(pack, DrivenPack):
                 known = outputs.target_rate is rate
                 pack.write_drive_target(outputs.target, None if known else _zeros_for_none(outputs))
@@ -103,18 +103,18 @@ class NumPyExecutor:
         return measured, not sound(measured, self._speed_limit)
 
     def rows(self, array: Any) -> NDArray[Any]:
-        """Return an array of the executor as NumPy's."""
+        """Return an array of the executor as a NumPy array."""
         return array
 
     def numpy_state(self, state: StepState) -> StepState:
-        """Return a state of the executor in arrays of NumPy."""
+        """Return a state of the executor with NumPy arrays."""
         return state
 
 
 def with_model(
     options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
 ) -> Layout:
-    """Return ``layout`` with the functions for arrays of NumPy, natively compiled ones where there are such."""
+    """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
     jitted, motors, (gravity, coriolis) = options.backend == "jax", constants.motors, passive_forces(options)
     model = Model(_mass_matrix(pack), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
     if layout.law is not None and jitted:
@@ -137,9 +137,9 @@ def _zeros_for_none(outputs: Outputs) -> Float64:
 
 
 def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
-    """Return the function of the mass matrix of the description of the robots.
+    """Return the function that computes the mass matrix of the robots' description.
 
-    Where the extension is used, every executor takes its mass matrix: the last bits of Pinocchio's differ.
+    If the extension is used, every executor takes the mass matrix from it, since Pinocchio's differs in the last bits.
     """
     if isinstance(pack, CompiledPack) and native.status().active:
         return NativeMassMatrix(pack.spec)
@@ -152,6 +152,6 @@ def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
 
 
 def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
-    """Return the mass matrix that the joints show, with the armature of the motors."""
+    """Return the effective mass matrix of the joints, armature of the motors included."""
     matrix = pack.joint_mass_matrix(qpos)
     return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix

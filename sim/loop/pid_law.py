@@ -16,7 +16,7 @@ MASS_MATRIX_STEPS = 4
 
 
 class PIDLaw(NamedTuple):
-    """Ways in which the params ask for the law to be run on a robot."""
+    """Variants of the law that the params select."""
 
     whole: bool
     """Gains per mass matrix: u = M a."""
@@ -27,7 +27,7 @@ class PIDLaw(NamedTuple):
 
     @classmethod
     def of(cls, params: bp.PIDParams) -> PIDLaw:
-        """Return the law that ``params`` ask for."""
+        """Return the law that ``params`` select."""
         whole, inertia = (isinstance(params.gain_units, kind) for kind in (PerMassMatrix, PerInertia))
         return cls(whole, inertia, params.measurement_rate is not None)
 
@@ -50,21 +50,20 @@ class PIDLaw(NamedTuple):
         high: Any = None,
         observed: bool = False,
     ) -> tuple[bp.PIDState, Any, Any]:
-        """Return the new state, the effort, and if it is ``observed`` the mask of its saturation, else None.
+        """Return the new state, the effort, and the mask of saturated joints, or None unless ``observed``.
 
         Parameters
         ----------
         command
             Setpoint and its rate, which may be None.
         matrix
-            M + dt B (envs, dof, dof) where the whole matrix is used, its diagonal (envs, dof) where gains are per
-            inertia.
+            M + dt B (envs, dof, dof) for gains per mass matrix; its diagonal (envs, dof) for gains per inertia.
         viscous
             B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B) (v+ - v) =
             dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
         low, high
-            Least and largest effort of the motors (envs, dof), which saturation and anti-windup take within those of
-            the params; None for no limit.
+            Least and largest effort of the motors (envs, dof); None for no limit. Saturation and anti-windup use them
+            after clipping to the limits of the params.
         """
         if self.per_inertia:
             k = per_inertia(k, matrix)
@@ -84,10 +83,10 @@ class PIDLaw(NamedTuple):
 
 
 def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:
-    """Return the pose at which to take a mass matrix for so many sim steps from ``qpos``: the one in their middle.
+    """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way through them.
 
-    So its error is zero on average: near upright, axes nearly in line, a jaco2 leaves its path by 18 mrad under
-    matrices that are 0.3 steps ahead.
+    The matrix error is then zero on average. With matrices 0.3 steps ahead, a jaco2 that is near upright, its axes
+    nearly in line, leaves its path by 18 mrad.
     """
     return qpos + 0.5 * (steps - 1) * timestep * qvel
 

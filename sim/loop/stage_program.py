@@ -1,6 +1,6 @@
-"""Elementwise parts of a step as programs of the extension, which makes all their operations in one call.
+"""Elementwise stages of a sim step as programs of the extension: one call executes all operations of a stage.
 
-As the law (:mod:`sim.loop.law_program`) they have one definition, which is traced; results are bit-identical.
+As with the law (:mod:`sim.loop.law_program`), the only definition is traced, and results are bit-identical.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEAST_OPERATIONS = 3
 
 
 def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
-    """Return the stages of actuators with coefficients ``k``, as programs where those are faster.
+    """Return the stages of actuators with coefficients ``k``, as programs where programs are faster.
 
     ``shape`` is (envs, joints).
     """
@@ -32,7 +32,7 @@ def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
 
 
 def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]) -> Callable[..., Any]:
-    """Return ``stage``, made by programs where it can be; each is traced for the inputs that are none."""
+    """Return ``stage``, run by programs where possible: one program for each set of inputs that are None."""
     programs: dict[tuple[bool, ...], Any] = {}
 
     def run(given: Coefficients, *inputs: Any) -> Any:
@@ -49,7 +49,7 @@ def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]
 def _program(
     stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int], none: tuple[bool, ...]
 ) -> ArrayProgram | None:
-    """Return the program of ``stage``; None if NumPy is to do it."""
+    """Return the program of ``stage``; None if it cannot be traced, or is faster in NumPy."""
     constants: list[Any] = []
     numbers = _numbered(k, shape, constants)
 
@@ -67,11 +67,11 @@ def _program(
 
 
 class _Place(int):
-    """Number of a constant."""
+    """Index of a constant."""
 
 
 def _numbered(leaf: Any, shape: tuple[int, int], constants: list[Any]) -> Any:
-    """Return ``leaf`` with the arrays that programs take as places in ``constants``, to which they are added."""
+    """Move the arrays that a program takes from ``leaf`` to ``constants``; return ``leaf`` with their indices."""
     if isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 and leaf.shape in (shape, (1, shape[1])):
         constants.append(leaf)
         return _Place(len(constants) - 1)
@@ -85,5 +85,5 @@ def _symbolic(leaf: Any, symbols: tuple[Any, ...]) -> Any:
 
 
 def _each(leaf: Any, change: Callable[[Any], Any]) -> Any:
-    """Return a named tuple with its leaves changed, another leaf as it is."""
+    """Apply ``change`` to each field of a named tuple; return any other leaf unchanged."""
     return type(leaf)(*map(change, leaf)) if isinstance(leaf, tuple) else leaf

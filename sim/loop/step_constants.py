@@ -20,7 +20,7 @@ from sim.robot.dissipation import DISSIPATION
 from sim.robot.mimics import coupling_of
 
 BAND = {"rad": 1e-4, "m": 2e-5}
-"""Half width, by the joint's unit, in which the compensation is less than the friction."""
+"""Half width, by the joint's unit, of the band in which the compensation is less than the friction."""
 
 
 def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actuators | None) -> Layout:
@@ -39,8 +39,8 @@ def make_constants(
 ) -> Constants:
     """Return the constants of the envs of ``pack``.
 
-    ``params`` and ``actuators`` are those that act, with the draws of the randomization; ``motors`` is the state of
-    actuators that change efforts or measurements, None without.
+    ``params`` and ``actuators`` include the draws of the randomization. ``motors`` is the state of actuators that
+    change efforts or measurements; None without such actuators.
     """
     scene, robot, guard = pack.spec, options.robot, None
     known = None if robot.actuators is None else known_joints(robot)
@@ -81,7 +81,7 @@ def acting_gains(params: bp.PIDParams, coupling: Coupling | None) -> bp.PIDParam
 
 
 def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction | None:
-    """Return the friction to compensate: that of the description and of the robot's own actuators; None for none."""
+    """Return the friction to compensate, from the description and the robot's own actuators, or None."""
     joints = pack.spec.joints
     modelled = DISSIPATION[pack.spec.dissipation].modelled
     friction = np.array([joint.friction * modelled for joint in joints]) + known_joints(options.robot).coulomb
@@ -92,7 +92,7 @@ def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction |
 
 
 def needs_qvel(layout: Layout, constants: Constants, speed_limit: Any) -> bool:
-    """Return whether something takes the joint velocities at each sim step."""
+    """Return whether the joint velocities are needed at each sim step."""
     law = layout.law
     takes = law is not None and (law.measures_rate or law.needs_matrix)
     rubs = any(leaf is not None for leaf in constants.friction)

@@ -29,7 +29,7 @@ Float64 = NDArray[np.float64]
 
 
 def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack, mask: Bool) -> StepState:
-    """Return ``state`` with the friction model of the envs of ``mask`` (M,) at the present state of the robots."""
+    """Return ``state`` with the friction model of the envs of ``mask`` (M,) restarted at the robots' present state."""
     model = constants.friction
     if model.coulomb is None:
         return state._replace(friction=FrictionState(), age=None)
@@ -45,7 +45,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
 
 
 def with_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack) -> StepState:
-    """Return ``state`` after a change of the friction of ``pack``: the model carries on, with another inertia."""
+    """Return ``state`` after a change of the friction of ``pack``: the model goes on, and updates its inertia next."""
     if constants.friction.coulomb is None or state.age is None:
         return reset_friction(layout, constants, state, pack, np.ones(pack.size, bool))
     return state._replace(age=np.full_like(state.age, REFRESH_STEPS))
@@ -54,9 +54,9 @@ def with_friction(layout: Layout, constants: Constants, state: StepState, pack: 
 def with_params(
     layout: Layout, constants: Constants, state: StepState, old: bp.PIDParams, new: bp.PIDParams, qpos: Float64
 ) -> StepState:
-    """Return ``state`` with the law of the params ``new`` after ``old``, the integral in the unit of the new gains.
+    """Return ``state`` for the params ``new`` in place of ``old``, with the integral in the unit of the new gains.
 
-    ``constants`` are those of the params with gains per mass matrix, if there are any.
+    ``constants`` belong to the params that have gains per mass matrix, if one of the two has.
     """
     if layout.control == "custom":
         return state

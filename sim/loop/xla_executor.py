@@ -1,8 +1,8 @@
 """Sim steps of a tick as one program of XLA, which reaches the engine by a call of the extension.
 
 The program is a loop over the sim steps, ``lax.while_loop``: :func:`sim.loop.control_step.control_step`, traced, then
-:func:`sim.engine.native.xla.sim_step`. It ends early where Python has to look: a contact may come, or an env has
-failed. All groups of envs have the same number of rows (:mod:`sim.loop.jitted`), so that one program serves them all.
+:func:`sim.engine.native.xla.sim_step`. It stops early at a possible contact or a failed env, which Python
+handles. All groups of envs have the same number of rows (:mod:`sim.loop.jitted`), so that one program serves them all.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Carry(NamedTuple):
 class XLAExecutor:
     """Executor of the ticks of the robots of ``pack`` by one program.
 
-    Its methods are those of :class:`sim.loop.numpy_executor.NumPyExecutor`.
+    It has the methods of :class:`sim.loop.numpy_executor.NumPyExecutor`.
     """
 
     def __init__(
@@ -98,14 +98,14 @@ class XLAExecutor:
             return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until Python has to look."""
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
         pack = self._pack
         native = self._bind()
         with own_settings(self._options.dtype):
             span = np.array([begin, end, 0, 0], np.int32)
             span[2:].view(np.uint64)[0] = native.prepare()
             command = command.map(padded)
-            # A JAX array either way: with another kind the program would be compiled again.
+            # Always a JAX array: for another kind the program would be compiled again.
             extra = self._zero if command.feedforward is None else put(command.feedforward)
             command = command._replace(feedforward=extra)
             traced = None if self._controller is None else self._controller.traced
@@ -123,11 +123,11 @@ class XLAExecutor:
         return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & LOOK))
 
     def rows(self, array: Any) -> NDArray[Any]:
-        """Return an array of the executor as NumPy's, a new array."""
+        """Return an array of the executor as a new NumPy array."""
         return np.array(array, bool if array.dtype == bool else np.float64)[: self._pack.size]
 
     def numpy_state(self, state: StepState) -> StepState:
-        """Return a state of the executor in arrays of NumPy: float64, but for those of the caller's own controller."""
+        """Return a state of the executor with NumPy arrays: float64, except for the caller's own controller."""
         import jax
 
         def rows(leaf: Any, keep: bool = False) -> NDArray[Any]:
@@ -139,7 +139,7 @@ class XLAExecutor:
         return state if state.age is None else state._replace(age=state.age.astype(np.int64))
 
     def _started(self, state: StepState) -> StepState:
-        """Return ``state`` in the arrays of the program."""
+        """Return ``state`` as the program takes it: padded JAX arrays, with a mass matrix if the law needs one."""
         import jax
 
         law, pack = self._layout.law, self._pack
@@ -154,7 +154,7 @@ class XLAExecutor:
         return state
 
     def _bind(self) -> CompiledStep:
-        """Return the sim step of the present robots and systems."""
+        """Return the compiled sim step of the present robots and systems."""
         pack = self._pack
         if self._native is None or self._bound is not pack.calls:
             self._bound = pack.calls
@@ -175,8 +175,8 @@ def tick(
 ) -> Carry:
     """Run sim steps of a tick; arrays (rows, dof).
 
-    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the group in two parts, as
-    each array from NumPy costs a call some microseconds.
+    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the group in two parts.
+    They share one array because each array from NumPy adds some microseconds to a call.
     """
     import jax
     from jax import lax
@@ -209,7 +209,7 @@ def tick(
 
 @lru_cache(maxsize=8)
 def compiled(layout: Layout, controller: Any, gravity: bool) -> Any:
-    """Return :func:`tick` of this layout, compiled when it is first called."""
+    """Return :func:`tick` of this layout, compiled at its first call."""
     import jax
 
     return jax.jit(partial(tick, layout, controller, gravity), compiler_options={"xla_cpu_multi_thread_eigen": False})

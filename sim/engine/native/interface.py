@@ -1,7 +1,7 @@
 """Interface between Python and the native extensions: files, flags and tables.
 
 The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` imports this module without its
-package: it may import that module, :mod:`batchpid.native.operations` and the standard library only.
+package, so it may import only that module, :mod:`batchpid.native.operations` and the standard library.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SYMBOLS = (
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 STATUS = ("left_region", "contacts", "not_finite", "too_fast", "failed")
-"""Bits of the status of a sim step: reasons for which a loop over sim steps has to stop, as Status in sim_step.h."""
+"""Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
 """Numbers in a row of constants of a body, as BodyRow in rigid_body.h."""
 DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
@@ -29,7 +29,7 @@ DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
 STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
 """Arrays of ``step``, as Leaf in batch_dynamics.cpp."""
 FARTHEST = 1e6
-"""Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is of float32."""
+"""Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is float32."""
 
 
 class Group(ctypes.Structure):

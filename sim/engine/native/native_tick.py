@@ -18,7 +18,7 @@ FULL, MATRIX = 3, 4
 
 
 class NativeTick:
-    """Sim steps of a pack under a program, on arrays that stay the same.
+    """Sim steps of a pack under a program, on fixed arrays.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class NativeTick:
     whole
         Whether ``matrix`` is the whole mass matrix or its diagonal.
     arrays
-        Of the fields of :class:`sim.engine.native.interface.Tick`: the reading ``qpos``, ``qvel`` and ``passive``, the
+        Arrays by field of :class:`sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and ``passive``,
         positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``, ``tree`` and
         ``bodies`` (:class:`sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping`` (dof,).
     """
@@ -53,7 +53,7 @@ class NativeTick:
         types = {name: np.int32 if name == "tree" else np.float64 for name in given}
         for name, array in given.items():
             if array.dtype != types[name] or not array.flags.c_contiguous:
-                raise ValueError(f"{name} is no contiguous array of {np.dtype(types[name])}")
+                raise ValueError(f"{name} is not a contiguous array of {np.dtype(types[name])}")
         self._native = native.extension("_gateway")
         pairs = tuple([(array, FULL if array.ndim == 2 else MATRIX) for array in inputs])
         self._program = self._native.bind(program.arguments, pairs, tuple(outputs))

@@ -1,7 +1,7 @@
 // Sim steps of a tick of a group of robots in one call: mass matrices, control step, and the engine, in turn.
 //
 // The control step is a Program, traced from sim/loop/control_step.py. Its state is in the arrays that it reads and
-// writes. Mass matrices of the law are made here, since no Program can: every `matrix_steps` sim steps, as there.
+// writes. The law's mass matrices are computed here, every `matrix_steps` sim steps, since a Program cannot.
 
 #pragma once
 
@@ -36,7 +36,7 @@ struct BoundProgram {
   std::vector<Output> outputs;
 };
 
-// Write M + armature + dt B of each robot, at the pose in the middle of so many sim steps.
+// Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
 inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
   auto const n = static_cast<std::size_t>(tick.dof);
   thread_local std::vector<BodyState<double>> bodies;
@@ -65,7 +65,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
   }
 }
 
-// Run the sim steps from `step` to `until`, of a tick of `end` steps; return the status of the last, and count in `step`.
+// Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
 inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group &group, std::int64_t &step,
                              std::int64_t until, std::int64_t end) {
   auto const robots = static_cast<std::int64_t>(group.gateway->robots.size());
