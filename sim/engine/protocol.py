@@ -167,10 +167,13 @@ class CompiledPack(EnginePack, Protocol):
 
     Attributes
     ----------
+    steps_natively
+        Whether :meth:`compiled_step` can be used.
     steps_read_force
         Whether a compiled step reads the passive force; otherwise call :meth:`passive_force`.
     """
 
+    steps_natively: bool
     steps_read_force: bool
 
     @property

@@ -12,7 +12,6 @@ from batchpid.actuators import ActuatorState, advance_measurement
 from batchpid.elementwise import clip
 from batchpid.friction import FrictionState
 from batchpid.guard import GuardState
-from sim.engine import native
 from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from sim.loop.arrays import Arrays, Command
 from sim.loop.backend import obstacle
@@ -77,7 +76,7 @@ class EnvGroup:
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
         self._executor: NumPyExecutor | XLAExecutor
-        steps = isinstance(pack, CompiledPack) and native.status().active and layout.coupling is None
+        steps = isinstance(pack, CompiledPack) and pack.steps_natively and layout.coupling is None
         if not isinstance(pack, CompiledPack) or not steps or layout.control == "drive":
             self._executor = NumPyExecutor(options, pack, layout, constants)
         elif options.backend == "jax" and not obstacle(options, self._actuators):

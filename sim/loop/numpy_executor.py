@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ControllerError
-from sim.engine import native
 from sim.engine.engines import scene_dynamics
 from sim.engine.native_mass_matrix import NativeMassMatrix
 from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
@@ -141,7 +140,7 @@ def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
 
     If the extension is used, every executor takes the mass matrix from it, since Pinocchio's differs in the last bits.
     """
-    if isinstance(pack, CompiledPack) and native.status().active:
+    if isinstance(pack, CompiledPack) and pack.steps_natively:
         return NativeMassMatrix(pack.spec)
 
     @cache

@@ -12,6 +12,7 @@ import contextlib
 import os
 import signal
 from collections.abc import Callable
+from contextvars import copy_context
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
@@ -19,10 +20,13 @@ T = TypeVar("T")
 
 
 class Job(Generic[T]):
-    """Function that is called once, by :meth:`run`, and whose result others wait for."""
+    """Function that is called once, by :meth:`run`, and whose result others wait for.
+
+    It sees the context variables of the thread that made the job.
+    """
 
     def __init__(self, function: Callable[[], T]) -> None:
-        self._function = function
+        self._function, self._context = function, copy_context()
         self._outcome: tuple[T | None, BaseException | None] | None = None
         self._wake: SimpleQueue[None] = SimpleQueue()
 
@@ -34,7 +38,7 @@ class Job(Generic[T]):
     def run(self) -> None:
         """Call the function."""
         try:
-            self._outcome = self._function(), None
+            self._outcome = self._context.run(self._function), None
         except BaseException as error:
             self._outcome = None, error
         self._wake.put(None)

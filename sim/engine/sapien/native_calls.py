@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.native import extension, status
+from sim.engine.native import extension
 from sim.engine.native.library import callback_table, functions
 from sim.engine.sapien.calls import EngineCalls, PythonCalls
 
@@ -25,10 +25,10 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 
 
 def engine_calls(
-    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_], native: bool
 ) -> EngineCalls:
-    """Return native calls where they are available, else Python's; the arguments are those of both."""
-    make = NativeCalls if robots and status().active else PythonCalls
+    """Return native calls, or Python's; the arguments before ``native`` are those of both."""
+    make = NativeCalls if robots and native else PythonCalls
     return make(robots, systems, qf, skip)
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from batchpid.actuators import Actuators
 from batchpid.friction import Friction
 from batchpid.single_owner import SingleOwner
+from sim.engine import native
 from sim.engine.coupling import ConstraintEfforts
 from sim.engine.sapien.building import (
     build_scene,
@@ -61,6 +62,8 @@ class Pack(SingleOwner):
         Watch over the contacts.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
+    steps_natively
+        Whether the calls into the engine are native.
     steps_read_force
         Whether :meth:`compiled_step` reads the force of :meth:`passive_force`.
     """
@@ -70,7 +73,7 @@ class Pack(SingleOwner):
     def __init__(
         self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
     ) -> None:
-        self.spec, self.first_env = spec, first_env
+        self.spec, self.first_env, self.steps_natively = spec, first_env, native.status().active
         # A robot that stands on the ground is touched from the start, and so are free bodies.
         shares = spec.fixed_base and spec.build is None
         shared, self._isolates = system_size if shares else 1, shares and isolates and spec.collisions
@@ -125,7 +128,11 @@ class Pack(SingleOwner):
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
         self._calls = engine_calls(
-            robots, list(dict.fromkeys(self.systems)), self._joint_qf[: len(robots)], self._suspended[: len(robots)]
+            robots,
+            list(dict.fromkeys(self.systems)),
+            self._joint_qf[: len(robots)],
+            self._suspended[: len(robots)],
+            self.steps_natively,
         )
         self._stepped_qpos = None
         watched = ~(self.isolated | self._suspended)[: len(robots)]

@@ -87,6 +87,29 @@ def test_python_calls_without_the_extension(monkeypatch):
     assert native.environment() == {"BATCHPID_NATIVE_REFUSED": native.status().reason}
 
 
+class Told:
+    """Controller whose effort is 1 in a process with native calls, else 2."""
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, np.full_like(qpos, 1.0 if native.status().active else 2.0)
+
+
+@needs_extension
+@pytest.mark.parametrize("workers", [0, 1])
+def test_python_calls_hold_for_the_workers_of_a_runner(panda, workers):
+    with native.python_calls():
+        runner = Runner(panda, 1, workers=workers, control=Told(), params=panda.params(effort_limit=None))
+    with runner:
+        effort = runner.step(panda.settings.target).effort
+        runner.params = panda.params(effort_limit=50.0)
+        runner.reset()
+        runner.step(panda.settings.target)
+    assert (effort == (1.0 if workers == 0 else 2.0)).all()  # in this process they are switched on again
+
+
 def test_python_calls_are_those_of_one_thread():
     before = native.status()
     with native.python_calls(), ThreadPoolExecutor(1) as other:
