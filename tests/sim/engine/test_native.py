@@ -99,7 +99,8 @@ class Told:
 
 @needs_extension
 @pytest.mark.parametrize("workers", [0, 1])
-def test_python_calls_hold_for_the_workers_of_a_runner(panda, workers):
+def test_python_calls_hold_for_the_workers_of_a_runner(panda, workers, monkeypatch):
+    monkeypatch.delenv(native.SWITCH, raising=False)
     with native.python_calls():
         runner = Runner(panda, 1, workers=workers, control=Told(), params=panda.params(effort_limit=None))
     with runner:
