@@ -128,7 +128,7 @@ def test_envs_do_not_see_each_other(case, order):
     np.testing.assert_array_equal(moved.saturated, outputs.saturated[order])
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(CASES)
 def test_jax_runs_the_same_function(case):
     import jax

@@ -20,7 +20,7 @@ from sim.loop.control_step import control_step
 from sim.loop.native_executor import NativeExecutor
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
-N = 5
+N = 3
 CASES = {
     "tuned": {},
     "inertia": {"gain_units": "inertia", "kp": 400.0, "ki": 100.0, "kd": 40.0},
@@ -32,7 +32,7 @@ def params_of(robot, case):
     return robot.params(**CASES[case]) if CASES[case] else None
 
 
-def rollout(robot, ticks=100, rates=False, forward=False, **options):
+def rollout(robot, ticks=40, rates=False, forward=False, **options):
     rng = np.random.default_rng(0)
     middle = np.clip(robot.settings.target, robot.lower + 0.05, robot.upper - 0.05)
     path = np.clip(middle + np.cumsum(0.01 * rng.normal(size=(ticks, N, robot.dof)), 0), robot.lower, robot.upper)
@@ -69,14 +69,14 @@ def test_an_env_that_is_reset_changes_no_other(panda):
     """A reset puts friction and mass matrix of one env out of step with the others', which then stop for it."""
     table = np.tile(panda.settings.target, (3, N, 1)) - 0.01
     found = []
-    for mask in (np.zeros(N, bool), np.arange(N) == 2):
+    for mask in (np.zeros(N, bool), np.arange(N) == 1):
         with Runner(panda, N, workers=0, substeps=21) as runner:
             runner.rollout(table)
             if mask.any():
                 runner.reset(mask=mask)
             found.append(runner.rollout(table))
-    assert_identical(*found, np.arange(N) != 2)
-    assert not np.array_equal(found[0].qpos[:, 2], found[1].qpos[:, 2])
+    assert_identical(*found, np.arange(N) != 1)
+    assert not np.array_equal(found[0].qpos[:, 1], found[1].qpos[:, 1])
 
 
 def test_the_program_is_a_trace_of_the_control_step(panda, monkeypatch):
