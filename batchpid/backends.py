@@ -21,7 +21,7 @@ LARGE = 2**18
 
 
 def declined(*_: Any) -> Any:
-    """Return NotImplemented: there is no fast call."""
+    """Return NotImplemented, as a fast call does that leaves its work to Python."""
     return NotImplemented
 
 

@@ -161,7 +161,7 @@ def array(
     """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
     A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
-    ``names`` are those of the last axis, which counts joints, or the entries of another ``kind`` of command.
+    ``names`` holds the name of each column. ``kind`` says what a column is: a joint, or an entry of a command.
     """
     remedy = f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
     result = read_array(argument, value)

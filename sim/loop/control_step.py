@@ -72,6 +72,18 @@ class Step(NamedTuple):
     """Whether :attr:`Outputs.saturated` is wanted."""
 
 
+class Inputs(NamedTuple):
+    """Inputs of a law in a sim step."""
+
+    command: Command
+    """Command, with guarded setpoints."""
+    seen: Measured
+    """Measurement by the sensors, with the whole feedforward as its passive force."""
+    limits: tuple[Any, Any]
+    """Least and largest effort that the motors do not clip; None for no limit."""
+    step: Step
+
+
 class Outputs(NamedTuple):
     """Results of a sim step, arrays (M, dof)."""
 
@@ -181,9 +193,8 @@ def control_step(
         if layout.measures and layout.model.passive_force is not None:
             passive = layout.model.passive_force(seen, seen_rate)
     forward = _feedforward(layout, constants, command, seen, passive)
-    state, outputs = _CONTROLS[layout.control](
-        layout, constants, state, command, Measured(seen, seen_rate, forward), limits, step
-    )
+    given = Inputs(command, Measured(seen, seen_rate, forward), limits, step)
+    state, outputs = _CONTROLS[layout.control](layout, constants, state, given)
     motor = outputs.motor
     if motors is not None:
         motors, motor = advance_effort(constants.motors, motors, motor, qpos, qvel, layout.model.stages)
@@ -235,16 +246,9 @@ def _feedforward(layout: Layout, constants: Constants, command: Command, qpos: A
     return _sum(friction_model.compensation(known.friction, error, command.setpoint_rate, known.band), forward)
 
 
-def _pid(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    command: Command,
-    seen: Measured,
-    limits: tuple[Any, Any],
-    step: Step,
-) -> tuple[StepState, Outputs]:
+def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """qf = sat(PID(setpoint, qpos) + feedforward). A mass matrix is kept for MASS_MATRIX_STEPS."""
+    command, seen, limits, step = given
     law, matrix, qvel = layout.law, state.matrix, seen.qvel
     assert law is not None
 
@@ -264,21 +268,13 @@ def _pid(
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
 
 
-def _drive(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    command: Command,
-    seen: Measured,
-    limits: tuple[Any, Any],
-    step: Step,
-) -> tuple[StepState, Outputs]:
+def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """PhysX's internal drive with stiffness kp and damping kd; qf = feedforward.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
     a PID whose P and D the engine integrates implicitly.
     """
-    target, rate, _ = command
+    (target, rate, _), seen, *_ = given
     xp = namespace(seen.qpos)
     if constants.driven is not None:
         rates = {"setpoint_rate": rate, "feedforward": seen.passive}
@@ -288,34 +284,20 @@ def _drive(
     return state, Outputs(effort, effort, None, target=target, target_rate=rate)
 
 
-def _effort(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    command: Command,
-    seen: Measured,
-    limits: tuple[Any, Any],
-    step: Step,
-) -> tuple[StepState, Outputs]:
+def _effort(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
-    total = command.setpoint if layout.coupling is None else layout.coupling.efforts(command.setpoint)
-    return state, _saturated(constants, _sum(total, seen.passive), limits, step)
+    asked = given.command.setpoint
+    total = asked if layout.coupling is None else layout.coupling.efforts(asked)
+    return state, _saturated(constants, _sum(total, given.seen.passive), given)
 
 
-def _custom(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    command: Command,
-    seen: Measured,
-    limits: tuple[Any, Any],
-    step: Step,
-) -> tuple[StepState, Outputs]:
+def _custom(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """qf = sat(effort of the caller's own controller). The feedforward is an input of the controller."""
+    seen = given.seen
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    law, returned = layout.model.controller(state.law, command.setpoint, seen.qpos, seen.qvel, passive)
+    law, returned = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
     total = returned if layout.coupling is None else layout.coupling.efforts(returned)
-    return state._replace(law=law), _saturated(constants, total, limits, step)._replace(returned=returned)
+    return state._replace(law=law), _saturated(constants, total, given)._replace(returned=returned)
 
 
 _CONTROLS: dict[str, Callable[..., tuple[StepState, Outputs]]] = {
@@ -345,11 +327,11 @@ def apply_friction(
     return friction, age, qf
 
 
-def _saturated(constants: Constants, total: Any, limits: tuple[Any, Any], step: Step) -> Outputs:
+def _saturated(constants: Constants, total: Any, given: Inputs) -> Outputs:
     """Return ``total`` clipped to the limits of motors and params."""
-    xp = namespace(total, *limits)
-    effort = clip(clip(total, *limits, xp), *constants.limits, xp)
-    return Outputs(effort, effort, effort != total if step.observed else None)
+    xp = namespace(total, *given.limits)
+    effort = clip(clip(total, *given.limits, xp), *constants.limits, xp)
+    return Outputs(effort, effort, effort != total if given.step.observed else None)
 
 
 def _sum(first: Any, second: Any) -> Any:

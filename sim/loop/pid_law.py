@@ -8,7 +8,6 @@ import batchpid as bp
 from batchpid.choices import PerInertia, PerMassMatrix
 from batchpid.coefficients import Coefficients
 from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
-from batchpid.coupling import Coupling
 from batchpid.elementwise import clip, namespace
 
 MASS_MATRIX_STEPS = 4
@@ -89,11 +88,3 @@ def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:
     nearly in line, leaves its path by 18 mrad.
     """
     return qpos + 0.5 * (steps - 1) * timestep * qvel
-
-
-def acting_params(params: bp.PIDParams, coupling: Coupling | None) -> bp.PIDParams:
-    """Return ``params`` with zero gains for followers, which move with their leaders."""
-    if coupling is None:
-        return params
-    gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
-    return params.replace(**{name: gain * coupling.independent for name, gain in gains.items() if gain is not None})

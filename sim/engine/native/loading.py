@@ -18,5 +18,5 @@ def extension(name: str) -> Any:
 
 
 def extensions() -> list[Any]:
-    """Return all extensions, with that of programs; errors as :func:`batchpid.native.extensions.load_all`."""
+    """Return all extensions, the one for programs included; errors as :func:`batchpid.native.extensions.load_all`."""
     return load_all((*EXTENSIONS.values(), PROGRAM))
