@@ -7,7 +7,7 @@ from pathlib import Path
 from setuptools import Extension, setup
 
 ROOT = Path(__file__).parent
-MODULES = ("batchpid.native.extensions", "batchpid.native.operations", "sim.engine.native.interface")
+MODULES = ("batchpid.native.extensions", "batchpid.native.operations", "batchpid.sim.engine.native.interface")
 """Definitions of the extensions, each after those that it imports."""
 
 
@@ -27,6 +27,7 @@ def built(extension):
         extension.module,
         [extension.files[0]],
         depends=["setup.py", *(f"{name.replace('.', '/')}.py" for name in MODULES), *extension.files[1:]],
+        include_dirs=["."],
         extra_compile_args=list(extension.flags),
         language="c++",
         define_macros=[("Py_LIMITED_API", "0x030B0000"), *macros.items()],

@@ -11,14 +11,14 @@ Params say how to control, a state is carried from step to step, and every array
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
   take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params.
-- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.presets` for other controllers' numerics;
+- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for other controllers' numerics;
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.
-- Limits of setpoints: :func:`make_guard` and :mod:`batchpid.guard`.
-- Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.actuators`.
+- Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
+- Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.motors`.
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
-  inertia in :mod:`batchpid.computed_torque`, errors in :mod:`batchpid.errors`.
+  inertia in :mod:`batchpid.law.computed_torque`, errors in :mod:`batchpid.errors`.
 
 NumPy alone is needed; JAX, PyYAML and ruckig are imported by what uses them.
 """
@@ -30,20 +30,21 @@ startup.prepare()
 __version__ = "0.1.0"
 """Version of the package; pyproject.toml reads it here."""
 
-from batchpid import actuators, presets
-from batchpid.actuators import Actuators, load_actuators, make_actuators, save_actuators
-from batchpid.bumpless import track
-from batchpid.coefficients import Coefficients, discretise
+from batchpid import motors as actuators
 from batchpid.controller import BatchPID
-from batchpid.design import design_gains
-from batchpid.drive import drive_target
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.guard import Guard, make_guard
-from batchpid.law import advance, init, reset, step
-from batchpid.params import PIDParams, make_params
-from batchpid.serialization import dumps_params, load_about, load_params, loads_params, save_params
-from batchpid.stability import spectral_radius, stability_bound
-from batchpid.state import PIDState, Terms
+from batchpid.gains import presets
+from batchpid.gains.design import design_gains
+from batchpid.gains.stability import spectral_radius, stability_bound
+from batchpid.io.params_files import dumps_params, load_about, load_params, loads_params, save_params
+from batchpid.law.bumpless import track
+from batchpid.law.coefficients import Coefficients, discretise
+from batchpid.law.drive import drive_target
+from batchpid.law.params import PIDParams, make_params
+from batchpid.law.pid import advance, init, reset, step
+from batchpid.law.state import PIDState, Terms
+from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
+from batchpid.motors.guard import Guard, make_guard
 
 __all__ = [
     "Actuators",

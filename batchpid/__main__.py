@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import sys
-from pathlib import Path
 
 
 def main() -> int:
     """Run the command line as a program, with three standard streams."""
     _open_closed_streams()
     try:
-        return _run()
+        from batchpid.sim.cli import main as run
+
+        return run()
     finally:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # at the end of Python it would print a traceback
-
-
-def _run() -> int:
-    """Hand over to the command line, unless the user's own ``sim.py`` or ``assets.py`` would be imported for it."""
-    for name in ("sim", "assets"):
-        origin = getattr(importlib.util.find_spec(name), "origin", None)
-        if origin and Path(origin) != Path(__file__).parents[1] / name / "__init__.py":
-            remedy = "rename it or run in another folder"
-            print(f"batchpid: {origin} hides the package {name!r} that batchpid needs; {remedy}", file=sys.stderr)
-            return 2
-    from sim.cli import main
-
-    return main()
 
 
 def _open_closed_streams() -> None:

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from batchpid import law
-from batchpid.coefficients import discretise
+from batchpid.arrays.jax_settings import own_settings
 from batchpid.errors import MissingDependencyError
-from batchpid.jax_settings import own_settings
+from batchpid.law import pid
+from batchpid.law.coefficients import discretise
+from batchpid.law.params import PIDParams
+from batchpid.law.state import PIDState, Terms
 from batchpid.native.availability import program_status
 from batchpid.native.compiled_law import CompiledLaw
-from batchpid.params import PIDParams
-from batchpid.state import PIDState, Terms
 
 LARGE = 2**18
 """Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
@@ -68,7 +68,7 @@ class NumPyBackend:
         if self._law is not None:
             state, effort, shown, fast = self._law.step(state, inputs, out)
             return state, effort, shown, fast or declined
-        new, effort, *terms = law.advance(self.coefficients, state, *inputs, terms=self.terms)
+        new, effort, *terms = pid.advance(self.coefficients, state, *inputs, terms=self.terms)
         if out is not None:
             out[...] = effort
             effort, terms = out, [each._replace(effort=out) for each in terms]
@@ -88,7 +88,7 @@ class JAXBackend:
             import jax
         except ImportError:
             raise MissingDependencyError("jax", "backend='jax'", "jax") from None
-        from batchpid import blocks
+        from batchpid.law import blocks
 
         self.jax, self.terms = jax, terms
         self.dtype: Any = None
@@ -96,7 +96,7 @@ class JAXBackend:
         self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
         def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-            new, effort, *shown = law.advance(discretise(params, dt), state, *inputs, terms=terms)
+            new, effort, *shown = pid.advance(discretise(params, dt), state, *inputs, terms=terms)
             return new, effort, shown[0] if shown else None
 
         def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:

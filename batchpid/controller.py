@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from batchpid import bumpless, law
+from batchpid.arrays.leaves import frozen
+from batchpid.arrays.read_only import read_only
 from batchpid.backends import JAXBackend, NumPyBackend, declined
+from batchpid.checks.validate import choice, env_mask, instance, integer, names, positive, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.leaves import frozen
-from batchpid.params import PIDParams
-from batchpid.read_only import read_only
-from batchpid.state import PIDState, Terms
-from batchpid.validate import choice, env_mask, instance, integer, names, positive, read_array
+from batchpid.law import bumpless, pid
+from batchpid.law.params import PIDParams
+from batchpid.law.state import PIDState, Terms
 
 BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31
@@ -184,7 +184,7 @@ class BatchPID:
         y = self._array("measurement", measurement, exact=True)
         mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
         self._fast = declined
-        self._state = self._engine.call(law.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
+        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
 
     def track(
         self,
@@ -208,9 +208,9 @@ class BatchPID:
     def _started(self, y: Any) -> PIDState:
         """Return the state, begun at the first measurement, with every leaf that the params need."""
         if self._state is None:
-            return self._engine.call(law.init, y)
+            return self._engine.call(pid.init, y)
         if self._stale:
-            self._state, self._stale = self._state.matched_to(self._engine.call(law.init, y)), False
+            self._state, self._stale = self._state.matched_to(self._engine.call(pid.init, y)), False
         return self._state
 
     def _optional(self, **values: Any) -> dict[str, Any]:

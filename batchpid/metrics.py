@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.display import array_summary
-from batchpid.elementwise import TURN
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN
+from batchpid.checks.validate import broadcast, number, positive, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import broadcast, number, positive, read_array
 
 Float64 = NDArray[np.float64]
 

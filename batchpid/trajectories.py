@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.display import array_summary
+from batchpid.arrays.display import array_summary
+from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.validate import at_least, broadcast, entries, positive, read_array
 
 Float64 = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import tyro
 
-from batchpid.files import write_atomically
-from sim import Robot
-from sim.benchmark.accuracy import REFERENCES, measure_errors
-from sim.benchmark.workload import TIMESTEP
-from sim.cli.report import table
+from batchpid.io.files import write_atomically
+from batchpid.sim import Robot
+from batchpid.sim.benchmark.accuracy import REFERENCES, measure_errors
+from batchpid.sim.benchmark.workload import TIMESTEP
+from batchpid.sim.cli.report import table
 
 EVERY = 20
 """Sim steps from one written error to the next."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
-from sim import Ray, Robot, Runner
+from batchpid.sim import Ray, Robot, Runner
 
 SMALL = {"object_store_memory": 100 << 20, "include_dashboard": False}
 

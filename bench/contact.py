@@ -3,8 +3,8 @@
     python bench/contact.py
 
 64 robots, four to a PhysX system, against the same robots with a system each: once with the prediction of contacts
-(:mod:`sim.engine.sapien.contact_prediction`), which gives a robot a system of its own before something touches it, and
-once without. Prints the table of docs/reliability.md.
+(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which gives a robot a system of its own before something touches
+it, and once without. Prints the table of docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from sim import Robot, Runner
-from sim.engine.sapien.contact_prediction import ContactPredictor
+from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.sapien.contact_prediction import ContactPredictor
 
 MOTIONS: dict[str, tuple[float, dict[str, Any]]] = {
     # name: (standard deviation of random efforts, in effort limits; options of the Runner)

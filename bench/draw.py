@@ -17,8 +17,8 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from batchpid.files import write_atomically
-from sim.plots.figures import save
+from batchpid.io.files import write_atomically
+from batchpid.sim.plots.figures import save
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SETUPS = {

@@ -5,8 +5,8 @@
 The speed depends on the motion: the engine steps shapes that are near each other slower, such as those of a closed
 gripper, and the loop has to look at their contacts. Everything runs in this process, in interleaved rounds: the
 tutorial's loop, the closed loop, and the closed loop without isolation of robots that are about to be touched
-(:mod:`sim.engine.sapien.contact_prediction`), which shows what the isolation costs. Times are processor times, which
-another program disturbs less.
+(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which shows what the isolation costs. Times are processor times,
+which another program disturbs less.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 
-from batchpid.files import write_atomically
-from sim import Robot, Runner
-from sim.benchmark.tutorial import TutorialLoop
-from sim.engine.native import status
-from sim.engine.sapien.pack import Pack
-from sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.io.files import write_atomically
+from batchpid.sim import Robot, Runner
+from batchpid.sim.benchmark.tutorial import TutorialLoop
+from batchpid.sim.engine.native import status
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 SUBSTEPS = 20
 REPEATS = 4

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 
-from sim.loop.arrays import Arrays
-from sim.options import RunnerOptions
-from sim.workers.cluster import NODE_STEPS
-from sim.workers.node_worker import SILENCE_LIMIT
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.workers.cluster import NODE_STEPS
+from batchpid.sim.workers.node_worker import SILENCE_LIMIT
 
 NODES, CORES, ENVS = (2, 10, 100, 1000), 16, 64
 """Nodes of a cluster, cores of a node, envs of a core."""

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.actuators import advance_effort, advance_measurement, discretise
-from sim import Robot
-from sim.benchmark.workload import Workload
-from sim.loop.noise_blocks import NoiseBlocks
-from sim.loop.stage_program import compiled_stages
+from batchpid.motors import advance_effort, advance_measurement, discretise
+from batchpid.sim import Robot
+from batchpid.sim.benchmark.workload import Workload
+from batchpid.sim.loop.noise_blocks import NoiseBlocks
+from batchpid.sim.loop.stage_program import compiled_stages
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {

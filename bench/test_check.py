@@ -14,10 +14,10 @@ import pytest
 from test_actuator_cost import speeds_over_ideal
 from test_few_robots import COUNTS, few_robots
 
-from sim import Robot
-from sim.benchmark.benchmark import BY_TICKS, OURS, PYTHON, measure_rates
-from sim.benchmark.workload import Workload
-from sim.engine import native
+from batchpid.sim import Robot
+from batchpid.sim.benchmark.benchmark import BY_TICKS, OURS, PYTHON, measure_rates
+from batchpid.sim.benchmark.workload import Workload
+from batchpid.sim.engine import native
 
 ATTEMPTS = 3
 

@@ -12,10 +12,10 @@ import time
 import numpy as np
 import pytest
 
-from sim import Robot, Runner
-from sim.benchmark.tutorial import tutorial_settings
-from sim.benchmark.workload import Workload
-from sim.engine.sapien.pack import Pack
+from batchpid.sim import Robot, Runner
+from batchpid.sim.benchmark.tutorial import tutorial_settings
+from batchpid.sim.benchmark.workload import Workload
+from batchpid.sim.engine.sapien.pack import Pack
 
 ENVS, TICKS, ROUNDS, POSES, PACK = 32, 10, 5, 6, 4
 

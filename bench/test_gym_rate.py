@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from sim.gym import ReachVectorEnv
+from batchpid.sim.gym import ReachVectorEnv
 
 NUM_ENVS, TICKS = 64, 12
 

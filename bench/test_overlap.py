@@ -13,7 +13,7 @@ from time import perf_counter, sleep
 import numpy as np
 import pytest
 
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 ENVS = 128  # so many that half of them fill their packs and groups, too
 TICKS, ROUNDS, ATTEMPTS, FLOOR = 10, 3, 3, 1.25

@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from sim import Robot, Runner
-from sim.benchmark.workload import Workload
+from batchpid.sim import Robot, Runner
+from batchpid.sim.benchmark.workload import Workload
 
 ROUNDS = 2
 

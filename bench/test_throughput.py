@@ -8,10 +8,10 @@ import importlib.util
 
 import pytest
 
-from sim import Robot
-from sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_rates
-from sim.benchmark.peers import PEERS
-from sim.benchmark.workload import Workload
+from batchpid.sim import Robot
+from batchpid.sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_rates
+from batchpid.sim.benchmark.peers import PEERS
+from batchpid.sim.benchmark.workload import Workload
 
 ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 

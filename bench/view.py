@@ -24,9 +24,9 @@ import tyro
 from PIL import Image
 from selenium import webdriver
 
-from batchpid.files import write_atomically
-from sim import Robot
-from sim.view import LiveSimulation, View
+from batchpid.io.files import write_atomically
+from batchpid.sim import Robot
+from batchpid.sim.view import LiveSimulation, View
 
 FLAGS = (
     "--headless=new",

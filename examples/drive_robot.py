@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 
 @dataclass(frozen=True)

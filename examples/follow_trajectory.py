@@ -9,8 +9,8 @@ the velocity error and not the velocity: the errors that remain show how hard a 
 import numpy as np
 
 from batchpid.errors import MissingDependencyError
+from batchpid.sim import Robot, Runner
 from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
-from sim import Robot, Runner
 
 DT = 0.01  # a tick: 20 sim steps [s]
 # Stiffness and damping of the arm in libfranka's joint impedance example, and a soft hold of the fingers.

@@ -7,7 +7,7 @@
 
 import numpy as np
 
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 HALF = 0.5  # half the box's edge [m]
 

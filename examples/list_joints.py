@@ -7,7 +7,7 @@ python examples/list_joints.py path/to/any.urdf
 import numpy as np
 import tyro
 
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 
 def main(robot: tyro.conf.Positional[str] = "panda", stiffness: float = 0.0) -> None:

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from sim import Robot
-from sim.robot.kinematics import Kinematics
-from sim.tuning.identification.excitation import excite
+from batchpid.sim import Robot
+from batchpid.sim.identification.excitation import excite
+from batchpid.sim.robot.kinematics import Kinematics
 
 
 class Truth(NamedTuple):

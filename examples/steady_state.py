@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from sim import Robot, Runner, plots
+from batchpid.sim import Robot, Runner, plots
 
 VARIANTS = (
     # control, compensate, label, colour, filled

@@ -24,7 +24,7 @@ import optax
 import tyro
 from matplotlib.figure import Figure
 
-from sim import MissedContactWarning, Robot, plots
+from batchpid.sim import MissedContactWarning, Robot, plots
 
 FINE = 0.2  # scale on which the agent sees small errors [rad or m]
 
@@ -160,7 +160,7 @@ def make_envs(config):
     options = {"params": params, "workers": config.workers, "collisions": False, "physics": "free"}
     warnings.simplefilter("ignore", MissedContactWarning)  # any pose within the limits may be a goal
     task = {"robot": robot, "actions": "increment", "max_episode_steps": config.episode}
-    return gymnasium.make_vec("sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options)
+    return gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options)
 
 
 def features(observation):

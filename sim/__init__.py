@@ -5,37 +5,47 @@ Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
+import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
-for _name in ("batchpid", "assets"):
-    _origin = getattr(importlib.util.find_spec(_name), "origin", None)
-    if _origin and Path(_origin) != Path(__file__).parents[1] / _name / "__init__.py":
-        raise ImportError(f"{_origin} hides the package {_name!r} that sim needs; rename it or run in another folder")
+if __name__ == "sim":  # the folder of a checkout, under the name that it had before
+    import warnings
 
-import batchpid.startup  # noqa: F401 - checks the import path before NumPy is imported
-from sim.cluster import ClusterWarning, Ray
-from sim.command import CommandSpec
-from sim.loop.contact_log import MissedContact, MissedContactWarning
-from sim.loop.faults import Fault, FaultWarning
-from sim.loop.snapshot import Snapshot
-from sim.observation import Observation, Rollout, RunInfo
-from sim.options import Controller, RunnerOptions
-from sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
-from sim.randomization.randomization import Randomization
-from sim.recording.files import RecordingError, read_recording, write_recording
-from sim.recording.recorder import Recorder
-from sim.robot.description import RobotFunctions, register_engine
-from sim.robot.findings import Finding
-from sim.robot.limits import SetpointWarning
-from sim.robot.robot import Robot
-from sim.robot.stability import StabilityWarning
+    class _Renamed:
+        """Importer of this package's modules under their former names, which would load them a second time."""
+
+        @staticmethod
+        def find_spec(name: str, *_: object) -> None:
+            """Refuse the former names."""
+            if name.startswith("sim."):
+                raise ModuleNotFoundError(f"{name} is now batchpid.{name}", name=name)
+
+    warnings.warn("the package 'sim' is now 'batchpid.sim'", DeprecationWarning, stacklevel=2)
+    sys.modules["sim"] = importlib.import_module("batchpid.sim")
+    sys.meta_path.insert(0, _Renamed())
+
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
+from batchpid.sim.loop.faults import Fault, FaultWarning
+from batchpid.sim.loop.snapshot import Snapshot
+from batchpid.sim.observation import Observation, Rollout, RunInfo
+from batchpid.sim.options import Controller, RunnerOptions
+from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.ray_options import ClusterWarning, Ray
+from batchpid.sim.recording.recorder import Recorder
+from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
+from batchpid.sim.robot.description import RobotFunctions, register_engine
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.limits import SetpointWarning
+from batchpid.sim.robot.loop_stability import StabilityWarning
+from batchpid.sim.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from sim.engine.sapien.physics import Physics
-    from sim.runner import Runner
-    from sim.workers.pool import RecoveryWarning
+    from batchpid.sim.engine.sapien.physics import Physics
+    from batchpid.sim.runner import Runner
+    from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
     "Choice",
@@ -69,17 +79,21 @@ __all__ = [
     "write_recording",
 ]
 
-_LOADS_SAPIEN = {"Physics": "sim.engine.sapien.physics", "Runner": "sim.runner", "RecoveryWarning": "sim.workers.pool"}
+_LOADS_SAPIEN = {
+    "Physics": "batchpid.sim.engine.sapien.physics",
+    "Runner": "batchpid.sim.runner",
+    "RecoveryWarning": "batchpid.sim.workers.pool",
+}
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LOADS_SAPIEN:
-        raise AttributeError(f"module 'sim' has no attribute {name!r}")
+        raise AttributeError(f"module 'batchpid.sim' has no attribute {name!r}")
     return getattr(importlib.import_module(_LOADS_SAPIEN[name]), name)
 
 
 def _engine() -> RobotFunctions:
-    from sim.engine.engines import load_engine
+    from batchpid.sim.engine.engines import load_engine
 
     return load_engine()
 

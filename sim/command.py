@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from batchpid.checks.validate import array, entries
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import array, entries
 
 
 @dataclass(frozen=True)
 class CommandSpec:
     """Names, units and bounds of the numbers in a setpoint of one env.
 
-    A :class:`sim.Controller` whose setpoints are not one number per joint has a spec as its attribute ``command``.
-    Two specs are equal if their names and units are equal.
+    A :class:`batchpid.sim.Controller` whose setpoints are not one number per joint has a spec as its attribute
+    ``command``. Two specs are equal if their names and units are equal.
 
     Raises
     ------
@@ -33,7 +33,7 @@ class CommandSpec:
     """Unit of each entry; default "", unknown."""
     _: KW_ONLY
     lower: ArrayLike = field(default=-math.inf, compare=False)
-    """Lower bounds (size,), for the action spaces of :mod:`sim.gym`; a :class:`sim.Runner` does not apply them."""
+    """Lower bounds (size,), for action spaces of :mod:`batchpid.sim.gym`; a Runner does not apply them."""
     upper: ArrayLike = field(default=math.inf, compare=False)
     """Upper bounds (size,)."""
     neutral: ArrayLike | None = field(default=None, compare=False)
@@ -99,7 +99,7 @@ def own_command(control: object) -> CommandSpec | None:
             "control",
             f"has an attribute 'command' whose {error.argument} {error.problem}",
             value=given,
-            remedy="let it be a sim.CommandSpec, or names such as ('x', 'y')",
+            remedy="let it be a batchpid.sim.CommandSpec, or names such as ('x', 'y')",
         ) from None
 
 

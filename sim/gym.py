@@ -1,8 +1,8 @@
 """Gymnasium environments: N robots reach random joint poses, with joint setpoints as actions.
 
-``import sim.gym`` registers ``batchpid/Reach-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``;
-``make_vec("sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every step:
-``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
+``import batchpid.sim.gym`` registers ``batchpid/Reach-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0",
+num_envs=64)``; ``make_vec("batchpid.sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every
+step: ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
 
 Longer than 300 lines because one class is the whole environment: spaces, episodes, steps and autoreset.
 """
@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.elementwise import TURN, wrap
+from batchpid.arrays.elementwise import TURN, wrap
+from batchpid.checks.keywords import check_keywords
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import AxisKind, array, choice, entries, env_mask, flag, integer, number
 from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError, MissingDependencyError
-from batchpid.keywords import check_keywords
-from batchpid.single_owner import SingleOwner
-from batchpid.validate import AxisKind, array, choice, entries, env_mask, flag, integer, number
-from sim.command import CommandSpec, own_command
-from sim.observation import Observation
-from sim.options import RunnerOptions
-from sim.robot.description import LIMIT_TOLERANCE
-from sim.robot.robot import Robot
-from sim.runner import Runner
+from batchpid.sim.command import CommandSpec, own_command
+from batchpid.sim.observation import Observation
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.description import LIMIT_TOLERANCE
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
 
 try:
     import gymnasium
@@ -34,7 +34,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError:
-    raise MissingDependencyError("gymnasium", "sim.gym", "gym") from None
+    raise MissingDependencyError("gymnasium", "batchpid.sim.gym", "gym") from None
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -51,9 +51,9 @@ MAX_SPEED = 100.0
 class ReachVectorEnv(SingleOwner, VectorEnv):
     """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
-    Joints are the independent ones (:attr:`sim.Robot.independent`): followers move with their leaders. A setpoint has
-    one number for each of them, or those of the command of a :class:`sim.Controller`, within the bounds of its
-    :class:`sim.CommandSpec`.
+    Joints are the independent ones (:attr:`batchpid.sim.Robot.independent`): followers move with their leaders. A
+    setpoint has one number for each of them, or those of the command of a :class:`batchpid.sim.Controller`, within the
+    bounds of its :class:`batchpid.sim.CommandSpec`.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
     - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the setpoint. An episode
@@ -71,7 +71,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
     Parameters
     ----------
     robot
-        Name of a bundled robot, URDF path, or :class:`sim.Robot`.
+        Name of a bundled robot, URDF path, or :class:`batchpid.sim.Robot`.
     rate_hz
         Actions per second; the PID runs at every sim step in between.
     actions
@@ -84,7 +84,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
     autoreset_mode
         Of :class:`gymnasium.vector.AutoresetMode`.
     options
-        Of :class:`sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
+        Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
 
     Raises
     ------
@@ -336,7 +336,10 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
 def _finite_bounds(command: CommandSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the bounds of a command; raise InvalidArgumentError if one is infinite."""
     low, high = np.asarray(command.lower), np.asarray(command.upper)
-    good, remedy = np.isfinite(low) & np.isfinite(high), "let its command be a sim.CommandSpec with lower= and upper="
+    good, remedy = (
+        np.isfinite(low) & np.isfinite(high),
+        "let its command be a batchpid.sim.CommandSpec with lower= and upper=",
+    )
     entries("control", low, good, "has no bounds", command.names, kind="entry", remedy=remedy)
     return low, high
 
@@ -385,5 +388,8 @@ class ReachEnv(SingleOwner, gymnasium.Env):
 
 
 gymnasium.register(
-    "batchpid/Reach-v0", "sim.gym:ReachEnv", max_episode_steps=250, vector_entry_point="sim.gym:ReachVectorEnv"
+    "batchpid/Reach-v0",
+    "batchpid.sim.gym:ReachEnv",
+    max_episode_steps=250,
+    vector_entry_point="batchpid.sim.gym:ReachVectorEnv",
 )

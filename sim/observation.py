@@ -9,9 +9,9 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.actuators import Actuators
-from batchpid.params import PIDParams
-from sim.command import CommandSpec, joint_command
+from batchpid.law.params import PIDParams
+from batchpid.motors import Actuators
+from batchpid.sim.command import CommandSpec, joint_command
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Observation(NamedTuple):
 
     ``effort``, ``saturated`` and ``guarded`` are those of the last sim step; under control "drive" the effort is qf
     alone, since PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is
-    suspended since an earlier one: see :attr:`sim.Runner.faults`.
+    suspended since an earlier one: see :attr:`batchpid.sim.Runner.faults`.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
@@ -84,7 +84,8 @@ class Redraw(NamedTuple):
 class RunInfo:
     """Robot, options and origin of a run; what is not known is None.
 
-    :meth:`sim.Runner.rollout` and :func:`sim.read_recording` fill it; ``robot.run_info()`` makes one by hand.
+    :meth:`batchpid.sim.Runner.rollout` and :func:`batchpid.sim.read_recording` fill it; ``robot.run_info()`` makes one
+    by hand.
     """
 
     robot: str
@@ -115,7 +116,7 @@ class RunInfo:
     compensate: str | None = None
     """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or "none"."""
     physics: str | None = None
-    """Solver settings: "accurate", "fast", "free", or the text of a :class:`sim.Physics`."""
+    """Solver settings: "accurate", "fast", "free", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None
     """False if the robots had no collision shapes."""
     ground: bool | None = None
@@ -135,9 +136,9 @@ class RunInfo:
     complete: bool = True
     """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
-    """Faults (:class:`sim.Fault`) of the runner up to the end of the run."""
+    """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
     randomization: Mapping[str, Any] | None = None
-    """Distributions, as :meth:`sim.Randomization.to_dict` returns them."""
+    """Distributions, as :meth:`batchpid.sim.Randomization.to_dict` returns them."""
     draws: Mapping[str, Float64] | None = None
     """Draws at the start, by field: (envs, joints or links)."""
     episodes: NDArray[np.int64] | None = None

@@ -1,4 +1,4 @@
-"""Options of a runner: one definition for :class:`sim.Runner`, its loops, snapshots, recordings and commands.
+"""Options of a runner: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots, recordings and commands.
 
 Longer than 300 lines because every option is documented here.
 """
@@ -13,24 +13,24 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.computed_torque import check_gain_units
-from batchpid.digest import digest
+from batchpid.arrays.digest import digest
+from batchpid.arrays.leaves import frozen
+from batchpid.arrays.read_only import read_only
+from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.leaves import frozen
-from batchpid.read_only import read_only
-from batchpid.validate import choice, flag, instance, integer, joint_speeds, number
-from sim.cluster import Ray
-from sim.command import CommandSpec, joint_command, own_command
-from sim.engine.engines import load_engine
-from sim.engine.protocol import Capability, Engine, require
-from sim.randomization.checks import check_params, check_robot, prepared_actuators
-from sim.randomization.randomization import Randomization
-from sim.robot.actuators import fit_actuators
-from sim.robot.guard import fit_guard
-from sim.robot.robot import Robot
+from batchpid.law.computed_torque import check_gain_units
+from batchpid.sim.command import CommandSpec, joint_command, own_command
+from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.ray_options import Ray
+from batchpid.sim.robot.actuator_checks import fit_actuators
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.setpoint_limits import fit_guard
 
 if TYPE_CHECKING:
-    from sim.engine.sapien.physics import Physics
+    from batchpid.sim.engine.sapien.physics import Physics
 
 ControlMode = Literal["pid", "drive", "effort"]
 
@@ -42,7 +42,7 @@ class Controller(Protocol):
     depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
 
     A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
-    :class:`sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
+    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
@@ -80,7 +80,7 @@ PACK_SIZE = {True: 4, False: 64}
 
 @dataclass(frozen=True, eq=False)
 class RunnerOptions:
-    """Options of a :class:`sim.Runner`, checked when they are constructed.
+    """Options of a :class:`batchpid.sim.Runner`, checked when they are constructed.
 
     Raises
     ------
@@ -89,7 +89,7 @@ class RunnerOptions:
     """
 
     robot: Robot
-    """From :meth:`sim.Robot.load`."""
+    """From :meth:`batchpid.sim.Robot.load`."""
     num_envs: int
     """Number of robots, one in each scene."""
     _: KW_ONLY
@@ -114,16 +114,17 @@ class RunnerOptions:
     "effort" friction is not compensated."""
     physics: PhysicsPreset | Physics = "accurate"
     """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
-    :class:`sim.Physics`."""
+    :class:`batchpid.sim.Physics`."""
     ground: bool | None = None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose."""
     collisions: bool = True
     """With False robots have no collision shapes, and there is no ground: for free motion only. Masses, inertias and
-    joint limits stay. A :class:`sim.MissedContactWarning` says which robots would have touched something."""
+    joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched something."""
     build: Callable[[Any, int], Any] | None = None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
-    that code written for a screen runs unchanged. It may return the entities that :meth:`sim.Runner.poses` reports. A
+    that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
+    reports. A
     reset puts the content back to where ``build`` left it."""
     pack_size: int | None = None
     """Largest number of scenes that share a PhysX system; affects speed alone. Default: 4, or 64 without collisions.
@@ -143,7 +144,8 @@ class RunnerOptions:
     """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
     (docs/randomization.md); default none."""
     guard: bool | bp.Guard = False
-    """Limits of setpoints, applied at every sim step: True for :meth:`sim.Robot.guard`, or :func:`batchpid.make_guard`.
+    """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
+    :func:`batchpid.make_guard`.
     ``obs.guarded`` tells which setpoints were changed."""
     on_invalid_input: InvalidInputAction = "raise"
     """``"raise"`` an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"`` it: the env that
@@ -159,7 +161,8 @@ class RunnerOptions:
     stopped or asleep within a tick counts as stuck within a second."""
 
     cluster: Literal["ray"] | Ray | None = None
-    """``"ray"`` or :class:`sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical results
+    """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical
+    results
     (docs/cluster.md)."""
 
     def __post_init__(self) -> None:
@@ -272,8 +275,8 @@ class RunnerOptions:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
         Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to miss:
-        any number of workers get equal shares, and pack these.
+        where :mod:`batchpid.sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to
+        miss: any number of workers get equal shares, and pack these.
         """
         assert self.pack_size is not None
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
@@ -321,7 +324,8 @@ class RunnerOptions:
         return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`sim.robot.actuators.fit_actuators` does; None if every effect is off.
+        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does; None if every effect
+        is off.
 
         Raises
         ------

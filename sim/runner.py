@@ -18,20 +18,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import AxisKind, array, env_mask, instance, integer, read_array, within
 from batchpid.errors import BatchPIDError, CallOrderError, ClosedError, InvalidArgumentError
-from batchpid.single_owner import SingleOwner
-from batchpid.validate import AxisKind, array, env_mask, instance, integer, read_array, within
-from batchpid.versions import package_versions
-from sim.cluster import Ray
-from sim.command import CommandSpec
-from sim.loop.arrays import Arrays, Command
-from sim.loop.backend import describe
-from sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
-from sim.loop.custom import initial_state
-from sim.loop.faults import FARTHEST, Fault, FaultLog, FaultWarning
-from sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from sim.observation import Observation, Rollout, RunInfo, empty_observation
-from sim.options import (
+from batchpid.io.versions import package_versions
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.backend import describe
+from batchpid.sim.loop.contact_log import MissedContact, MissedContactLog, MissedContactWarning
+from batchpid.sim.loop.custom import initial_state
+from batchpid.sim.loop.faults import FARTHEST, Fault, FaultLog, FaultWarning
+from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
+from batchpid.sim.options import (
     Backend,
     Compensation,
     Controller,
@@ -43,15 +42,16 @@ from sim.options import (
     RunnerOptions,
     default_params,
 )
-from sim.randomization.draws import NOTHING, Draws
-from sim.randomization.randomization import Randomization
-from sim.robot.limits import SetpointCheck
-from sim.robot.robot import Robot
-from sim.robot.stability import StabilityCheck
-from sim.workers.ledger import Commit, Ledger
-from sim.workers.node import NodeInfo
-from sim.workers.pool import WorkerPool
-from sim.workers.requests import (
+from batchpid.sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.ray_options import Ray
+from batchpid.sim.robot.limits import SetpointCheck
+from batchpid.sim.robot.loop_stability import StabilityCheck
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.workers.ledger import Commit, Ledger
+from batchpid.sim.workers.node import NodeInfo
+from batchpid.sim.workers.pool import WorkerPool
+from batchpid.sim.workers.requests import (
     ReadPoses,
     ReadStateSizes,
     Request,
@@ -64,11 +64,11 @@ from sim.workers.requests import (
 )
 
 if TYPE_CHECKING:
-    from sim.engine.sapien.physics import Physics
+    from batchpid.sim.engine.sapien.physics import Physics
 
 
 class TickRecorder(Protocol):
-    """Receives every tick of a runner; :class:`sim.Recorder` is one."""
+    """Receives every tick of a runner; :class:`batchpid.sim.Recorder` is one."""
 
     path: Path
 
@@ -107,13 +107,13 @@ class Runner(SingleOwner):
     Parameters
     ----------
     robot
-        From :meth:`sim.Robot.load`.
+        From :meth:`batchpid.sim.Robot.load`.
     num_envs
         Number of robots, one in each scene.
     params
-        PID parameters of one row, or one row per env. Default: see :func:`sim.options.default_params`.
+        PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`.
     workers, timestep, ...
-        See the fields of :class:`sim.RunnerOptions`.
+        See the fields of :class:`batchpid.sim.RunnerOptions`.
 
     Raises
     ------
@@ -194,7 +194,7 @@ class Runner(SingleOwner):
         self._stability = StabilityCheck(robot, self.timestep) if self.control == "pid" else None
         self._checks_setpoints = options.sets_positions and options.guard is False
         self.recorder: TickRecorder | None = None
-        """Recorder of every tick; :class:`sim.Recorder` sets it."""
+        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._has_warned = self._has_warned_of_contact = False
         entry_names = None if own is None else own.names
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault, entry_names)
@@ -294,11 +294,12 @@ class Runner(SingleOwner):
         ----------
         setpoint
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. What it has for a
-            follower (:attr:`sim.Robot.coupling`) is replaced by what the leader's means for it; an effort acts on the
-            leader. A :class:`sim.Controller` with a command of its own takes (size,) or (envs, size): :attr:`command`.
+            follower (:attr:`batchpid.sim.Robot.coupling`) is replaced by what the leader's means for it; an effort acts
+            on the leader. A :class:`batchpid.sim.Controller` with a command of its own takes (size,) or (envs, size):
+            :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity. Not for
-            a :class:`sim.Controller`, which ignores it.
+            a :class:`batchpid.sim.Controller`, which ignores it.
         feedforward
             Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before saturation.
         substeps
@@ -549,7 +550,7 @@ class Runner(SingleOwner):
 
     @property
     def command(self) -> CommandSpec:
-        """Names and units of a setpoint's entries: the joints, or as a :class:`sim.Controller` declares them."""
+        """Names and units of a setpoint's entries: the joints, or as a controller declares them."""
         return self.options.command
 
     @cached_property

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 import batchpid as bp
-from sim import Robot
-from sim.cli import COMMANDS, main, parse
+from batchpid.sim import Robot
+from batchpid.sim.cli import COMMANDS, main, parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
+import pytest
 from setuptools import find_packages
 from setuptools.config.expand import read_attr
 
@@ -19,8 +24,8 @@ def test_every_package_is_shipped():
     include = PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]
     packages = {
         ".".join(path.parent.relative_to(ROOT).parts)
-        for top in ("batchpid", "sim", "assets")
-        for path in (ROOT / top).rglob("*.py")
+        for folder in ("batchpid", "batchpid/sim", "batchpid/assets")
+        for path in (ROOT / folder).rglob("*.py")
     }
     assert set(find_packages(str(ROOT), include=include)) == packages
 
@@ -28,7 +33,7 @@ def test_every_package_is_shipped():
 def test_every_data_file_is_shipped():
     data = PROJECT["tool"]["setuptools"]["package-data"]
     for package, patterns in data.items():
-        folder = ROOT / package
+        folder = ROOT / package.replace(".", "/")
         shipped = {path for pattern in patterns for path in folder.glob(pattern)}
         there = {path for path in folder.iterdir() if path.is_file() and path.suffix != ".py"}
         assert there == shipped
@@ -57,3 +62,47 @@ def test_classifiers_name_the_versions_of_python_that_it_runs_on():
 
 def test_the_command_checks_the_packages_before_it_imports_them():
     assert PROJECT["project"]["scripts"] == {"batchpid": "batchpid.__main__:main"}
+
+
+def test_the_folder_of_a_checkout_still_imports_as_sim_with_a_warning():
+    code = """
+import warnings
+with warnings.catch_warnings(record=True) as seen:
+    warnings.simplefilter("always")
+    import sim
+    from sim import Robot
+import batchpid.sim
+assert sim is batchpid.sim and Robot is batchpid.sim.Robot
+assert [each.category for each in seen] == [DeprecationWarning], seen
+try:
+    import sim.observation
+except ModuleNotFoundError as error:
+    assert str(error) == "sim.observation is now batchpid.sim.observation"
+else:
+    raise AssertionError("sim.observation would be a second copy")
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_shares_an_environment_with_another_package_called_sim(tmp_path):
+    build = [sys.executable, "-W", "ignore", "-m", "pip", "wheel", "--quiet", "--no-deps"]
+    subprocess.run([*build, "--wheel-dir", tmp_path, ROOT], check=True)
+    (wheel,) = tmp_path.glob("batchpid-*.whl")
+    site = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    installed = {path.name for path in site.iterdir() if path.suffix != ".dist-info"}
+    assert installed == {"batchpid"}
+    assert {path.name for path in (site / "batchpid").rglob("*.so")} == {
+        f"{name}.abi3.so" for name in ("_program", "_gateway", "_batch_dynamics")
+    }
+    (site / "sim.py").write_text("def joints(): return 3")
+    code = """
+import sim
+from batchpid.sim import Robot, Runner
+with Runner(Robot.load("panda"), num_envs=2, workers=1) as runner:
+    assert runner.step(runner.reset().qpos).ok.all()
+assert sim.joints() == 3
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)}, check=True)

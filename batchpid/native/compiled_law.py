@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.coefficients import Coefficients
-from batchpid.law import advance
+from batchpid.law.coefficients import Coefficients
+from batchpid.law.pid import advance
+from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.tracing import Symbol, Trace, trace
-from batchpid.state import PIDState, Terms
 
 _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""

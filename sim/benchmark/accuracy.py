@@ -20,20 +20,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.friction import Friction
-from batchpid.validate import choice, integer, number
-from sim.benchmark.workload import TIMESTEP
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS, Physics
-from sim.engine.scene_spec import SceneSpec
-from sim.loop.arrays import Command
-from sim.loop.control_step import Constants, Layout, Measured, Model, Step, StepState, apply_friction, control_step
-from sim.loop.pid_law import PIDLaw
-from sim.loop.step_constants import acting_gains
-from sim.loop.step_state import reset_friction
-from sim.robot.description import Dynamics
-from sim.robot.robot import Robot
-from sim.tuning.moves import Moves, draw_moves, random_moves
+from batchpid.checks.validate import choice, integer, number
+from batchpid.motors.friction import Friction
+from batchpid.sim.benchmark.workload import TIMESTEP
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Step,
+    StepState,
+    apply_friction,
+    control_step,
+)
+from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.step_constants import acting_gains
+from batchpid.sim.loop.step_state import reset_friction
+from batchpid.sim.robot.description import Dynamics
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.tuning.moves import Moves, draw_moves, random_moves
 
 Float64 = NDArray[np.float64]
 
@@ -56,7 +65,7 @@ _LINE = 60
 class EquationOfMotion:
     """Robots without contact and joint limits, by steps of the Runge-Kutta method of order 4; arrays are (M, dof).
 
-    It has the methods of a :class:`sim.engine.sapien.pack.Pack` that a control step takes.
+    It has the methods of a :class:`batchpid.sim.engine.sapien.pack.Pack` that a control step takes.
     """
 
     def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:

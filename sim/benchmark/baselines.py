@@ -16,12 +16,12 @@ from multiprocessing.process import BaseProcess
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
-from sim.benchmark.workload import Case, Workload
-from sim.engine.sapien.pack import Pack
-from sim.workers.background import BACKGROUND
-from sim.workers.placement import pinned_cores
-from sim.workers.worker import ONE_THREAD
+from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
+from batchpid.sim.benchmark.workload import Case, Workload
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.workers.background import BACKGROUND
+from batchpid.sim.workers.placement import pinned_cores
+from batchpid.sim.workers.worker import ONE_THREAD
 
 Float64 = NDArray[np.float64]
 TUTORIALS = ("tutorial", "tutorial, a process a core")

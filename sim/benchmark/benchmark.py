@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.benchmark.baselines import make_baselines
-from sim.benchmark.peers import make_peers
-from sim.benchmark.policy import ResidualPolicy
-from sim.benchmark.workload import Case, Workload, run_round
-from sim.engine.native import python_calls
-from sim.engine.protocol import EnginePack
-from sim.loop.arrays import Arrays
-from sim.loop.loop import Loop
-from sim.options import RunnerOptions
-from sim.robot.robot import Robot
-from sim.runner import Runner
-from sim.workers.shared_memory import SharedArrays
+from batchpid.sim.benchmark.baselines import make_baselines
+from batchpid.sim.benchmark.peers import make_peers
+from batchpid.sim.benchmark.policy import ResidualPolicy
+from batchpid.sim.benchmark.workload import Case, Workload, run_round
+from batchpid.sim.engine.native import python_calls
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.loop import Loop
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.workers.shared_memory import SharedArrays
 
 Float64 = NDArray[np.float64]
 CASES = {

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
-from sim.benchmark.baselines import single_threaded
-from sim.benchmark.tutorial import TutorialLoop, tutorial_settings
-from sim.benchmark.workload import TIMESTEP, Case, Workload
+from batchpid.sim.benchmark.baselines import single_threaded
+from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
+from batchpid.sim.benchmark.workload import TIMESTEP, Case, Workload
 
 Float64 = NDArray[np.float64]
 

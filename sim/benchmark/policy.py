@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.elementwise import namespace
-from sim.benchmark.tutorial import tutorial_settings
-from sim.robot.robot import Robot
+from batchpid.arrays.elementwise import namespace
+from batchpid.sim.benchmark.tutorial import tutorial_settings
+from batchpid.sim.robot.robot import Robot
 
 HIDDEN = 64
 """Units of each of the two hidden layers."""

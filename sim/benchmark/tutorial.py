@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.reference import SimplePID
-from sim.engine.sapien.user_content import HeadlessScene
-from sim.robot.parts import Settings
-from sim.robot.robot import Robot
+from batchpid.law.reference import SimplePID
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
+from batchpid.sim.robot.parts import Settings
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 

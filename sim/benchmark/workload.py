@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError
-from sim.benchmark.tutorial import tutorial_settings
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.options import PhysicsPreset
-from sim.robot.robot import Robot
-from sim.runner import Runner
+from batchpid.sim.benchmark.tutorial import tutorial_settings
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.options import PhysicsPreset
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
 
 Float64 = NDArray[np.float64]
 TIMESTEP = 1 / 2000

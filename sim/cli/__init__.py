@@ -21,20 +21,20 @@ import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
+from batchpid.sim.cli.bench import BenchCommand
+from batchpid.sim.cli.compare import CompareCommand
+from batchpid.sim.cli.demo import DemoCommand
+from batchpid.sim.cli.excite import ExciteCommand
+from batchpid.sim.cli.identify import IdentifyCommand
+from batchpid.sim.cli.inspect import InspectCommand
+from batchpid.sim.cli.plot import PlotCommand
+from batchpid.sim.cli.progress import close_bars
+from batchpid.sim.cli.render import RenderCommand
+from batchpid.sim.cli.rollout import RolloutCommand
+from batchpid.sim.cli.survey import SurveyCommand
+from batchpid.sim.cli.tune import TuneCommand
+from batchpid.sim.cli.view import ViewCommand
 from batchpid.startup import exit_at_once
-from sim.cli.bench import BenchCommand
-from sim.cli.compare import CompareCommand
-from sim.cli.demo import DemoCommand
-from sim.cli.excite import ExciteCommand
-from sim.cli.identify import IdentifyCommand
-from sim.cli.inspect import InspectCommand
-from sim.cli.plot import PlotCommand
-from sim.cli.progress import close_bars
-from sim.cli.render import RenderCommand
-from sim.cli.rollout import RolloutCommand
-from sim.cli.survey import SurveyCommand
-from sim.cli.tune import TuneCommand
-from sim.cli.view import ViewCommand
 
 COMMANDS: dict[str, type[Any]] = {
     "demo": DemoCommand,

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from batchpid.files import write_atomically
-from batchpid.validate import integer
-from batchpid.versions import package_versions
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs
-from sim.cli.progress import bar
+from batchpid.checks.validate import integer
+from batchpid.io.files import write_atomically
+from batchpid.io.versions import package_versions
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.progress import bar
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class BenchCommand:
     """Figures to write, with the machine and the versions: .json."""
     force: flags.Force = False
 
-    imports = ("sim.benchmark.benchmark",)
+    imports = ("batchpid.sim.benchmark.benchmark",)
 
     def run(self) -> None:
         """Run the command."""
-        from sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_phases, measure_rates
-        from sim.benchmark.peers import PEERS, installed_peers
-        from sim.benchmark.workload import Workload
-        from sim.cli.report import table
-        from sim.engine.native import status as native_status
+        from batchpid.sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_phases, measure_rates
+        from batchpid.sim.benchmark.peers import PEERS, installed_peers
+        from batchpid.sim.benchmark.workload import Workload
+        from batchpid.sim.cli.report import table
+        from batchpid.sim.engine.native import status as native_status
 
         out = Outputs(force=self.force).path("out", self.out, (".json",))
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers

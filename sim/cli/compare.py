@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs
-from sim.tuning.gain_sets import gain_set
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.tuning.gain_sets import gain_set
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class CompareCommand:
     """First two sets on the first move, to draw: .png or .svg."""
     force: flags.Force = False
 
-    imports = ("sim.plots", "sim.runner")
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
     def run(self) -> None:
         """Run the command."""
-        from sim import plots
-        from sim.cli.report import draw_first_move, evaluation_table
-        from sim.cli.run import evaluate_sets, read_variation
+        from batchpid.sim import plots
+        from batchpid.sim.cli.report import draw_first_move, evaluation_table
+        from batchpid.sim.cli.run import evaluate_sets, read_variation
 
         picture = Outputs(force=self.force).path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)

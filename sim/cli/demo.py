@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import number
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs, beside
-from sim.tuning.gain_sets import gain_set
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.tuning.gain_sets import gain_set
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class DemoCommand:
     viewer: flags.Switch = False
     """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
 
-    imports = ("sim.plots", "sim.runner")
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
     def run(self) -> None:
         """Run the command."""
-        from sim import Runner, plots
-        from sim.cli.run import hold_setpoint, start_poses
+        from batchpid.sim import Runner, plots
+        from batchpid.sim.cli.run import hold_setpoint, start_poses
 
         if self.viewer:
-            from sim.view.film import check_renderer, show_window
+            from batchpid.sim.view.film import check_renderer, show_window
 
             check_renderer()
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)

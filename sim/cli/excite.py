@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class ExciteCommand:
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
 
-    imports = ("sim.engine.sapien.dynamics", "sim.tuning.identification.excitation")
+    imports = ("batchpid.sim.engine.sapien.dynamics", "batchpid.sim.identification.excitation")
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.files import write_atomically
-        from sim.cli.report import table
-        from sim.tuning.identification.excitation import excite
-        from sim.tuning.identification.logs import setpoint_csv
+        from batchpid.io.files import write_atomically
+        from batchpid.sim.cli.report import table
+        from batchpid.sim.identification.excitation import excite
+        from batchpid.sim.identification.logs import setpoint_csv
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs, beside
-from sim.cli.progress import AT_MOST, bar
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
-    from sim.tuning.identification.result import Identification
+    from batchpid.sim.identification.result import Identification
 
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Logs: .csv, .h5 or recordings.")]
 
@@ -61,13 +61,17 @@ class IdentifyCommand:
     actuators file."""
     force: flags.Force = False
 
-    imports = ("sim.plots", "sim.engine.sapien.dynamics", "sim.tuning.identification.identify")
+    imports = (
+        "batchpid.sim.plots",
+        "batchpid.sim.engine.sapien.dynamics",
+        "batchpid.sim.identification.identification",
+    )
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.files import write_atomically
-        from sim import plots
-        from sim.tuning.identification.identify import identify
+        from batchpid.io.files import write_atomically
+        from batchpid.sim import plots
+        from batchpid.sim.identification.identification import identify
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
         if not self.logs:
@@ -121,8 +125,8 @@ def _params(robot: Robot, path: Path) -> Any:
 
 def report(found: Identification) -> str:
     """Return a table of the joints, and the delay, the payload and the errors in lines."""
-    from sim.cli.report import table
-    from sim.tuning.identification.unknowns import PER_JOINT
+    from batchpid.sim.cli.report import table
+    from batchpid.sim.identification.unknowns import PER_JOINT
 
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
         interval = found.interval(kind, joint)
@@ -150,7 +154,7 @@ def report(found: Identification) -> str:
 
 def _not_identified(found: Identification) -> list[str]:
     """Return lines for the unknowns that the logs do not identify, by joint, each with the remedy."""
-    from sim.tuning.identification.unknowns import PER_JOINT
+    from batchpid.sim.identification.unknowns import PER_JOINT
 
     of_joints, others = found.missing()
     if not of_joints and not others:

@@ -8,13 +8,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from batchpid.versions import package_versions
-from sim import Finding, Robot
-from sim.cli import flags
-from sim.robot.findings import summary
-from sim.robot.inertia import DENSITY
-from sim.robot.parts import Joint
-from sim.tuning.gain_sets import gain_set
+from batchpid.io.versions import package_versions
+from batchpid.sim import Finding, Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.robot.findings import summary
+from batchpid.sim.robot.inertia import DENSITY
+from batchpid.sim.robot.parts import Joint
+from batchpid.sim.tuning.gain_sets import gain_set
 
 HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
 SOURCES = {
@@ -43,7 +43,7 @@ class InspectCommand:
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
-    imports = ("sim.engine.sapien.dynamics",)
+    imports = ("batchpid.sim.engine.sapien.dynamics",)
 
     def run(self) -> int:
         """Run the command and return its exit status."""
@@ -65,7 +65,7 @@ class InspectCommand:
         print("\n" + mass_table(robot, light_too=self.all))
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
-            from sim.engine.native import status
+            from batchpid.sim.engine.native import status
 
             print(f"\nEngine: SAPIEN {package_versions(['sapien'])['sapien']}, {status()}.")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
@@ -73,7 +73,7 @@ class InspectCommand:
 
 def joint_table(robot: Robot, *, fixed_too: bool) -> str:
     """Return a table of the moving joints, numbered as in qpos, and the fixed ones."""
-    from sim.cli.report import table
+    from batchpid.sim.cli.report import table
 
     rows = [
         [
@@ -99,7 +99,7 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
 
 def mass_table(robot: Robot, *, light_too: bool) -> str:
     """Return a table of the masses of links and their sources, without light links, and the total."""
-    from sim.cli.report import table
+    from batchpid.sim.cli.report import table
 
     masses = robot.link_masses
     total = sum(link.mass for link in masses.values())

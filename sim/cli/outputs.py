@@ -10,9 +10,9 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.files import try_writing
-from batchpid.validate import file_path
+from batchpid.io.files import try_writing
 
 P = TypeVar("P", bound=Path | None)
 

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import integer
-from sim import Rollout, read_recording
-from sim.cli import flags
-from sim.cli.outputs import Outputs, beside, stem
+from batchpid.sim import Rollout, read_recording
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, beside, stem
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class PlotCommand:
     """
 
     recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a sim.Recorder wrote: .npz or .h5."""
+    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
     versus: flags.OptionalPath = None
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
@@ -37,11 +37,11 @@ class PlotCommand:
     NAME-versus-OTHER.png."""
     force: flags.Force = False
 
-    imports = ("sim.plots",)
+    imports = ("batchpid.sim.plots",)
 
     def run(self) -> None:
         """Run the command."""
-        from sim import plots
+        from batchpid.sim import plots
 
         every = integer("every", self.every, 1, 10**9)
         if not self.recording.is_file():  # before a picture is named after it

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import tyro
 
-from batchpid.validate import integer
-from sim.cli import flags
-from sim.cli.outputs import Outputs, beside
-from sim.cli.progress import bar
+from batchpid.checks.validate import integer
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.progress import bar
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class RenderCommand:
     """
 
     recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a sim.Recorder wrote: .npz or .h5."""
+    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
     robot: flags.RecordedRobot = None
     num_envs: int = 16
     """Number of envs to show, the first ones; 64 at most."""
@@ -36,13 +36,13 @@ class RenderCommand:
     """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
     force: flags.Force = False
 
-    imports = ("sim.view.film",)
+    imports = ("batchpid.sim.view.film",)
 
     def run(self) -> None:
         """Run the command."""
-        from sim.cli.run import read_run
-        from sim.view.film import FORMATS, write_film
-        from sim.view.layout import MAX_ROBOTS
+        from batchpid.sim.cli.run import read_run
+        from batchpid.sim.view.film import FORMATS, write_film
+        from batchpid.sim.view.layout import MAX_ROBOTS
 
         outputs = Outputs(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tabulate import tabulate
 
 from batchpid.metrics import StepMetrics
-from sim import Robot, Rollout, Runner
-from sim.tuning.evaluation import Evaluation, arm_joints
+from batchpid.sim import Robot, Rollout, Runner
+from batchpid.sim.tuning.evaluation import Evaluation, arm_joints
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
@@ -129,7 +129,7 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
 
 def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Draw the first two ``evaluations`` on their first move to ``path``, and return it."""
-    from sim import plots
+    from batchpid.sim import plots
 
     first, second = evaluations[:2]
     runs = [evaluation.rollout.for_envs(slice(0, 1)) for evaluation in (first, second)]

@@ -6,11 +6,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from batchpid.validate import array, number
-from sim import Recorder, Robot, write_recording
-from sim.cli import flags
-from sim.cli.outputs import Outputs
-from sim.tuning.gain_sets import gain_set
+from batchpid.checks.validate import array, number
+from batchpid.sim import Recorder, Robot, write_recording
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.tuning.gain_sets import gain_set
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ class RolloutCommand:
     """Step responses to draw: .png or .svg."""
     force: flags.Force = False
 
-    imports = ("sim.plots", "sim.runner")
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
     def run(self) -> None:
         """Run the command."""
-        from sim import Runner, plots
-        from sim.cli.run import hold_setpoint, read_variation, start_poses
+        from batchpid.sim import Runner, plots
+        from batchpid.sim.cli.run import hold_setpoint, read_variation, start_poses
 
         outputs = Outputs(force=self.force)
         out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import integer, number
-from sim import Robot, Rollout, Runner, read_recording
-from sim.cli.progress import bar
-from sim.cli.report import run_report
-from sim.randomization.randomization import Randomization
-from sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
-from sim.tuning.gain_sets import GainSet
-from sim.tuning.moves import Moves, random_moves, tutorial_move
-from sim.tuning.randomization import at_the_joints, load_randomization, reseeded, usual_variation
+from batchpid.sim import Robot, Rollout, Runner, read_recording
+from batchpid.sim.cli.progress import bar
+from batchpid.sim.cli.report import run_report
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
+from batchpid.sim.tuning.gain_sets import GainSet
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.randomization_presets import at_the_joints, load_randomization, reseeded, usual_variation
 
 
 def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArray[np.float64]:
@@ -51,7 +51,8 @@ def evaluate_sets(
 ) -> list[Evaluation]:
     """Evaluate ``sets`` on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
 
-    ``options`` go to :func:`sim.tuning.evaluation.evaluate_gains`. Of the actuators, those at the joints act on drives.
+    ``options`` go to :func:`batchpid.sim.tuning.evaluation.evaluate_gains`. Of the actuators, those at the joints act
+    on drives.
     """
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from batchpid.files import write_atomically
-from sim.cli import flags
-from sim.cli.outputs import Outputs
+from batchpid.io.files import write_atomically
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
 
 if TYPE_CHECKING:
-    from sim.tuning.survey import RobotReport
+    from batchpid.sim.tuning.robot_survey import RobotReport
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class SurveyCommand:
     """Table to write in Markdown, .md."""
     force: flags.Force = False
 
-    imports = ("sim.tuning.survey",)
+    imports = ("batchpid.sim.tuning.robot_survey",)
 
     def run(self) -> int:
         """Run the command; the exit status is 1 if a robot crashed its process."""
-        from sim.cli.progress import bar
-        from sim.tuning.survey import find_urdfs, survey
+        from batchpid.sim.cli.progress import bar
+        from batchpid.sim.tuning.robot_survey import find_urdfs, survey
 
         outputs = Outputs(force=self.force)
         json_path = outputs.path("json", self.json, (".json",))

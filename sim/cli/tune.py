@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 import tyro
 
 from batchpid import save_params
-from sim import Robot
-from sim.cli import flags
-from sim.cli.outputs import Outputs, beside
-from sim.cli.progress import bar
-from sim.tuning.gain_sets import GainSet
-from sim.tuning.weights import Weights
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.progress import bar
+from batchpid.sim.tuning.gain_sets import GainSet
+from batchpid.sim.tuning.weights import Weights
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ class TuneCommand:
     """Before and after on the first move, to draw: .png or .svg. Default: NAME-tune.png, next to the params file."""
     force: flags.Force = False
 
-    imports = ("sim.plots", "sim.tuning.search")
+    imports = ("batchpid.sim.plots", "batchpid.sim.tuning.search")
 
     def run(self) -> None:
         """Run the command."""
-        from sim import plots
-        from sim.cli.report import draw_first_move, evaluation_table
-        from sim.cli.run import evaluate_sets, read_variation
-        from sim.tuning.evaluation import arm_joints
-        from sim.tuning.search import tune
+        from batchpid.sim import plots
+        from batchpid.sim.cli.report import draw_first_move, evaluation_table
+        from batchpid.sim.cli.run import evaluate_sets, read_variation
+        from batchpid.sim.tuning.evaluation import arm_joints
+        from batchpid.sim.tuning.search import tune
 
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         read = [Path(path) for path in (self.actuators, self.randomize) if path is not None]

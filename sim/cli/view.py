@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import integer, number
-from sim import Robot
-from sim.cli import flags
-from sim.tuning.gain_sets import gain_set
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
-    from sim.view import LiveSimulation, Playback
+    from batchpid.sim.view import LiveSimulation, Playback
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -49,12 +49,12 @@ class ViewCommand:
     """Port, or the next free one if it is taken."""
     time_limit: flags.TimeLimit = None
 
-    imports = ("sim.view",)
+    imports = ("batchpid.sim.view",)
 
     def run(self) -> None:
         """Run the command."""
-        from sim.view import View
-        from sim.view.address import resolve
+        from batchpid.sim.view import View
+        from batchpid.sim.view.address import resolve
 
         port = integer("port", self.port, 1, 65535)
         number("fps", self.fps, 1.0, 120.0, "frames per second")
@@ -75,7 +75,7 @@ class ViewCommand:
 
     def _live(self) -> LiveSimulation:
         """Return the running robots."""
-        from sim.view import LiveSimulation
+        from batchpid.sim.view import LiveSimulation
 
         robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes, actuators=self.actuators)
         gains = None if self.gains is None else gain_set(robot, self.gains)
@@ -97,9 +97,9 @@ class ViewCommand:
 
     def _recorded(self, path: Path) -> Playback:
         """Return the run in the file; of many envs those that fit on the page."""
-        from sim.cli.run import read_run
-        from sim.view import Playback
-        from sim.view.layout import MAX_ROBOTS
+        from batchpid.sim.cli.run import read_run
+        from batchpid.sim.view import Playback
+        from batchpid.sim.view.layout import MAX_ROBOTS
 
         usage = f"batchpid view PATH/TO/ROBOT.urdf --play {shlex.quote(str(path))}"
         rollout, robot = read_run(path, self.robot, self.missing_meshes, usage)

@@ -4,10 +4,10 @@ Some joints move (``joints``), others rest or follow one of those: q_whole = res
 G. With the mass matrix M and the passive forces h (gravity, Coriolis and centrifugal forces) of all joints, those of
 the ones that move are G^T M G and G^T h.
 
-The extension computes M by composite rigid bodies (:mod:`sim.engine.rigid_body`) and h by the recursive Newton-Euler
-algorithm without acceleration of the joints (R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section
-5.3), in the axes of the base and about its origin. With the motions s_j of the joints, the velocity V and acceleration
-A of a body, and its inertia I, from the base to the tips::
+The extension computes M by composite rigid bodies (:mod:`batchpid.sim.engine.rigid_body`) and h by the recursive
+Newton-Euler algorithm without acceleration of the joints (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
+2008, section 5.3), in the axes of the base and about its origin. With the motions s_j of the joints, the velocity V and
+acceleration A of a body, and its inertia I, from the base to the tips::
 
     V_j = V_above + s_j q'_j       A_j = A_above + V_j x s_j q'_j       F_j = I_j A_j + V_j x* I_j V_j
 
@@ -32,12 +32,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine import native
-from sim.engine.engines import load_engine
-from sim.engine.native.interface import DYNAMICS, STEP
-from sim.engine.protocol import RobotModel
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.description import RobotDescription
+from batchpid.sim.engine import native
+from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.native.interface import DYNAMICS, STEP
+from batchpid.sim.engine.protocol import RobotModel
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.description import RobotDescription
 
 Float64 = NDArray[np.float64]
 Models = Callable[[float], RobotModel]

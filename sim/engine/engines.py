@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from batchpid.validate import choice
-from sim.engine.protocol import Engine, RobotModel
-from sim.engine.scene_spec import SceneSpec
+from batchpid.checks.validate import choice
+from batchpid.sim.engine.protocol import Engine, RobotModel
+from batchpid.sim.engine.scene_spec import SceneSpec
 
-MODULES = {"sapien": "sim.engine.sapien.sapien_engine"}
+MODULES = {"sapien": "batchpid.sim.engine.sapien.sapien_engine"}
 """Module of each engine; its constant ENGINE is the engine."""
 
 

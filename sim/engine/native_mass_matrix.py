@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine import native
-from sim.engine.engines import scene_dynamics
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine import native
+from batchpid.sim.engine.engines import scene_dynamics
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 
 class NativeMassMatrix:

@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import first_difference
 from batchpid.native.tracing import trace
-from sim.engine.batch_dynamics import (
+from batchpid.sim.engine.batch_dynamics import (
     Friction,
     MovingJoints,
     NativeBatchDynamics,
     PinocchioBatchDynamics,
 )
-from sim.engine.native import extension, python_calls
-from sim.engine.native.native_tick import NativeTick
-from sim.engine.sapien.building import build_scene, new_system
-from sim.engine.sapien.calls import PythonCalls
-from sim.engine.sapien.dynamics import Dynamics
-from sim.engine.sapien.native_calls import NativeCalls
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.parts import Joint
+from batchpid.sim.engine.native import extension, python_calls
+from batchpid.sim.engine.native.native_tick import NativeTick
+from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.calls import PythonCalls
+from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.sapien.native_calls import NativeCalls
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.parts import Joint
 
 STEPS = 50
 _BODY = """<inertial><mass value="1.5"/>

@@ -1,7 +1,7 @@
 """Interface between a physics engine and loop, robots and tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning compute with a
-:class:`RobotModel`. :func:`sim.engine.engines.load_engine` returns an :class:`Engine`, which makes both.
+:class:`RobotModel`. :func:`batchpid.sim.engine.engines.load_engine` returns an :class:`Engine`, which makes both.
 
 A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks it.
 """
@@ -14,14 +14,14 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.actuators import Actuators
 from batchpid.errors import InvalidArgumentError
-from batchpid.friction import Friction
-from sim.engine.native.interface import STATUS
-from sim.engine.rigid_body import RigidBodies
-from sim.engine.scene_spec import SceneSpec, Variation
-from sim.robot import description
-from sim.robot.description import RobotDescription
+from batchpid.motors import Actuators
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.native.interface import STATUS
+from batchpid.sim.engine.rigid_body import RigidBodies
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot import description
+from batchpid.sim.robot.description import RobotDescription
 
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -145,7 +145,7 @@ class DrivenPack(EnginePack, Protocol):
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from a program of XLA (:func:`sim.engine.native.xla.sim_step`)."""
+    """Sim step of a pack as one native call, also from XLA (:func:`batchpid.sim.engine.native.xla.sim_step`)."""
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""

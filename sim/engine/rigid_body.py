@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.native import xla
-from sim.engine.native.interface import BODY
+from batchpid.sim.engine.native import xla
+from batchpid.sim.engine.native.interface import BODY
 
 Float64 = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robot.parts import Joint
+from batchpid.sim.robot.parts import Joint
 
 Float64 = NDArray[np.float64]
 
@@ -24,11 +24,11 @@ Objects are entities, and names of the robot's links, merged links included. Non
 class SceneSpec:
     """Everything that a scene is built from, picklable.
 
-    ``urdf`` is sanitised text (see :mod:`sim.robot.urdf`); ``ignored`` are pairs of its links that do not collide;
-    ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are settings of the solver of
-    ``engine``, of the engine's type. With ``merge_fixed`` each rigid body is one link (:mod:`sim.robot.merging`).
-    Without ``collisions`` the robot has no shapes and there is no ground; masses and inertias stay.
-    Specs that differ in ``build`` alone are equal.
+    ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its links that do not
+    collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are settings of the solver
+    of ``engine``, of the engine's type. With ``merge_fixed`` each rigid body is one link
+    (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` the robot has no shapes and there is no ground; masses
+    and inertias stay. Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str

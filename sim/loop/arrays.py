@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.observation import OBSERVED, Observation
+from batchpid.sim.observation import OBSERVED, Observation
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""
@@ -19,7 +19,7 @@ class Command(NamedTuple):
     """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is given."""
 
     setpoint: Any
-    """(envs, size), as :attr:`sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
+    """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
     setpoint_rate: Any = None
     """Rate of the setpoint, per second (envs, size)."""
     feedforward: Any = None
@@ -31,9 +31,10 @@ class Command(NamedTuple):
 
 
 class FaultArrays(NamedTuple):
-    """Last fault of each env (envs,): sim step (-1: none), joint, and index into :data:`sim.loop.faults.CAUSES`.
+    """Last fault of each env (envs,): sim step (-1: none), joint, and index into
+    :data:`batchpid.sim.loop.faults.CAUSES`.
 
-    Where the cause is one of :data:`sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the entry of the command.
+    Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the entry of the command.
 
     Without collisions, ``missed_contact`` is the sim step of its first missed contact (0: none).
     """

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import batchpid as bp
-from sim.engine import native
-from sim.engine.native import xla
-from sim.options import RunnerOptions
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native import xla
+from batchpid.sim.options import RunnerOptions
 
 
 def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:

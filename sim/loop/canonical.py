@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 import batchpid as bp
-from batchpid.versions import package_versions
-from sim.loop.arrays import Arrays
-from sim.loop.loop import Loop
-from sim.options import RunnerOptions
+from batchpid.io.versions import package_versions
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.loop import Loop
+from batchpid.sim.options import RunnerOptions
 
 _TICKS, _SUBSTEPS, _STEP = 5, 20, 0.1  # rad, m, N m or N: small enough for any robot
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.loop.arrays import Arrays
+from batchpid.sim.loop.arrays import Arrays
 
 LISTED = 5
 """Contacts that a warning lists."""

@@ -9,8 +9,9 @@ In this order, with setpoint r, joint positions q and velocities v, and passive 
     motors      m    = motors(u)
     friction    qf   = m - friction(m, v)             applied in the next sim step
 
-Executors call :func:`control_step` at every sim step, each with its own kind of arrays: :mod:`sim.loop.numpy_executor`,
-:mod:`sim.loop.xla_executor`. A :class:`StepState` is the whole state of the control between sim steps.
+Executors call :func:`control_step` at every sim step, each with its own kind of arrays:
+:mod:`batchpid.sim.loop.numpy_executor`, :mod:`batchpid.sim.loop.xla_executor`. A :class:`StepState` is the whole state
+of the control between sim steps.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid import friction as friction_model
-from batchpid import guard as guard_model
-from batchpid.actuators import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
-from batchpid.coefficients import Coefficients
-from batchpid.coupling import Coupling
-from batchpid.elementwise import clip, namespace, wrap
-from batchpid.friction import Friction, FrictionState
-from batchpid.guard import GuardState
-from sim.loop.arrays import Command
-from sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, half_way
+from batchpid.arrays.elementwise import clip, namespace, wrap
+from batchpid.law.coefficients import Coefficients
+from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
+from batchpid.motors import friction as friction_model
+from batchpid.motors import guard as guard_model
+from batchpid.motors.coupling import Coupling
+from batchpid.motors.friction import Friction, FrictionState
+from batchpid.motors.guard import GuardState
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, half_way
 
 REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
@@ -133,7 +134,7 @@ class Constants(NamedTuple):
     guard: Any = None
     """:class:`batchpid.Guard`"""
     motors: Any = None
-    """:class:`batchpid.actuators.Coefficients` of motors and sensors."""
+    """:class:`batchpid.motors.Coefficients` of motors and sensors."""
     driven: bp.PIDParams | None = None
     """Params of the integral that moves the targets of drives."""
 
@@ -155,7 +156,7 @@ class Model(NamedTuple):
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
+    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
     controller: Any = None
     """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort)."""
     noise: Any = None

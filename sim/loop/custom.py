@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.jax_settings import own_settings
+from batchpid.arrays.read_only import read_only
 from batchpid.errors import ControllerError, InvalidArgumentError
-from batchpid.jax_settings import own_settings
-from batchpid.read_only import read_only
-from sim.options import RunnerOptions
+from batchpid.sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 
 
 class OwnController:
-    """Caller's own controller (:class:`sim.options.Controller`), checked; its state is a dictionary of arrays by name.
+    """Caller's own controller (:class:`batchpid.sim.options.Controller`), checked; its state is a dictionary of arrays
+    by name.
 
     All groups of envs share it, and thus its JAX program.
     """

@@ -8,26 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.actuators import ActuatorState, advance_measurement
-from batchpid.elementwise import clip
-from batchpid.friction import FrictionState
-from batchpid.guard import GuardState
-from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
-from sim.loop.arrays import Arrays, Command
-from sim.loop.backend import obstacle
-from sim.loop.control_step import StepState
-from sim.loop.custom import OwnController
-from sim.loop.faults import FaultContainment, far, finite, near
-from sim.loop.native_executor import NativeExecutor
-from sim.loop.numpy_executor import NumPyExecutor, passive_forces, with_model
-from sim.loop.pid_law import PIDLaw
-from sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
-from sim.loop.step_constants import make_constants, make_layout
-from sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
-from sim.loop.variation import acting_actuators, acting_params, variation
-from sim.loop.xla_executor import XLAExecutor
-from sim.options import RunnerOptions
-from sim.randomization.draws import Draws
+from batchpid.arrays.elementwise import clip
+from batchpid.motors import ActuatorState, advance_measurement
+from batchpid.motors.friction import FrictionState
+from batchpid.motors.guard import GuardState
+from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
+from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
+from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.backend import obstacle
+from batchpid.sim.loop.control_step import StepState
+from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.faults import FaultContainment, far, finite, near
+from batchpid.sim.loop.native_executor import NativeExecutor
+from batchpid.sim.loop.numpy_executor import NumPyExecutor, passive_forces, with_model
+from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
+from batchpid.sim.loop.step_constants import make_constants, make_layout
+from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
+from batchpid.sim.loop.xla_executor import XLAExecutor
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.draws import Draws
 
 Float64 = NDArray[np.float64]
 

@@ -47,7 +47,7 @@ def order(failure: Failure) -> tuple[int, int]:
 
 
 class RunError(Exception):
-    """A group of envs failed in :meth:`sim.loop.loop.Loop.run`."""
+    """A group of envs failed in :meth:`batchpid.sim.loop.loop.Loop.run`."""
 
     def __init__(self, failure: Failure) -> None:
         super().__init__(str(failure.error))

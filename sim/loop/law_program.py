@@ -1,7 +1,7 @@
 """The law of the control "pid" as a native program (:mod:`batchpid.native`).
 
 In a sim step the law makes some thirty calls of NumPy. The program is traced from
-:meth:`sim.loop.pid_law.PIDLaw.advance`, so that there is only one definition of the law.
+:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, so that there is only one definition of the law.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.coefficients import Coefficients
+from batchpid.law.coefficients import Coefficients
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.tracing import Symbol, Trace, trace
-from sim.engine import native
-from sim.loop.pid_law import PIDLaw
+from batchpid.sim.engine import native
+from batchpid.sim.loop.pid_law import PIDLaw
 
 
 @lru_cache(maxsize=256)
@@ -44,7 +44,7 @@ def _trace_law(law: PIDLaw, structures: tuple[tuple[Any, ...], ...], observed: b
 
 
 class LawProgram:
-    """:meth:`sim.loop.pid_law.PIDLaw.advance` for given coefficients ``k`` (envs, joints), of float64."""
+    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance` for given coefficients ``k`` (envs, joints), of float64."""
 
     def __init__(self, law: PIDLaw, k: Coefficients) -> None:
         self._law = law
@@ -73,7 +73,7 @@ class LawProgram:
     ) -> tuple[Any, ...]:
         """Return the new state, the effort, and the mask of saturated joints, or None unless ``observed``.
 
-        Arguments as in :meth:`sim.loop.pid_law.PIDLaw.advance`.
+        Arguments as in :meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`.
         """
         inputs = (*command, qpos, qvel if self._law.measures_rate else None, *others)
         leaves = (*state, *inputs)

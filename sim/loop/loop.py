@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import ControllerError
-from sim.engine.protocol import EnginePack
-from sim.engine.scene_spec import SceneSpec
-from sim.loop.arrays import Arrays, Command, Ticks
-from sim.loop.custom import OwnController
-from sim.loop.env_group import EnvGroup
-from sim.loop.failure import Failure, RunError, order
-from sim.loop.snapshot import EnvStates, Snapshot
-from sim.loop.variation import make_pack
-from sim.options import RunnerOptions
-from sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.loop.acting_draws import make_pack
+from batchpid.sim.loop.arrays import Arrays, Command, Ticks
+from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.env_group import EnvGroup
+from batchpid.sim.loop.failure import Failure, RunError, order
+from batchpid.sim.loop.snapshot import EnvStates, Snapshot
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.draws import NOTHING, Draws
 
 GROUP_SIZE = 16
 """Envs of a group: enough to share the overhead of NumPy calls, few enough for the working set to stay in the cache."""

@@ -1,9 +1,9 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
-:func:`sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on arrays
-that hold the state from step to step. Where it cannot be traced (sensors and motors, a caller's own controller), it
-runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the friction
-model updates its mass matrix runs in the same way.
+:func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
+arrays that hold the state from step to step. Where it cannot be traced (sensors and motors, a caller's own controller),
+it runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the
+friction model updates its mass matrix runs in the same way.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.tracing import Symbol, Trace, trace
-from sim.engine.engines import scene_dynamics
-from sim.engine.native.interface import STATUS
-from sim.engine.native.native_tick import NativeTick
-from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
-from sim.loop.arrays import Command
-from sim.loop.control_step import (
+from batchpid.sim.engine.engines import scene_dynamics
+from batchpid.sim.engine.native.interface import STATUS
+from batchpid.sim.engine.native.native_tick import NativeTick
+from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import (
     REFRESH_STEPS,
     Constants,
     Layout,
@@ -33,9 +33,9 @@ from sim.loop.control_step import (
     StepState,
     control_step,
 )
-from sim.loop.numpy_executor import NumPyExecutor, Ran
-from sim.loop.pid_law import MASS_MATRIX_STEPS
-from sim.options import RunnerOptions
+from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
+from batchpid.sim.loop.pid_law import MASS_MATRIX_STEPS
+from batchpid.sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 

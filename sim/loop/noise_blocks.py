@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.actuators import ActuatorState, Coefficients, measurement_noise
+from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 
 BLOCK = 64
 """Sim steps of a block."""
 
 
 class NoiseBlocks:
-    """:func:`batchpid.actuators.measurement_noise` at the step of a state, from blocks of consecutive steps."""
+    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive steps."""
 
     def __init__(self) -> None:
         self._key: Any = None

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ControllerError
-from sim.engine.engines import scene_dynamics
-from sim.engine.native_mass_matrix import NativeMassMatrix
-from sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
-from sim.loop.arrays import Command
-from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
-from sim.loop.custom import OwnController
-from sim.loop.faults import sound
-from sim.loop.jitted import jitted_controller, jitted_law
-from sim.loop.law_program import LawProgram
-from sim.loop.noise_blocks import NoiseBlocks
-from sim.loop.stage_program import compiled_stages
-from sim.loop.step_constants import needs_qvel
-from sim.options import RunnerOptions
+from batchpid.sim.engine.engines import scene_dynamics
+from batchpid.sim.engine.native_mass_matrix import NativeMassMatrix
+from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.faults import sound
+from batchpid.sim.loop.jitted import jitted_controller, jitted_law
+from batchpid.sim.loop.law_program import LawProgram
+from batchpid.sim.loop.noise_blocks import NoiseBlocks
+from batchpid.sim.loop.stage_program import compiled_stages
+from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import batchpid as bp
-from batchpid.choices import PerInertia, PerMassMatrix
-from batchpid.coefficients import Coefficients
-from batchpid.computed_torque import advance_with_mass_matrix, per_inertia
-from batchpid.elementwise import clip, namespace
+from batchpid.arrays.choices import PerInertia, PerMassMatrix
+from batchpid.arrays.elementwise import clip, namespace
+from batchpid.law.coefficients import Coefficients
+from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick."""

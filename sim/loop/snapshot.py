@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.choices import CHOICES, Everywhere
+from batchpid.arrays.choices import CHOICES, Everywhere
+from batchpid.checks.validate import file_path, integer, names
 from batchpid.errors import InvalidArgumentError
-from batchpid.files import write_atomically
-from batchpid.friction import FrictionState
-from batchpid.guard import GuardState
-from batchpid.npz import read_npz
-from batchpid.validate import file_path, integer, names
-from sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
-from sim.loop.tables import flatten, nest, widen
+from batchpid.io.files import write_atomically
+from batchpid.io.npz import read_npz
+from batchpid.motors.friction import FrictionState
+from batchpid.motors.guard import GuardState
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
+from batchpid.sim.loop.tables import flatten, nest, widen
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
@@ -48,20 +48,20 @@ class EnvStates:
 
     engine: NDArray[np.float64]
     """Robots and content (envs, values), of which only the engine knows the meaning; NaN where an env has fewer values
-    than another (:meth:`sim.engine.protocol.EnginePack.read_state`)."""
+    than another (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`)."""
     effort: NDArray[np.float32]
     saturated: NDArray[np.bool_]
     controller: dict[str, NDArray[Any]]
     """Leaves of :class:`batchpid.PIDState`."""
     friction: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
+    """Leaves of :class:`batchpid.motors.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
     actuators: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.actuators.ActuatorState`, and :data:`EPISODE`; none without effects on
+    """Leaves of :class:`batchpid.motors.ActuatorState`, and :data:`EPISODE`; none without effects on
     efforts or measurements."""
     guard: dict[str, NDArray[Any]]
-    """Leaves of :class:`batchpid.guard.GuardState`, and :data:`CHANGED`; none without guard."""
+    """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without guard."""
     containment: dict[str, NDArray[Any]]
-    """See :class:`sim.loop.faults.FaultContainment`."""
+    """See :class:`batchpid.sim.loop.faults.FaultContainment`."""
 
     def for_envs(self, envs: slice) -> EnvStates:
         """Return the state of some envs, as copies."""
@@ -145,7 +145,7 @@ class Snapshot:
     """State of all envs of a runner at one moment. It can be pickled, or kept in a file: :meth:`save`, :meth:`load`."""
 
     about: dict[str, Any]
-    """Options that a runner must share to restore it: :meth:`sim.RunnerOptions.about`."""
+    """Options that a runner must share to restore it: :meth:`batchpid.sim.RunnerOptions.about`."""
     steps: int
     """Sim steps up to this moment."""
     params: bp.PIDParams

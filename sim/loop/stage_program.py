@@ -1,6 +1,6 @@
 """Elementwise stages of a sim step as programs of the extension: one call executes all operations of a stage.
 
-As with the law (:mod:`sim.loop.law_program`), the only definition is traced, and results are bit-identical.
+As with the law (:mod:`batchpid.sim.loop.law_program`), the only definition is traced, and results are bit-identical.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.actuators import STAGES, Coefficients, Stages
+from batchpid.motors import STAGES, Coefficients, Stages
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import OPERATION
 from batchpid.native.tracing import trace
-from sim.engine import native
+from batchpid.sim.engine import native
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""

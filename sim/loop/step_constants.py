@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 
 import batchpid as bp
-from batchpid import actuators as actuator_model
-from batchpid.actuators import ActuatorState
-from batchpid.coupling import Coupling
-from batchpid.elementwise import TURN
-from sim.engine.protocol import EnginePack
-from sim.loop.control_step import Constants, KnownFriction, Layout
-from sim.loop.pid_law import PIDLaw
-from sim.options import RunnerOptions
-from sim.robot.actuators import known_joints
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.mimics import coupling_of
+from batchpid import motors as actuator_model
+from batchpid.arrays.elementwise import TURN
+from batchpid.motors import ActuatorState
+from batchpid.motors.coupling import Coupling
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.control_step import Constants, KnownFriction, Layout
+from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.actuator_checks import known_joints
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.mimics import coupling_of
 
 BAND = {"rad": 1e-4, "m": 2e-5}
 """Half width, by the joint's unit, of the band in which the compensation is less than the friction."""

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid import friction as friction_model
-from batchpid import guard as guard_model
-from batchpid.actuators import ActuatorState
-from batchpid.computed_torque import convert_integral
-from batchpid.friction import FrictionState
-from sim.engine.protocol import EnginePack
-from sim.loop.control_step import (
+from batchpid.law.computed_torque import convert_integral
+from batchpid.motors import ActuatorState
+from batchpid.motors import friction as friction_model
+from batchpid.motors import guard as guard_model
+from batchpid.motors.friction import FrictionState
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.control_step import (
     REFRESH_STEPS,
     Constants,
     Layout,
@@ -22,7 +22,7 @@ from sim.loop.control_step import (
     joint_mass_matrix,
     mass_matrix,
 )
-from sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.pid_law import PIDLaw
 
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -77,6 +77,6 @@ def reset_guard(constants: Constants, state: StepState, qpos: Float64, mask: Boo
 def init_motors(
     actuators: bp.Actuators, pack: EnginePack, qpos: Float64, episode: NDArray[np.int64], **since: Any
 ) -> ActuatorState:
-    """Return the state of actuators that start at ``qpos``: :func:`batchpid.actuators.init`."""
+    """Return the state of actuators that start at ``qpos``: :func:`batchpid.motors.init`."""
     envs = np.arange(pack.first_env, pack.first_env + pack.size)
     return bp.actuators.init(actuators, qpos, pack.spec.timestep, envs=envs, episode=episode, **since)

@@ -1,8 +1,9 @@
 """Sim steps of a tick as one program of XLA, which reaches the engine by a call of the extension.
 
-The program is a loop over the sim steps, ``lax.while_loop``: :func:`sim.loop.control_step.control_step`, traced, then
-:func:`sim.engine.native.xla.sim_step`. It stops early at a possible contact or a failed env, which Python
-handles. All groups of envs have the same number of rows (:mod:`sim.loop.jitted`), so that one program serves them all.
+The program is a loop over the sim steps, ``lax.while_loop``: :func:`batchpid.sim.loop.control_step.control_step`,
+traced, then :func:`batchpid.sim.engine.native.xla.sim_step`. It stops early at a possible contact or a failed env,
+which Python handles. All groups of envs have the same number of rows (:mod:`batchpid.sim.loop.jitted`), so that one
+program serves them all.
 """
 
 from __future__ import annotations
@@ -13,24 +14,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.coefficients import Coefficients
-from batchpid.friction import Friction
-from batchpid.jax_settings import own_settings
-from sim.engine.engines import scene_dynamics
-from sim.engine.native import xla
-from sim.engine.protocol import FAILED, CompiledPack, CompiledStep
-from sim.loop.arrays import Command
-from sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
-from sim.loop.custom import OwnController, controller_errors
-from sim.loop.jitted import padded, put
-from sim.loop.native_executor import LOOK
-from sim.loop.numpy_executor import Ran, passive_forces
-from sim.loop.step_constants import needs_qvel
-from sim.options import RunnerOptions
+from batchpid.arrays.jax_settings import own_settings
+from batchpid.law.coefficients import Coefficients
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.engines import scene_dynamics
+from batchpid.sim.engine.native import xla
+from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.custom import OwnController, controller_errors
+from batchpid.sim.loop.jitted import padded, put
+from batchpid.sim.loop.native_executor import LOOK
+from batchpid.sim.loop.numpy_executor import Ran, passive_forces
+from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.options import RunnerOptions
 
 
 class Bodies(NamedTuple):
-    """Arguments of :func:`sim.engine.native.xla.mass_matrix`; None where nothing needs them."""
+    """Arguments of :func:`batchpid.sim.engine.native.xla.mass_matrix`; None where nothing needs them."""
 
     tree: Any = None
     table: Any = None
@@ -51,7 +52,7 @@ class Carry(NamedTuple):
 class XLAExecutor:
     """Executor of the ticks of the robots of ``pack`` by one program.
 
-    It has the methods of :class:`sim.loop.numpy_executor.NumPyExecutor`.
+    It has the methods of :class:`batchpid.sim.loop.numpy_executor.NumPyExecutor`.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from numpy.typing import NDArray
 
-from sim.observation import OBSERVED, Rollout, RunInfo
+from batchpid.sim.observation import OBSERVED, Rollout, RunInfo
 
 ENV = "#4c78a8"
 MEDIAN = "#16324f"

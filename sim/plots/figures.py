@@ -20,12 +20,12 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.files import write_atomically
-from batchpid.validate import file_path
-from sim.command import CommandSpec
-from sim.observation import Rollout
-from sim.plots import drawing
+from batchpid.io.files import write_atomically
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.observation import Rollout
+from batchpid.sim.plots import drawing
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""

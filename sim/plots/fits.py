@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sim.plots import drawing
+from batchpid.sim.plots import drawing
 
 Float64 = NDArray[np.float64]
 

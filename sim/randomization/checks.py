@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.actuators import JOINT_SIDE
-from batchpid.actuators.fields import NEUTRAL, TABLE
+from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice
-from sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
-from sim.randomization.randomization import Randomization
-from sim.robot.robot import Robot
+from batchpid.motors import JOINT_SIDE
+from batchpid.motors.actuator_fields import NEUTRAL, TABLE
+from batchpid.sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.robot import Robot
 
 _PAIRED = ("saturation_effort", "no_load_speed")
 _HUGE = 1e300

@@ -1,4 +1,4 @@
-"""Distributions of a :class:`sim.Randomization`: uniform, log-uniform, normal, choice."""
+"""Distributions of a :class:`batchpid.sim.Randomization`: uniform, log-uniform, normal, choice."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice, flag, number
 
 Float64 = NDArray[np.float64]
 Operation = Literal["add", "scale", "abs"]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice
-from sim.randomization.distributions import Distribution, read_distribution
-from sim.robot.robot import Robot
+from batchpid.sim.randomization.distributions import Distribution, read_distribution
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 Field = Distribution | Mapping[str, Distribution]

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.actuators import JOINT_SIDE
+from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import choice, integer, read_array
-from sim.randomization.distributions import Distribution
-from sim.randomization.draws import Draws, generators
-from sim.randomization.fields import GROUPS, PHYSICAL, START, Field, elements, mapping, parts, read_field
-from sim.robot.kinematics import Kinematics
-from sim.robot.robot import Robot
+from batchpid.motors import JOINT_SIDE
+from batchpid.sim.randomization.distributions import Distribution
+from batchpid.sim.randomization.draws import Draws, generators
+from batchpid.sim.randomization.fields import GROUPS, PHYSICAL, START, Field, elements, mapping, parts, read_field
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 LARGEST = 2**63 - 1
@@ -33,10 +33,11 @@ OF_JOINTS = ("bias", *JOINT_SIDE)
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """Distributions of the parameters of the robots, for the option ``randomization`` of :class:`sim.Runner`.
+    """Distributions of the parameters of the robots, for the option ``randomization`` of :class:`batchpid.sim.Runner`.
 
-    A field is a distribution (:class:`sim.Uniform`, :class:`sim.LogUniform`, :class:`sim.Normal`, :class:`sim.Choice`),
-    drawn for each joint or link, or a mapping of the names of some joints or links to distributions.
+    A field is a distribution (:class:`batchpid.sim.Uniform`, :class:`batchpid.sim.LogUniform`,
+    :class:`batchpid.sim.Normal`, :class:`batchpid.sim.Choice`), drawn for each joint or link, or a mapping of the names
+    of some joints or links to distributions.
 
     The controller knows the nominal robot: compensation and mass matrix do not change.
 
@@ -178,7 +179,7 @@ class Randomization:
     ) -> bp.Actuators | None:
         """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is drawn for them.
 
-        They are those of :func:`sim.randomization.checks.prepared_actuators`.
+        They are those of :func:`batchpid.sim.randomization.checks.prepared_actuators`.
         """
         if draws is None or actuators is None or not self.actuators:
             return actuators

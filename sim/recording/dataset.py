@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.errors import MissingDependencyError
-from sim.observation import RECORDED, Rollout
-from sim.recording.files import read_recording
+from batchpid.sim.observation import RECORDED, Rollout
+from batchpid.sim.recording.recording_files import read_recording
 
 if TYPE_CHECKING:
     import xarray
@@ -64,5 +64,5 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
 
 
 def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
-    """Return the recording in a file as a dataset: :func:`sim.read_recording`, :func:`to_dataset`."""
+    """Return the recording in a file as a dataset: :func:`batchpid.sim.read_recording`, :func:`to_dataset`."""
     return to_dataset(read_recording(path))

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from batchpid.single_owner import SingleOwner
-from sim.observation import RunInfo
-from sim.recording import files
-from sim.recording.files import RecordingError
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.sim.observation import RunInfo
+from batchpid.sim.recording import recording_files as files
+from batchpid.sim.recording.recording_files import RecordingError
 
 if TYPE_CHECKING:
     import h5py

@@ -3,7 +3,8 @@
 A thread makes the file, appends the recorded ticks every half second in HDF5's single-writer mode, and completes it. A
 tick waits while the oldest row that is not on disk was recorded more than :data:`MAX_LAG` ago, so that a kill loses at
 most a second's ticks, however slow the disk. The file grows as ``NAME.partial`` and gets its name when it is complete;
-an existing file of that name is not touched before. See :mod:`sim.recording.files` for what it holds.
+an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for what it
+holds.
 
 A signal handler (Ctrl-C) can interrupt the calls at any moment, but not the thread. So the calls take no lock that the
 thread needs: they put items into queues that are written in C, and wait in ways that can be repeated.
@@ -24,18 +25,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import flag, instance, integer
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
-from batchpid.single_owner import SingleOwner
-from batchpid.validate import flag, instance, integer
-from sim.loop.faults import Fault
-from sim.observation import RECORDED, Observation, Redraw
-from sim.recording import files
-from sim.recording.files import RecordingError
-from sim.recording.partial_file import PartialFile
-from sim.workers.background import Job, start_thread
+from batchpid.sim.loop.faults import Fault
+from batchpid.sim.observation import RECORDED, Observation, Redraw
+from batchpid.sim.recording import recording_files as files
+from batchpid.sim.recording.partial_file import PartialFile
+from batchpid.sim.recording.recording_files import RecordingError
+from batchpid.sim.workers.background import Job, start_thread
 
 if TYPE_CHECKING:
-    from sim.runner import Runner
+    from batchpid.sim.runner import Runner
 
 WRITE_PERIOD = 0.5
 """Time from one write to the next [s]."""
@@ -85,7 +86,7 @@ class Recorder(SingleOwner):
     def __init__(
         self, path: str | os.PathLike[str], runner: Runner, *, seed: int | None = None, overwrite: bool = False
     ) -> None:
-        from sim.runner import Runner  # loads SAPIEN, as the runner has done already
+        from batchpid.sim.runner import Runner  # loads SAPIEN, as the runner has done already
 
         if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")

@@ -1,1 +1,1 @@
-"""Robot descriptions, from a URDF to a checked :class:`sim.Robot`, without SAPIEN."""
+"""Robot descriptions, from a URDF to a checked :class:`batchpid.sim.Robot`, without SAPIEN."""

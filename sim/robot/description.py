@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.coupling import Coupling
-from batchpid.digest import digest
+from batchpid.arrays.digest import digest
+from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
-from batchpid.read_only import read_only
-from sim.observation import RunInfo
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.effort import POSES, suggested_effort_limit
-from sim.robot.guard import setpoint_guard
-from sim.robot.meshes import content_of
-from sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
-from sim.robot.self_collision import SelfContact, Srdf
+from batchpid.motors.coupling import Coupling
+from batchpid.sim.observation import RunInfo
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.effort import POSES, suggested_effort_limit
+from batchpid.sim.robot.meshes import content_of
+from batchpid.sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
+from batchpid.sim.robot.self_collision import SelfContact, Srdf
+from batchpid.sim.robot.setpoint_limits import setpoint_guard
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -48,7 +48,7 @@ class Dynamics(Protocol):
 
 
 class RobotFunctions(Protocol):
-    """Functions of an engine that a robot needs; :class:`sim.engine.protocol.Engine` has them."""
+    """Functions of an engine that a robot needs; :class:`batchpid.sim.engine.protocol.Engine` has them."""
 
     def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> Dynamics:
         """Return the dynamics of ``robot`` on a fixed base; ``ground`` as in :meth:`RobotDescription.dynamics`."""
@@ -137,7 +137,8 @@ class RobotDescription(Urdf):
     def design_effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N] of designed and tuned gains.
 
-        They are the URDF's; where it gives none, :func:`sim.robot.effort.suggested_effort_limit`, which loads SAPIEN.
+        They are the URDF's; where it gives none, :func:`batchpid.sim.robot.effort.suggested_effort_limit`, which loads
+        SAPIEN.
         """
         given = self.effort_limit
         if np.isfinite(given).all():
@@ -228,7 +229,7 @@ class RobotDescription(Urdf):
         return bp.make_params(joints=self.dof, **(known | options))
 
     def run_info(self, **options: Any) -> RunInfo:
-        """Return the info of a run of this robot; ``options`` are further fields of :class:`sim.RunInfo`."""
+        """Return the info of a run of this robot; ``options`` are further fields of :class:`batchpid.sim.RunInfo`."""
         shared = ("joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed")
         return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 

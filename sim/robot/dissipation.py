@@ -9,8 +9,8 @@ class Dissipation(NamedTuple):
     """Friction and damping in the engine.
 
     ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
-    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.friction`, in the URDF's units,
-    and not the engine's.
+    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.motors.friction`, in the URDF's
+    units, and not the engine's.
     """
 
     joint_friction: float
@@ -22,4 +22,4 @@ DISSIPATION = {
     "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
     "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
 }
-"""Values of the option ``dissipation`` of :meth:`sim.Robot.load`."""
+"""Values of the option ``dissipation`` of :meth:`batchpid.sim.Robot.load`."""

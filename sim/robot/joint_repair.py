@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 from lxml import etree
 
-from sim.robot.findings import Finding, finding_of
-from sim.robot.parts import MOVING_TYPES
-from sim.robot.xml import readable
+from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.parts import MOVING_TYPES
+from batchpid.sim.robot.xml import readable
 
 GIVE_RANGE = "give <limit lower= upper=>"
 """Remedy for position limits that are missing or unreadable."""

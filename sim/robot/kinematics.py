@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.validate import choice
-from sim.robot.description import RobotDescription
-from sim.robot.rotations import about, from_rpy, multiply, rotate
+from batchpid.checks.validate import choice
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.rotations import about, from_rpy, multiply, rotate
 
 Float64 = NDArray[np.float64]
 

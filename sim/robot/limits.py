@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robot.description import LIMIT_TOLERANCE, RobotDescription
+from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
 LISTED = 4
 """Envs that a warning lists for each joint."""

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from lxml import etree
 
-from sim.robot.findings import Finding, finding_of
-from sim.robot.inertia import DENSITY, ball, from_entries, nearest_physical
-from sim.robot.xml import readable
+from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.inertia import DENSITY, ball, from_entries, nearest_physical
+from batchpid.sim.robot.xml import readable
 
 SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
 SMALLEST_RATIO = 1e-9  # of principal moments that SAPIEN's eigenvalues and single precision resolve

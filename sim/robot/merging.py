@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from lxml import etree
 
-from batchpid.read_only import read_only
-from sim.robot.parts import MOVING_TYPES, Placement
-from sim.robot.rotations import from_rpy, multiply, rotate, to_rpy
-from sim.robot.spatial_inertia import SpatialInertia, total
-from sim.robot.xml import number, numbers
+from batchpid.arrays.read_only import read_only
+from batchpid.sim.robot.parts import MOVING_TYPES, Placement
+from batchpid.sim.robot.rotations import from_rpy, multiply, rotate, to_rpy
+from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.sim.robot.xml import number, numbers
 
 _IDENTITY = Placement("", read_only(np.zeros(3)), read_only(np.array([1.0, 0.0, 0.0, 0.0])))
 

@@ -18,9 +18,9 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from batchpid.digest import digest
+from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from sim.robot.xml import LARGEST
+from batchpid.sim.robot.xml import LARGEST
 
 SIZE_LIMIT = 2**27  # bytes of a mesh file
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])

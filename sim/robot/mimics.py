@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from batchpid.coupling import Coupling, Follower
-from sim.robot.parts import Joint
+from batchpid.motors.coupling import Coupling, Follower
+from batchpid.sim.robot.parts import Joint
 
 
 @lru_cache(maxsize=32)

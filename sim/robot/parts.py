@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.observation import OBSERVED
-from sim.robot.findings import Finding
+from batchpid.sim.observation import OBSERVED
+from batchpid.sim.robot.findings import Finding
 
 Float64 = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Link:
     """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
 
     ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
-    that inertia tensor: see :func:`sim.robot.inertia.triangle_excess`.
+    that inertia tensor: see :func:`batchpid.sim.robot.inertia.triangle_excess`.
     """
 
     name: str

@@ -21,9 +21,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sim.robot.description import RobotDescription
-from sim.robot.effort import POSES
-from sim.robot.findings import Finding
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.effort import POSES
+from batchpid.sim.robot.findings import Finding
 
 GRAVITY = 9.81
 LARGEST, SMALLEST = 20.0, 1 / 200

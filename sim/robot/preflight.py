@@ -1,7 +1,7 @@
 """Preflight: oddities of a robot, and of the way it is to be run, reported before the first step.
 
 SAPIEN silently accepts most of what is listed here. ``Robot.load`` raises an error for what SAPIEN cannot run at all; a
-:class:`sim.Finding` is something that runs otherwise than the URDF, or the user, means.
+:class:`batchpid.sim.Finding` is something that runs otherwise than the URDF, or the user, means.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import array, choice, instance, number, within
-from sim.robot.description import RobotDescription
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.effort import POSES
-from sim.robot.findings import SEVERITIES, Finding
-from sim.robot.inertia import DENSITY
-from sim.robot.joint_repair import GIVE_RANGE
-from sim.robot.parts import Joint
-from sim.robot.plausibility import implausible_figures
-from sim.robot.stability import slow_oscillation, stability_report
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.effort import POSES
+from batchpid.sim.robot.findings import SEVERITIES, Finding
+from batchpid.sim.robot.inertia import DENSITY
+from batchpid.sim.robot.joint_repair import GIVE_RANGE
+from batchpid.sim.robot.loop_stability import slow_oscillation, stability_report
+from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.plausibility import implausible_figures
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
 RINGING = 0.2  # damping ratio below which gains are reported: more than a quarter is left after each period
@@ -38,7 +38,7 @@ def check(
     timestep: float,
     control: str,
 ) -> list[Finding]:
-    """Return the findings, most severe first; :meth:`sim.Robot.check` describes the arguments."""
+    """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the arguments."""
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names

@@ -1,7 +1,7 @@
 """Repair of URDFs as published: what can be put right without a guess of the robot's geometry.
 
 Every function changes the XML tree in place and yields a finding of each repair. What is left is valid for the reader
-(:mod:`sim.robot.urdf`), or has no repair and is an error there.
+(:mod:`batchpid.sim.robot.urdf`), or has no repair and is an error there.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
-from sim.robot import joint_repair, link_repair
-from sim.robot.findings import Finding, finding_of
-from sim.robot.joint_repair import ends_of
-from sim.robot.link_repair import SHAPES
+from batchpid.sim.robot import joint_repair, link_repair
+from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.joint_repair import ends_of
+from batchpid.sim.robot.link_repair import SHAPES
 
 _READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
     "robot": {"link", "joint"},

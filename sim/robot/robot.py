@@ -12,22 +12,22 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-import assets
 import batchpid as bp
-from batchpid.choices import CHOICES
+from batchpid import assets
+from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.read_only import read_only
+from batchpid.checks.validate import choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
-from batchpid.read_only import read_only
-from batchpid.validate import choice, file_path, flag
-from sim.robot.actuators import load_robot_actuators
-from sim.robot.description import RobotDescription
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.findings import Finding
-from sim.robot.merging import place_links
-from sim.robot.mimics import couple, coupling_of
-from sim.robot.parts import Joint, Settings
-from sim.robot.preflight import check
-from sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
-from sim.robot.urdf import read_urdf
+from batchpid.sim.robot.actuator_checks import load_robot_actuators
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.mimics import couple, coupling_of
+from batchpid.sim.robot.parts import Joint, Settings
+from batchpid.sim.robot.preflight import check
+from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
+from batchpid.sim.robot.urdf import read_urdf
 
 _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
@@ -63,8 +63,8 @@ class Robot(RobotDescription):
             ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or ``"error"``.
         dissipation
             ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the model of
-            :mod:`batchpid.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction 0.05 and
-            link damping 0.05, for comparison with its tutorial.
+            :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
+            0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
             True to fix the root link to the world.
         merge_fixed
@@ -151,7 +151,7 @@ class Robot(RobotDescription):
         timestep
             Time step of control and simulation [s].
         control
-            ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`sim.Runner`.
+            ``"pid"``, ``"drive"`` or ``"effort"``, as in :class:`batchpid.sim.Runner`.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.computed_torque`.
+            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`.
 
         Raises
         ------

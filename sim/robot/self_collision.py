@@ -11,11 +11,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from sim.robot.findings import Finding
-from sim.robot.xml import parse_xml
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.xml import parse_xml
 
 SELF_COLLISION = ("auto", "urdf", "none")
-"""Values of the option ``self_collision`` of :meth:`sim.Robot.load`."""
+"""Values of the option ``self_collision`` of :meth:`batchpid.sim.Robot.load`."""
 ALWAYS = 0.95
 """Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
 GAP = 1e-3
@@ -72,7 +72,7 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     Raises
     ------
     RobotError
-        What :func:`sim.robot.xml.parse_xml` refuses.
+        What :func:`batchpid.sim.robot.xml.parse_xml` refuses.
     """
     known, disabled, enabled, findings = set(links), list[DisabledPair](), set[frozenset[str]](), list[Finding]()
     for element in parse_xml(path).iterchildren("disable_collisions", "enable_collisions"):

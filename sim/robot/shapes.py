@@ -17,11 +17,11 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.errors import MissingDependencyError
-from sim.robot.description import RobotDescription
-from sim.robot.findings import Finding
-from sim.robot.meshes import find_mesh, mesh_problem
-from sim.robot.rotations import from_rpy, rotate
-from sim.robot.xml import numbers, parse_xml
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.meshes import find_mesh, mesh_problem
+from batchpid.sim.robot.rotations import from_rpy, rotate
+from batchpid.sim.robot.xml import numbers, parse_xml
 
 Rgba = tuple[float, ...]
 
@@ -72,7 +72,7 @@ def surfaces(
     for link in original.findall("link"):
         name = link.get("name", "").strip()
         if name not in undrawn:
-            continue  # left out of the robot: see sim.robot.repair
+            continue  # left out of the robot: see batchpid.sim.robot.repair
         undrawn.remove(name)
         where = f"{robot.path}: link {name!r}"
         parts: dict[Rgba, list[Any]] = {}

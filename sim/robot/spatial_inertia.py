@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robot.rotations import rotate
+from batchpid.sim.robot.rotations import rotate
 
 Float64 = NDArray[np.float64]
 

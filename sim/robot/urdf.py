@@ -2,7 +2,7 @@
 
 SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
 and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
-mimic joint: the coupling is not SAPIEN's (:mod:`sim.engine.coupling`).
+mimic joint: the coupling is not SAPIEN's (:mod:`batchpid.sim.engine.coupled_joints`).
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 from lxml import etree
 
 from batchpid.errors import RobotError
-from sim.robot.findings import Finding, refuse
-from sim.robot.inertia import from_entries, triangle_excess
-from sim.robot.joint_repair import ends_of
-from sim.robot.link_repair import MOMENTS
-from sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
-from sim.robot.parts import Joint, Link, Mimic, Urdf
-from sim.robot.repair import repair
-from sim.robot.xml import number, numbers, parse_xml
+from batchpid.sim.robot.findings import Finding, refuse
+from batchpid.sim.robot.inertia import from_entries, triangle_excess
+from batchpid.sim.robot.joint_repair import ends_of
+from batchpid.sim.robot.link_repair import MOMENTS
+from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
+from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
+from batchpid.sim.robot.repair import repair
+from batchpid.sim.robot.xml import number, numbers, parse_xml
 
 MOST_READ = 4096  # links and joints of a file
 
@@ -33,7 +33,7 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     Parameters
     ----------
     package_dirs, missing_meshes, strict
-        See :meth:`sim.Robot.load`.
+        See :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     ordered = _breadth_first(links, joints, path, added)
     for element, joint in zip(root.findall("joint"), joints, strict=True):
         if joint.mimic is not None:
-            element.remove(element.find("mimic"))  # sim.engine.coupling simulates it
+            element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
     if strict:
         refuse(path, repairs)
     text = etree.tostring(root, encoding="unicode")

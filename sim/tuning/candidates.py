@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.stability import stability_bound
-from sim.robot.robot import Robot
-from sim.robot.stability import StabilityWarning
-from sim.runner import Runner
-from sim.tuning.evaluation import absolute_band, arm_joints, run_moves, settling_limits
-from sim.tuning.moves import Moves, smooth_variation
-from sim.tuning.weights import Weights
+from batchpid.gains.stability import stability_bound
+from batchpid.sim.robot.loop_stability import StabilityWarning
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.tuning.evaluation import absolute_band, arm_joints, run_moves, settling_limits
+from batchpid.sim.tuning.moves import Moves, smooth_variation
+from batchpid.sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
 FACTORS = {

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
-from sim.observation import Rollout
-from sim.robot.limits import SetpointWarning
-from sim.robot.robot import Robot
-from sim.runner import Runner
-from sim.tuning.moves import MAX_OVERSHOOT, Moves, shortest_durations, smooth_variation
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.limits import SetpointWarning
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.tuning.moves import MAX_OVERSHOOT, Moves, shortest_durations, smooth_variation
 
 Float64 = NDArray[np.float64]
 SUBSTEPS = 5
@@ -177,7 +177,8 @@ def evaluate_gains(
 ) -> Evaluation:
     """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
 
-    ``params`` have one row for all moves, or one row per move; ``runner_options`` are those of :class:`sim.Runner`.
+    ``params`` have one row for all moves, or one row per move; ``runner_options`` are those of
+    :class:`batchpid.sim.Runner`.
     """
     with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)

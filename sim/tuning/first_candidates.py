@@ -18,10 +18,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.randomization.checks import prepared_actuators
-from sim.randomization.randomization import Randomization
-from sim.robot.robot import Robot
-from sim.tuning.evaluation import SETTLE_SECONDS
+from batchpid.sim.randomization.checks import prepared_actuators
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.tuning.evaluation import SETTLE_SECONDS
 
 Float64 = NDArray[np.float64]
 PHASE_MARGIN = np.pi / 4

@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim.options import ControlMode
-from sim.robot.robot import Robot
+from batchpid.sim.options import ControlMode
+from batchpid.sim.robot.robot import Robot
 
 NAMES = ("tuned", "designed", "tutorial", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
 
 
 class GainSet(NamedTuple):
-    """Params with a name, and the control of :class:`sim.Runner` that they are for."""
+    """Params with a name, and the control of :class:`batchpid.sim.Runner` that they are for."""
 
     name: str
     params: bp.PIDParams
@@ -25,9 +25,9 @@ class GainSet(NamedTuple):
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
 
-    "tuned" are those that ship with the robot, "designed" :meth:`sim.Robot.designed`, "tutorial" those of SAPIEN's
-    tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names are
-    params files. Raises InvalidArgumentError where there is no such name or file, or the robot has no gains of it.
+    "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
+    SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names
+    are params files. Raises InvalidArgumentError where there is no such name or file, or the robot has no gains of it.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
     named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from batchpid.digest import digest
+from batchpid.arrays.digest import digest
+from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.files import write_atomically
-from batchpid.validate import file_path
+from batchpid.io.files import write_atomically
 
 
 class HistoryFile:

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import integer, number
-from sim.robot.description import Dynamics
-from sim.robot.robot import Robot
+from batchpid.sim.robot.description import Dynamics
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 KINDS = ("large", "small", "one joint", "all alike")

@@ -2,11 +2,12 @@ r"""Black-box search for gains on the real scenes: CMA-ES from the designed gain
 
 Each env runs one move of one candidate, so that a generation is one rollout. The moves touch nothing, so that robots
 have no collision shapes in the search. A share of the effort limits is reserved for moves that are harder than those
-searched; :mod:`sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
-evolution strategy: a tutorial", arXiv:1604.00772).
+searched; :mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen,
+"The CMA evolution strategy: a tutorial", arXiv:1604.00772).
 
 Gains for robots that differ from the model, by actuators or a randomization, lie farther from the designed ones. There
-the first generation are the designs of :mod:`sim.tuning.first_candidates`, and CMA-ES starts from the best of them.
+the first generation are the designs of :mod:`batchpid.sim.tuning.first_candidates`, and CMA-ES starts from the best of
+them.
 
 The best of the candidates and the designed gains then run a final on more moves, with collisions, under the caller's
 solver, at the full effort limits. The cheapest there is the result: what suits the few moves of the search need not
@@ -29,24 +30,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.digest import digest
+from batchpid.arrays.digest import digest
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.validate import integer, number
-from batchpid.versions import package_versions
-from sim.cluster import Ray
-from sim.loop.contact_log import MissedContactWarning
-from sim.options import RunnerOptions
-from sim.randomization.randomization import Randomization
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.robot import Robot
-from sim.runner import Runner
-from sim.tuning.candidates import HEADROOM, Candidates
-from sim.tuning.evaluation import SUBSTEPS
-from sim.tuning.first_candidates import first_gains, loop_delay
-from sim.tuning.history import HistoryFile
-from sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-from sim.tuning.randomization import reseeded
-from sim.tuning.weights import Weights
+from batchpid.io.versions import package_versions
+from batchpid.sim.loop.contact_log import MissedContactWarning
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.ray_options import Ray
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.tuning.candidates import HEADROOM, Candidates
+from batchpid.sim.tuning.evaluation import SUBSTEPS
+from batchpid.sim.tuning.first_candidates import first_gains, loop_delay
+from batchpid.sim.tuning.history import HistoryFile
+from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
+from batchpid.sim.tuning.randomization_presets import reseeded
+from batchpid.sim.tuning.weights import Weights
 
 Float64 = NDArray[np.float64]
 INITIAL_SPREAD = 0.12
@@ -108,20 +109,20 @@ def tune(
     seconds
         Simulated time of each move [s].
     gain_units
-        "effort", "inertia" or "mass_matrix": :mod:`batchpid.computed_torque`.
+        "effort", "inertia" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights
         Of the terms of the cost.
     moves
-        Default: those of :func:`sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Robots with
-        actuators or a randomization are searched on the tutorial's and VARIED_MOVES random ones: the hardest of those
-        that the effort limits allow the model ask too much of them. Moves that are given are the final as well, and are
-        searched on with the physics of the final, since they may touch something.
+        Default: those of :func:`batchpid.sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Robots
+        with actuators or a randomization are searched on the tutorial's and VARIED_MOVES random ones: the hardest of
+        those that the effort limits allow the model ask too much of them. Moves that are given are the final as well,
+        and are searched on with the physics of the final, since they may touch something.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     workers, cluster
-        Number of processes, or a cluster: as for :class:`sim.Runner`. The result does not depend on them.
+        Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`. The result does not depend on them.
     time_limit
         Stop after the generation in which this many seconds have passed; None: run all generations.
     history
@@ -129,7 +130,7 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`sim.Runner`, e.g. ``physics="fast"``. The search has collisions, too, and
+        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``. The search has collisions, too, and
         this physics, with ``build``, on a floating base, and where the solver has the drives or SAPIEN's friction.
 
     Raises

@@ -1,10 +1,10 @@
-"""Weights of the terms of a search's cost; :mod:`sim.tuning.search` defines the cost."""
+"""Weights of the terms of a search's cost; :mod:`batchpid.sim.tuning.search` defines the cost."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from batchpid.validate import number
+from batchpid.checks.validate import number
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sim.view.data import ViewData
-from sim.view.playback import HISTORY_SECONDS
+from batchpid.sim.view.data import ViewData
+from batchpid.sim.view.playback import HISTORY_SECONDS
 
 _COLOURS = ("#15803d", "#d97706")
 """Colour of each group's curves."""

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from batchpid.validate import choice, flag, number
 
 MAX_REQUESTS = 256
 """Largest number of requests between two frames."""

@@ -1,6 +1,6 @@
 """Data of a page: a running simulation or a recorded run, whose robots are numbered group by group."""
 
-from sim.view.playback import Playback
-from sim.view.simulation import LiveSimulation
+from batchpid.sim.view.playback import Playback
+from batchpid.sim.view.simulation import LiveSimulation
 
 ViewData = LiveSimulation | Playback

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, MissingDependencyError
-from batchpid.files import replacing
-from batchpid.validate import file_path, integer, number
-from sim.engine.native.library import import_sapien
-from sim.observation import Rollout
-from sim.robot.kinematics import Kinematics
-from sim.robot.robot import Robot
-from sim.robot.rotations import from_rpy
-from sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotLayout, arrange_robots
-from sim.view.playback import had_ground, rows_at
+from batchpid.io.files import replacing
+from batchpid.sim.engine.native.library import import_sapien
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.rotations import from_rpy
+from batchpid.sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotLayout, arrange_robots
+from batchpid.sim.view.playback import had_ground, rows_at
 
 sapien: Any = import_sapien()
 

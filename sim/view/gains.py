@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.checks.validate import at_least, broadcast, choice, integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import at_least, broadcast, choice, integer
-from sim.options import ControlMode, RunnerOptions, default_params
-from sim.robot.robot import Robot
+from batchpid.sim.options import ControlMode, RunnerOptions, default_params
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from sim.view.address import listen
-from sim.view.messages import MAX_BYTES, check_message
+from batchpid.sim.view.address import listen
+from batchpid.sim.view.messages import MAX_BYTES, check_message
 
 Refuse = Callable[[str], object]
 """Function that is told why something was refused."""

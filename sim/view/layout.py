@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.engines import load_engine
-from sim.robot.kinematics import Kinematics
-from sim.robot.robot import Robot
+from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
 

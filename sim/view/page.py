@@ -11,14 +11,14 @@ from contextlib import AbstractContextManager, redirect_stdout, suppress
 from functools import partial
 from typing import Any
 
+from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import MissingDependencyError
-from batchpid.single_owner import SingleOwner
-from sim.observation import Rollout
-from sim.robot.findings import summary
-from sim.view.charts import Charts
-from sim.view.data import ViewData
-from sim.view.panel import Panel
-from sim.view.scene import RobotScene
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.findings import summary
+from batchpid.sim.view.charts import Charts
+from batchpid.sim.view.data import ViewData
+from batchpid.sim.view.panel import Panel
+from batchpid.sim.view.scene import RobotScene
 
 CHARTS_EVERY = 5
 """Frames between two updates of the charts."""
@@ -45,7 +45,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
         try:
             import viser
 
-            from sim.view.gate import Gate  # needs what viser needs
+            from batchpid.sim.view.gate import Gate  # needs what viser needs
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.validate import integer
-from sim.command import CommandSpec
-from sim.observation import Rollout
-from sim.robot.robot import Robot
-from sim.view.controls import Control, Requests
-from sim.view.data import ViewData
-from sim.view.gains import GAINS
-from sim.view.playback import Playback
-from sim.view.simulation import LiveSimulation
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.view.controls import Control, Requests
+from batchpid.sim.view.data import ViewData
+from batchpid.sim.view.gains import GAINS
+from batchpid.sim.view.playback import Playback
+from batchpid.sim.view.simulation import LiveSimulation
 
 _DIRECTIONS = dict(zip(("+x", "+y", "up", "-x", "-y", "down"), np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _FINDING_STYLE = "margin: 0.5em 1em; font-size: 0.8em; color: #b45309; overflow-wrap: anywhere"

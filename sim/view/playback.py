@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
-from sim.observation import Observation, Rollout
-from sim.robot.robot import Robot
+from batchpid.sim.observation import Observation, Rollout
+from batchpid.sim.robot.robot import Robot
 
 HISTORY_SECONDS = 8.0
 """Longest past that the charts show [s]."""

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.observation import Rollout
-from sim.robot.findings import Finding
-from sim.robot.kinematics import Kinematics, Poses
-from sim.robot.robot import Robot
-from sim.robot.shapes import Surface, surfaces
-from sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.kinematics import Kinematics, Poses
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.shapes import Surface, surfaces
+from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
 
 Float64 = NDArray[np.float64]
 

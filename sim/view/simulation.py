@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.single_owner import SingleOwner
-from batchpid.validate import choice, integer, number
-from sim.observation import Observation, Rollout
-from sim.options import ControlMode, RunnerOptions
-from sim.robot.kinematics import Kinematics
-from sim.robot.robot import Robot
-from sim.runner import Runner
-from sim.view.gains import GroupGains, offered_gains
-from sim.view.layout import MAX_ROBOTS
-from sim.view.playback import HISTORY_SECONDS
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import choice, integer, number
+from batchpid.sim.observation import Observation, Rollout
+from batchpid.sim.options import ControlMode, RunnerOptions
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.view.gains import GroupGains, offered_gains
+from batchpid.sim.view.layout import MAX_ROBOTS
+from batchpid.sim.view.playback import HISTORY_SECONDS
 
 Float64 = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class LiveSimulation(SingleOwner):
     params
         Of the PID, one row, in any gain units; default the tuned gains where the robot has them, else designed ones.
     options
-        Of :class:`sim.Runner`: physics, compensate, timestep, ...
+        Of :class:`batchpid.sim.Runner`: physics, compensate, timestep, ...
 
     Raises
     ------

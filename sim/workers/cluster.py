@@ -1,8 +1,8 @@
 """Machines of a Ray cluster as workers of a pool.
 
 Ray finds the machines, starts a process on each and carries the messages. That process holds a pool of workers for a
-slice of the envs (:mod:`sim.workers.node`). It is lost with its machine, with any of its workers, or when it does not
-answer; the caller's pool then replaces it, here or on another machine, as it replaces a worker process.
+slice of the envs (:mod:`batchpid.sim.workers.node`). It is lost with its machine, with any of its workers, or when it
+does not answer; the caller's pool then replaces it, here or on another machine, as it replaces a worker process.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
-from sim.cluster import ClusterWarning, Ray
-from sim.options import RunnerOptions
-from sim.workers.background import BACKGROUND
-from sim.workers.node import NodeInfo
-from sim.workers.placement import split_in_shares
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.ray_options import ClusterWarning, Ray
+from batchpid.sim.workers.background import BACKGROUND
+from batchpid.sim.workers.node import NodeInfo
+from batchpid.sim.workers.placement import split_in_shares
 
 NODE_STEPS = 25_000
 """Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""

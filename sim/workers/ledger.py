@@ -15,8 +15,8 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from batchpid.errors import InUseError, WorkerError
-from sim.workers.pool import WorkerPool
-from sim.workers.requests import Request
+from batchpid.sim.workers.pool import WorkerPool
+from batchpid.sim.workers.requests import Request
 
 Books = TypeVar("Books")
 Commit = Callable[[Books, list[Any]], tuple[Books, Any]]

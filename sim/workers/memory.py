@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from batchpid.errors import InvalidArgumentError
-from sim.options import RunnerOptions
+from batchpid.sim.options import RunnerOptions
 
 ENV_BYTES, JOINT_BYTES, SYSTEM_BYTES = 5_000, 6_000, 400_000
 """Resident bytes of an env, for each of its joints, and of a PhysX system, at least: chains of 1 to 30 boxes and jaco2

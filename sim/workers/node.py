@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import batchpid as bp
-from sim.loop.arrays import Arrays
-from sim.loop.failure import Failure, failure_of
-from sim.workers.requests import ReadDigest, Request, Start
-from sim.workers.worker import WorkerLost
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.failure import Failure, failure_of
+from batchpid.sim.workers.requests import ReadDigest, Request, Start
+from batchpid.sim.workers.worker import WorkerLost
 
 
 class NodeInfo(NamedTuple):
@@ -30,7 +30,7 @@ class NodeInfo(NamedTuple):
     processor: str
     """Model of the processor."""
     digest: str
-    """Digest of the canonical episode (:mod:`sim.loop.canonical`)."""
+    """Digest of the canonical episode (:mod:`batchpid.sim.loop.canonical`)."""
 
 
 class Share(NamedTuple):

@@ -10,13 +10,13 @@ from concurrent.futures import Future
 from typing import Any, Self
 
 from batchpid.errors import InvalidArgumentError
-from sim.loop.arrays import Arrays
-from sim.workers.background import BACKGROUND, Job
-from sim.workers.cluster import Cluster
-from sim.workers.node import Answer, Node, NodeInfo
-from sim.workers.requests import Request, Run, Start
-from sim.workers.shared_memory import SharedArrays, above_standard_streams
-from sim.workers.worker import Worker, WorkerLost, pickled
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.workers.background import BACKGROUND, Job
+from batchpid.sim.workers.cluster import Cluster
+from batchpid.sim.workers.node import Answer, Node, NodeInfo
+from batchpid.sim.workers.requests import Request, Run, Start
+from batchpid.sim.workers.shared_memory import SharedArrays, above_standard_streams
+from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 START_LIMIT, SILENCE_LIMIT = 60.0, 20.0
 """Seconds after which a node is lost that has not started, or whose process does not answer a call to nothing."""

@@ -1,9 +1,9 @@
 """Pool of workers, each with a slice of the envs. A lost worker is replaced, and its envs are replayed.
 
 Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A new worker gets the
-last checkpoint and the requests since. A checkpoint is a barrier for the other workers too (:mod:`sim.loop.snapshot`),
-so that the replayed envs are bit-identical. Each worker has a queue of requests, so that one can catch up while the
-others continue.
+last checkpoint and the requests since. A checkpoint is a barrier for the other workers too
+(:mod:`batchpid.sim.loop.snapshot`), so that the replayed envs are bit-identical. Each worker has a queue of requests,
+so that one can catch up while the others continue.
 
 An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool says at every moment how
 far each worker is, and a worker with which a message was under way is replaced, so that the call can be repeated.
@@ -22,20 +22,20 @@ from functools import partial
 from typing import Any, Literal
 
 import batchpid as bp
+from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import ClosedError
-from batchpid.single_owner import SingleOwner
-from sim.loop.arrays import Arrays, Ticks
-from sim.loop.failure import Failure, order
-from sim.options import RunnerOptions
-from sim.workers.background import BACKGROUND
-from sim.workers.cluster import NODE_STEPS, Cluster
-from sim.workers.memory import check_memory
-from sim.workers.node import NodeInfo, Share
-from sim.workers.node_worker import NodeWorker
-from sim.workers.placement import pinned_cores, split_envs
-from sim.workers.requests import Request, Start
-from sim.workers.shared_memory import SharedArrays
-from sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
+from batchpid.sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.failure import Failure, order
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.workers.background import BACKGROUND
+from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
+from batchpid.sim.workers.memory import check_memory
+from batchpid.sim.workers.node import NodeInfo, Share
+from batchpid.sim.workers.node_worker import NodeWorker
+from batchpid.sim.workers.placement import pinned_cores, split_envs
+from batchpid.sim.workers.requests import Request, Start
+from batchpid.sim.workers.shared_memory import SharedArrays
+from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
 
 MAX_LOSSES = 5
 """Losses of one worker during the same request after which the pool gives up."""

@@ -15,11 +15,11 @@ import sys
 import time
 from typing import Any
 
-from sim.loop.arrays import Arrays
-from sim.loop.failure import failure_of
-from sim.workers.channel import Channel
-from sim.workers.requests import decode
-from sim.workers.shared_memory import SharedArrays
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.failure import failure_of
+from batchpid.sim.workers.channel import Channel
+from batchpid.sim.workers.requests import decode
+from batchpid.sim.workers.shared_memory import SharedArrays
 
 DONE = struct.Struct("<cd")  # b"D", seconds of work: the answer on the hot path, all others are pickled
 _SPIN_SECONDS = 2e-4

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.single_owner import SingleOwner
-from sim.loop.arrays import Layout
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.sim.loop.arrays import Layout
 
 _ALIGN = 64  # a cache line, so that two workers never write to the same one
 

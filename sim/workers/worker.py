@@ -23,18 +23,18 @@ from typing import Any, Self
 
 import cloudpickle
 
+from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
-from batchpid.single_owner import SingleOwner
-from sim.engine import native
-from sim.loop.arrays import Arrays
-from sim.loop.failure import Failure, failure_of
-from sim.loop.loop import Loop
-from sim.workers.background import BACKGROUND, Job
-from sim.workers.channel import Channel
-from sim.workers.liveness import Liveness
-from sim.workers.requests import Request, Start
-from sim.workers.serve import DONE
-from sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
+from batchpid.sim.engine import native
+from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.failure import Failure, failure_of
+from batchpid.sim.loop.loop import Loop
+from batchpid.sim.workers.background import BACKGROUND, Job
+from batchpid.sim.workers.channel import Channel
+from batchpid.sim.workers.liveness import Liveness
+from batchpid.sim.workers.requests import Request, Start
+from batchpid.sim.workers.serve import DONE
+from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
@@ -262,15 +262,15 @@ def pickled(start: Any) -> bytes:
 
 
 def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
-    """Start a process that runs :func:`sim.workers.serve.main` with these descriptors: socket, memory, last stack."""
+    """Start :func:`batchpid.sim.workers.serve.main` in a process, given its descriptors."""
     if not sys.executable:
         raise OSError("sys.executable does not say which Python to run")
     paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
-    paths.append(str(Path(__file__).parents[2]))  # where "" led to, before the caller changed the folder
+    paths.append(str(Path(__file__).parents[3]))  # where "" led to, before the caller changed the folder
     program = (
         f"import ctypes, os, sys; ctypes.CDLL(None).prctl({_PR_SET_PDEATHSIG}, {signal.SIGKILL:d}); "
         "os.getppid() == int(sys.argv[2]) or os._exit(1); "
-        "import json; sys.path[:] = json.loads(sys.argv[1]); from sim.workers.serve import main; main()"
+        "import json; sys.path[:] = json.loads(sys.argv[1]); from batchpid.sim.workers.serve import main; main()"
     )
     closed = [stream for stream in (1, 2) if not _is_open(stream)]
     return subprocess.Popen(

@@ -52,11 +52,11 @@ GAINS = {
 
 
 def xml(name: str) -> etree._Element:
-    return etree.fromstring((importlib.resources.files("assets") / f"{name}.urdf").read_bytes())
+    return etree.fromstring((importlib.resources.files("batchpid.assets") / f"{name}.urdf").read_bytes())
 
 
 def settings(name: str) -> dict:
-    return yaml.safe_load((importlib.resources.files("assets") / f"{name}.yaml").read_text())
+    return yaml.safe_load((importlib.resources.files("batchpid.assets") / f"{name}.yaml").read_text())
 
 
 class World:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-from batchpid.params import PIDParams
+from batchpid.law.params import PIDParams
 
 
 @dataclass

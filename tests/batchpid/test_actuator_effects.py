@@ -10,9 +10,10 @@ from law_cases import read_only
 from quick_jit import quick_jit
 
 import batchpid as bp
-from batchpid import actuators, friction
-from batchpid.actuators import noise
+from batchpid import motors as actuators
 from batchpid.errors import InvalidArgumentError
+from batchpid.motors import friction
+from batchpid.motors import sensor_noise as noise
 
 DT = 1 / 2000
 positive = st.floats(1e-3, 1e3)

@@ -7,8 +7,9 @@ import pytest
 from law_cases import DT, ENVS, GAINS, JOINTS, LIMITED, OPTIONS
 
 import batchpid as bp
-from batchpid import backends, blocks
-from batchpid.blocks import advance_in_blocks
+from batchpid import backends
+from batchpid.law import blocks
+from batchpid.law.blocks import advance_in_blocks
 
 RATES = ("measurement_rate", "setpoint_rate", "feedforward")
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
 
 DT = 1e-3
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.serialization import OFF
+from batchpid.io.params_files import OFF
 
 NAMES = ["shoulder", "elbow"]
 PARAMS = bp.make_params(

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.design import FILTER_SHARE, FILTER_STEPS, pid_from_inertia
 from batchpid.errors import InvalidArgumentError
+from batchpid.gains.design import FILTER_SHARE, FILTER_STEPS, pid_from_inertia
+from batchpid.gains.stability import spectral_radius, stability_bound
 from batchpid.metrics import step_metrics
-from batchpid.stability import spectral_radius, stability_bound
 
 DT = 1 / 2000
 

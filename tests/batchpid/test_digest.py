@@ -14,8 +14,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.choices import CHOICE_TYPES, HoldEffort, ZeroEffort
-from batchpid.digest import digest
+from batchpid.arrays.choices import CHOICE_TYPES, HoldEffort, ZeroEffort
+from batchpid.arrays.digest import digest
 
 
 class Pair(NamedTuple):
@@ -128,7 +128,7 @@ def test_digest_is_the_same_in_another_process():
     make = (
         "bp.make_params(2, kp=[3.0, 1.0], gain_units='inertia', non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
     )
-    program = f"import batchpid as bp; from batchpid.digest import digest; print(digest({make}))"
+    program = f"import batchpid as bp; from batchpid.arrays.digest import digest; print(digest({make}))"
     environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
     out = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert out.stdout.strip() == digest(*eval(f"({make})"))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import batchpid
-from batchpid.files import try_writing, write_atomically
-from batchpid.versions import package_versions
+from batchpid.io.files import try_writing, write_atomically
+from batchpid.io.versions import package_versions
 
 
 @pytest.mark.parametrize("content", ["ä", "ä".encode(), lambda file: file.write("ä".encode())])
@@ -64,7 +64,7 @@ def test_a_trial_leaves_nothing_and_names_what_is_no_file(tmp_path):
 
 
 NOT_FILES = {
-    "batchpid/files.py": "the atomic writer",
+    "batchpid/io/files.py": "the atomic writer",
     "sim/engine/sapien/building.py": "text in memory",
     "sim/engine/sapien/trial.py": "a pipe",
     "sim/recording/partial_file.py": "space for a growing recording",

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid import friction
-from batchpid.friction import Friction
+from batchpid.motors import friction
+from batchpid.motors.friction import Friction
 
 DT = 1 / 2000
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from law_cases import read_only
 
 import batchpid as bp
-from batchpid import guard
+from batchpid.motors import guard
 
 DT = 0.01
 

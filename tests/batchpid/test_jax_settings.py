@@ -13,8 +13,10 @@ import pytest
 from jax_debugging import SETTINGS, changed
 
 import batchpid as bp
-from batchpid import actuators, backends, friction
-from batchpid.jax_settings import NEEDED, own_settings
+from batchpid import backends
+from batchpid import motors as actuators
+from batchpid.arrays.jax_settings import NEEDED, own_settings
+from batchpid.motors import friction
 
 
 def controller():

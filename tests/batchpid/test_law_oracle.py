@@ -6,7 +6,7 @@ from law_cases import DT, ENVS, JOINTS, Backend, read_only
 from scalar_pid import ScalarPID, scalar_pids
 
 import batchpid as bp
-from batchpid.reference import SimplePID
+from batchpid.law.reference import SimplePID
 
 ALL = ("measurement_rate", "setpoint_rate", "feedforward")
 SOME = [("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]

@@ -8,7 +8,7 @@ import pytest
 from law_cases import ENVS, JOINTS
 
 import batchpid as bp
-from batchpid.choices import Everywhere
+from batchpid.arrays.choices import Everywhere
 
 
 def test_scalars_and_vectors_broadcast():

@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid import presets
-from batchpid.reference import SimplePID
+from batchpid.gains import presets
+from batchpid.law.reference import SimplePID
 
 DT = 0.01
 series = st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25)

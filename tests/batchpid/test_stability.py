@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.stability import oscillation, spectral_radius, stability_bound
+from batchpid.gains.stability import oscillation, spectral_radius, stability_bound
 
 DT = 1 / 2000
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from batchpid import validate
+from batchpid.checks import validate
 from batchpid.errors import InvalidArgumentError
 
 JOINTS = ("shoulder", "elbow")

@@ -7,7 +7,7 @@ import pytest
 from processes import shared_memory
 from robots import load_bundled
 
-from sim import Ray, Runner
+from batchpid.sim import Ray, Runner
 
 ROBOT = load_bundled("panda")
 N = 12

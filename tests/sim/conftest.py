@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from robots import load_bundled
 
-from sim import Robot
+from batchpid.sim import Robot
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.observation import OBSERVED
+from batchpid.sim.observation import OBSERVED
 
 
 def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-from sim import Robot
+from batchpid.sim import Robot
 
 RUBBING = "panda with friction"
 

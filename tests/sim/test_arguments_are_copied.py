@@ -15,8 +15,8 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from sim import Randomization, Runner, Uniform
-from sim.options import RunnerOptions
+from batchpid.sim import Randomization, Runner, Uniform
+from batchpid.sim.options import RunnerOptions
 
 ROBOT = load_bundled("panda")
 N, DOF = 4, ROBOT.dof
@@ -119,7 +119,7 @@ def run(commands, seed, workers, disturb):
 COMMANDS = ("step", "send", "rollout", "reset", "params", "actuators", "snapshot")
 
 
-@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning", "ignore::sim.SetpointWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning", "ignore::batchpid.sim.SetpointWarning")
 @settings(max_examples=4, deadline=None)
 @given(commands=st.permutations(COMMANDS), seed=st.integers(0, 2**32 - 1), workers=st.sampled_from([0, 1]))
 def test_a_runner_keeps_nothing_of_the_callers(commands, seed, workers):
@@ -243,7 +243,7 @@ class Gain:
         return state, passive + self.stiffness * (setpoint - qpos) - qvel
 
 
-@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_worker_that_is_replaced_gets_the_controller_as_it_was():
     ends = []
     for disturb in (False, True):

@@ -13,7 +13,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import (
+from batchpid.sim import (
     CommandSpec,
     FaultWarning,
     Recorder,
@@ -429,7 +429,7 @@ def test_the_recorder_streams_them(arm, tmp_path):
 
 def test_a_labelled_dataset_has_entries(rollout):
     pytest.importorskip("xarray")
-    from sim.recording.dataset import to_dataset
+    from batchpid.sim.recording.dataset import to_dataset
 
     data = to_dataset(rollout)
     assert data.setpoint.dims == ("time", "env", "entry")
@@ -452,7 +452,7 @@ def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
 
 def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
     pytest.importorskip("viser")
-    from sim.view import Playback, View
+    from batchpid.sim.view import Playback, View
 
     playback = Playback(rollout, arm)
     view = View(playback, port=18090)
@@ -474,8 +474,8 @@ def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):
-    from sim.tuning.evaluation import step_response_metrics
-    from sim.tuning.identification.logs import logs_of_rollout
+    from batchpid.sim.identification.logs import logs_of_rollout
+    from batchpid.sim.tuning.evaluation import step_response_metrics
 
     with pytest.raises(InvalidArgumentError, match=r"setpoints of x, z, gain <b>, not of joints"):
         step_response_metrics(arm, rollout, np.zeros((N, 2)))
@@ -489,7 +489,7 @@ def test_identification_and_metrics_refuse_such_runs(arm, rollout):
 @pytest.mark.parametrize("actions", ["setpoint", "increment"])
 def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
     pytest.importorskip("gymnasium")
-    from sim.gym import ReachVectorEnv
+    from batchpid.sim.gym import ReachVectorEnv
 
     increment = {"max_increment": [0.05, 0.1]} if actions == "increment" else {}
     env = ReachVectorEnv(3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment)
@@ -514,7 +514,7 @@ def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
 
 def test_gymnasium_needs_bounds_and_increments(arm):
     pytest.importorskip("gymnasium")
-    from sim.gym import ReachVectorEnv
+    from batchpid.sim.gym import ReachVectorEnv
 
     with pytest.raises(InvalidArgumentError, match=r"^control, entry 'x': has no bounds"):
         ReachVectorEnv(1, arm, control=Cartesian(("x", "z")), workers=0)
@@ -526,7 +526,7 @@ def test_the_single_gymnasium_env(arm):
     pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
-    from sim.gym import ReachEnv
+    from batchpid.sim.gym import ReachEnv
 
     env = ReachEnv(arm, control=Cartesian())
     check_env(env, skip_render_check=True)

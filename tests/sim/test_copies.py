@@ -10,8 +10,8 @@ import cloudpickle
 import pytest
 
 from batchpid.errors import NotCopyableError
-from sim import Recorder, Robot, Runner
-from sim.workers.pool import WorkerPool
+from batchpid.sim import Recorder, Robot, Runner
+from batchpid.sim.workers.pool import WorkerPool
 from tests.sim.tiny_urdf import one_joint, write
 
 COPIES = (copy.copy, copy.deepcopy, pickle.dumps, cloudpickle.dumps)
@@ -55,7 +55,7 @@ def test_a_recorder(hinge, tmp_path):
 
 def test_an_environment(hinge):
     pytest.importorskip("gymnasium")
-    from sim.gym import ReachEnv, ReachVectorEnv
+    from batchpid.sim.gym import ReachEnv, ReachVectorEnv
 
     for env in (ReachVectorEnv(1, hinge, workers=0), ReachEnv(hinge)):
         env.reset(seed=0)

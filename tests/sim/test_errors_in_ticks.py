@@ -14,8 +14,8 @@ from identical import assert_identical
 from robots import load_bundled
 
 from batchpid.errors import BatchPIDError, ClosedError, ControllerError, InvalidArgumentError
-from sim import Runner
-from sim.loop.failure import Failure
+from batchpid.sim import Runner
+from batchpid.sim.loop.failure import Failure
 
 ROBOT = load_bundled("panda")
 ENVS, SUBSTEPS, TICKS = 20, 4, 6  # 20 envs: two groups with workers=0
@@ -114,7 +114,7 @@ def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failure
     assert len(one[4]) == (first - 1) // SUBSTEPS
 
 
-@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_lost_worker_does_not_change_the_error():
     controller = FailsLater([(3, 11), (17, 14)])
     assert_same(outcome(0, controller, kill=True), outcome(2, controller, kill=True))

@@ -21,7 +21,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import BatchPIDError
-from sim import Randomization, Recorder, Robot, Runner, Snapshot, Uniform, read_recording
+from batchpid.sim import Randomization, Recorder, Robot, Runner, Snapshot, Uniform, read_recording
 
 CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "10000"))
 ROBOT = load_bundled("panda")

@@ -13,11 +13,11 @@ from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E40
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
-from sim import FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
-from sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
+from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
-ID = "sim.gym:batchpid/Reach-v0"
+ID = "batchpid.sim.gym:batchpid/Reach-v0"
 
 
 def test_gymnasiums_own_checks_pass():

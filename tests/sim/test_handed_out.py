@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import FaultWarning, Randomization, Robot, Runner, Uniform
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write
 
 

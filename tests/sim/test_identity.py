@@ -7,8 +7,8 @@ import pytest
 from identical import assert_identical
 from robots import RUBBING, load_bundled
 
-from sim import FaultWarning, Runner
-from sim.options import default_params
+from batchpid.sim import FaultWarning, Runner
+from batchpid.sim.options import default_params
 
 TICKS = 25  # of 20 sim steps: 0.25 s
 
@@ -62,7 +62,7 @@ def test_other_controls(control):
     assert_identical(run(ticks=20, workers=2, pack_size=8, control=control), expected)
 
 
-@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_another_robot():
     assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), reference("jaco2", ticks=20))
 

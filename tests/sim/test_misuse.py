@@ -16,7 +16,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import ClosedError, InUseError
-from sim import Runner
+from batchpid.sim import Runner
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -171,7 +171,7 @@ def test_workers_start_from_another_folder_and_with_odd_entries_in_sys_path():
     program = """
 import os, pathlib, sys, warnings
 warnings.simplefilter("ignore")
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 os.chdir("/")
 sys.path.append(pathlib.Path("/tmp"))
 robot = Robot.load("panda")
@@ -186,7 +186,7 @@ def test_workers_that_cannot_be_started_leave_nothing_behind():
 import gc, os, resource, sys, warnings
 warnings.simplefilter("ignore")
 from batchpid.errors import WorkerError
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
 before = len(os.listdir("/proc/self/fd"))
 for limit in (before + 5, before + 12):
@@ -217,7 +217,7 @@ warnings.simplefilter("ignore")
 kept = os.dup(1)
 for stream in (0, 1, 2):
     os.close(stream)
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
 with Runner(robot, 2, params=robot.params(), workers=1) as runner:
     os.write(kept, str(runner.step(robot.start).ok.all()).encode())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from identical import assert_identical
 
-from sim import Rollout, Runner
+from batchpid.sim import Rollout, Runner
 
 
 @pytest.fixture(scope="module")

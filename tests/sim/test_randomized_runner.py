@@ -12,7 +12,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import (
+from batchpid.sim import (
     Choice,
     LogUniform,
     Normal,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import tiny_urdf
 
-from sim import Robot, Runner, RunnerOptions
-from sim.options import default_params
+from batchpid.sim import Robot, Runner, RunnerOptions
+from batchpid.sim.options import default_params
 
 
 def same(first, second):

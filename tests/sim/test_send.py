@@ -10,7 +10,7 @@ from processes import have_ended
 from robots import load_bundled
 
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
-from sim import RecoveryWarning, Runner
+from batchpid.sim import RecoveryWarning, Runner
 
 ROBOT = load_bundled("panda")
 SETPOINTS = np.clip(

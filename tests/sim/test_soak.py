@@ -9,7 +9,7 @@ import numpy as np
 import psutil
 import pytest
 
-from sim import Recorder, Runner, Snapshot, read_recording
+from batchpid.sim import Recorder, Runner, Snapshot, read_recording
 
 SECONDS = float(os.environ.get("BATCHPID_SOAK_SECONDS", "240"))
 # These are 31 million env steps, and half of them again: some minutes. An hour of simulated time takes hours.

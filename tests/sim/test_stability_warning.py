@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Robot, Runner, StabilityWarning
-from sim.tuning.candidates import Candidates
+from batchpid.sim import Robot, Runner, StabilityWarning
+from batchpid.sim.tuning.candidates import Candidates
 from tests.sim.tiny_urdf import joint, link, robot, write
 
 BAD, GOOD = {"kp": 10.0, "ki": 0.0, "kd": [1.0, 5e4]}, {"kp": 10.0, "ki": 0.0, "kd": 1.0}
@@ -94,8 +94,8 @@ def test_bundled_gains_do_not_warn(panda, jaco2):
 
 def test_candidates_of_a_search_do_not_warn(arm, monkeypatch):
     monkeypatch.setattr(Candidates, "params", lambda self, points: arm.params(**BAD, derivative_filter_time=1e-6))
-    import sim.tuning.moves as moves
-    from sim.tuning.weights import Weights
+    import batchpid.sim.tuning.moves as moves
+    from batchpid.sim.tuning.weights import Weights
 
     some = moves.random_moves(arm, 2, 0)
     search = Candidates(arm, "effort", False, some, 0.02, Weights(), headroom=1.0, varied=False)

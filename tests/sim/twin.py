@@ -20,15 +20,15 @@ from identical import assert_identical
 from processes import children, have_ended, shared_memory
 from robots import load_bundled
 
-import sim.runner
+import batchpid.sim.runner
 from batchpid.errors import CallOrderError
-from sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
-from sim.workers.background import start_thread
+from batchpid.sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
+from batchpid.sim.workers.background import start_thread
 
 ROBOT = load_bundled("panda")
 N = 2
 SUBSTEPS = 5
-ROOT = Path(sim.runner.__file__).parent
+ROOT = Path(batchpid.sim.runner.__file__).parent
 MODULES = tuple(str(ROOT / part) for part in ("runner.py", "workers", "recording/recorder.py"))
 
 _MOMENTS = ("call", "c_call", "c_return")

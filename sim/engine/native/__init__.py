@@ -5,8 +5,16 @@ Where they are not used, and with the environment variable ``BATCHPID_NATIVE=0``
 
 from __future__ import annotations
 
-from sim.engine.native.loading import extension
-from sim.engine.native.verdict import SWITCH, NativeStatus, environment, python_calls, status, take_verdict, verify
+from batchpid.sim.engine.native.loading import extension
+from batchpid.sim.engine.native.verdict import (
+    SWITCH,
+    NativeStatus,
+    environment,
+    python_calls,
+    status,
+    take_verdict,
+    verify,
+)
 
 __all__ = [
     "SWITCH",

@@ -5,7 +5,7 @@
 #include <memory>
 
 #include "buffer.h"
-#include "../../../batchpid/native/extension.h"
+#include "batchpid/native/extension.h"
 #include "rigid_body.h"
 
 using namespace batchpid;

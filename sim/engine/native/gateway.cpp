@@ -5,7 +5,7 @@
 
 #include "gateway.h"
 
-#include "../../../batchpid/native/extension.h"
+#include "batchpid/native/extension.h"
 #include "sim_step.h"
 #include "tick.h"
 #include "xla_call.h"

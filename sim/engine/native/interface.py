@@ -70,7 +70,7 @@ def _layout(structure: type[ctypes.Structure]) -> list[tuple[str, int, int]]:
 
 
 def _files(*names: str) -> tuple[str, ...]:
-    return (*(f"sim/engine/native/{name}" for name in names), "batchpid/native/extension.h")
+    return (*(f"batchpid/sim/engine/native/{name}" for name in names), "batchpid/native/extension.h")
 
 
 def _gateway_tables() -> tuple[Any, ...]:
@@ -83,7 +83,7 @@ def _batch_dynamics_tables() -> tuple[Any, ...]:
 
 EXTENSIONS = {
     "_gateway": Extension(
-        "sim.engine.native._gateway",
+        "batchpid.sim.engine.native._gateway",
         (
             *_files("gateway.cpp", "buffer.h", "gateway.h", "rigid_body.h", "sim_step.h", "tick.h", "xla_call.h"),
             *HEADERS,
@@ -92,7 +92,7 @@ EXTENSIONS = {
         _gateway_tables,
     ),
     "_batch_dynamics": Extension(
-        "sim.engine.native._batch_dynamics",
+        "batchpid.sim.engine.native._batch_dynamics",
         _files("batch_dynamics.cpp", "buffer.h", "rigid_body.h"),
         (*ROUNDED, "-Wno-psabi"),
         _batch_dynamics_tables,

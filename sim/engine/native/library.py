@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sim.engine.native.interface import SYMBOLS
+from batchpid.sim.engine.native.interface import SYMBOLS
 
 _CALLBACK = "_ZTVN6sapien5physx20DefaultEventCallbackE"
 

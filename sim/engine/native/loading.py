@@ -6,7 +6,7 @@ from typing import Any
 
 from batchpid.native.extensions import load, load_all
 from batchpid.native.operations import PROGRAM
-from sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.native.interface import EXTENSIONS
 
 
 def extension(name: str) -> Any:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.native.array_program import ArrayProgram
-from sim.engine import native
-from sim.engine.native.interface import Tick
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native.interface import Tick
 
 FULL, MATRIX = 3, 4
 """Numbers of shapes in program.h: (rows, columns), and a matrix for each row."""
@@ -33,9 +33,10 @@ class NativeTick:
     whole
         Whether ``matrix`` is the whole mass matrix or its diagonal.
     arrays
-        Arrays by field of :class:`sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and ``passive``,
-        positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``, ``tree`` and
-        ``bodies`` (:class:`sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping`` (dof,).
+        Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
+        ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
+        ``tree`` and ``bodies`` (:class:`batchpid.sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping``
+        (dof,).
     """
 
     def __init__(
@@ -66,6 +67,6 @@ class NativeTick:
     def run(self, group: int, begin: int, until: int, end: int) -> tuple[int, int]:
         """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the last status.
 
-        ``group`` is the address of the native group: :meth:`sim.engine.protocol.CompiledStep.prepare`.
+        ``group`` is the address of the native group: :meth:`batchpid.sim.engine.protocol.CompiledStep.prepare`.
         """
         return self._native.tick(self._program, self._address, group, begin, until, end)

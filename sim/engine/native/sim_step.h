@@ -32,7 +32,7 @@ struct Group {
   char const *watched;               // (systems,): systems in which a contact may be a reason to stop
   Body const *const *bodies;         // (bodies,): those of the robots that share systems, sorted
   std::int64_t const *robot_of;      // (bodies,)
-  char const *known;                 // (robots,): robots with a region, as in sim.engine.sapien.contact_prediction.SafeRegions
+  char const *known;                 // (robots,): robots with a region, as in batchpid.sim.engine.sapien.contact_prediction.SafeRegions
   double *places;                    // (robots, 2, dof)
   double const *arms;                // (2 dof, pairs)
   double const *sizes;               // (robots, pairs)

@@ -5,7 +5,7 @@
 
 #pragma once
 
-#include "../../../batchpid/native/make_program.h"
+#include "batchpid/native/make_program.h"
 #include "rigid_body.h"
 #include "sim_step.h"
 

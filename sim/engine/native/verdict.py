@@ -1,9 +1,9 @@
 """Verdict on the native extensions: used or not, and why not.
 
-They are used if all of them were built from the present tables and sources (:mod:`sim.engine.native.loading`), and if a
-self-test in a child process, where a crash does no harm, gives the results of Python. The verdict of the self-test is
-kept in the user's cache, under a hash of its inputs. A process passes its verdict on to its child processes, so that
-one warning is shown and one self-test is run for all of them.
+They are used if all of them were built from the present tables and sources (:mod:`batchpid.sim.engine.native.loading`),
+and if a self-test in a child process, where a crash does no harm, gives the results of Python. The verdict of the
+self-test is kept in the user's cache, under a hash of its inputs. A process passes its verdict on to its child
+processes, so that one warning is shown and one self-test is run for all of them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ import numpy as np
 
 from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import ROOT, StaleExtensionError
-from sim.engine.native.library import functions, sapien_library
-from sim.engine.native.loading import extensions
+from batchpid.sim.engine.native.library import functions, sapien_library
+from batchpid.sim.engine.native.loading import extensions
 
 _VERIFIED, _REFUSED = "BATCHPID_NATIVE_VERIFIED", "BATCHPID_NATIVE_REFUSED"
 """Environment variables of child processes: fingerprint of a verdict to use the extensions, or reason not to."""
 _SWITCHED_OFF = f"native calls are switched off by {SWITCH}=0"
 SELF_TEST = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sim.engine.native_self_test import main; main()"
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from batchpid.sim.engine.native_self_test import main; main()"
 )
 _SECONDS = 60.0
 _python_calls: ContextVar[bool] = ContextVar("_python_calls", default=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.engine import native
+from batchpid.sim.engine import native
 
 _lock = threading.Lock()
 
@@ -38,7 +38,7 @@ def _registered() -> str:
 
 
 def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
-    """Do a sim step of a :class:`sim.engine.sapien.sim_step.NativeStep` in a program of JAX.
+    """Do a sim step of a :class:`batchpid.sim.engine.sapien.sim_step.NativeStep` in a program of JAX.
 
     Order is kept by the data and by the number of the step, which is another in each call.
 
@@ -67,7 +67,7 @@ def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
 def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
 
-    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are those of :class:`sim.engine.rigid_body.RigidBodies`.
+    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are those of :class:`batchpid.sim.engine.rigid_body.RigidBodies`.
     """
     import jax
 

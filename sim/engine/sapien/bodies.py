@@ -1,4 +1,4 @@
-"""Rigid bodies of one of SAPIEN's articulations, for the algorithms of :mod:`sim.engine.rigid_body`."""
+"""Rigid bodies of one of SAPIEN's articulations, for the algorithms of :mod:`batchpid.sim.engine.rigid_body`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.read_only import read_only
-from sim.engine.rigid_body import RigidBodies
-from sim.robot.rotations import from_rpy, rotate
-from sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.arrays.read_only import read_only
+from batchpid.sim.engine.rigid_body import RigidBodies
+from batchpid.sim.robot.rotations import from_rpy, rotate
+from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
 
 Float64 = NDArray[np.float64]
 

@@ -16,14 +16,14 @@ from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
-from sim.engine.lazy_module import imported_lazily
-from sim.engine.sapien.collision_groups import CollisionGroups, Pair, collision_groups
-from sim.engine.sapien.user_content import Frames, HeadlessScene
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.merging import Merged, merge_fixed_links, place_links
-from sim.robot.meshes import note_meshes
-from sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.sim.engine.lazy_module import imported_lazily
+from batchpid.sim.engine.sapien.collision_groups import CollisionGroups, Pair, collision_groups
+from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.merging import Merged, merge_fixed_links, place_links
+from batchpid.sim.robot.meshes import note_meshes
+from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
 
 _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
@@ -245,7 +245,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
         built.set_friction(dissipation.joint_friction)
         if dissipation.modelled:
             # SAPIEN implements the URDF's damping as a drive, with an error that depends on the solver; this is exact,
-            # with the effort of batchpid.friction.
+            # with the effort of batchpid.motors.friction.
             built.set_drive_properties(0.0, 0.0)
             built.set_armature(np.array([spec.timestep * joint.damping], np.float32))
     return scene, robot

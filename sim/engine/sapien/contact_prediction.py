@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.read_only import read_only
+from batchpid.arrays.read_only import read_only
 
 Float64 = NDArray[np.float64]
 

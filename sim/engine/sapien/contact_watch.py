@@ -1,8 +1,8 @@
 """Watch over the contacts of robots that share PhysX systems: which of them have to move to a system to themselves.
 
 A robot is looked at where the engine lists pairs of its links and it has no region in which no contact can be
-predicted, or has left that region (:mod:`sim.engine.sapien.contact_prediction`). When a robot is looked at depends on
-it alone, and not on the others.
+predicted, or has left that region (:mod:`batchpid.sim.engine.sapien.contact_prediction`). When a robot is looked at
+depends on it alone, and not on the others.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
-from sim.engine.sapien.dynamics import Dynamics, scene_dynamics
-from sim.engine.sapien.extents import link_extents, touching_pairs
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
+from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
+from batchpid.sim.engine.sapien.extents import link_extents, touching_pairs
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 Float64 = NDArray[np.float64]
 

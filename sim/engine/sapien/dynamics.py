@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.rigid_body import RigidBodies, mass_matrix
-from sim.engine.sapien.bodies import bodies_of
-from sim.engine.sapien.building import (
+from batchpid.sim.engine.rigid_body import RigidBodies, mass_matrix
+from batchpid.sim.engine.sapien.bodies import bodies_of
+from batchpid.sim.engine.sapien.building import (
     add_point_mass,
     build_scene,
     center_of_mass,
@@ -23,15 +23,15 @@ from sim.engine.sapien.building import (
     rigid_bodies,
     shape_owners,
 )
-from sim.engine.sapien.collision_groups import Pair
-from sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair
-from sim.engine.sapien.extents import link_extents, touching_pairs
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.description import RobotDescription
-from sim.robot.kinematics import Kinematics
-from sim.robot.mimics import coupling_of
-from sim.robot.parts import Joint
+from batchpid.sim.engine.sapien.collision_groups import Pair
+from batchpid.sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair
+from batchpid.sim.engine.sapien.extents import link_extents, touching_pairs
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import Joint
 
 Float64 = NDArray[np.float64]
 P = ParamSpec("P")
@@ -84,8 +84,8 @@ class Dynamics:
     def mass_matrix(self, qpos: Any) -> Any:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg].
 
-        Those of a JAX array are computed in its program, on the CPU (:mod:`sim.engine.rigid_body`); they have no
-        derivatives.
+        Those of a JAX array are computed in its program, on the CPU (:mod:`batchpid.sim.engine.rigid_body`); they have
+        no derivatives.
         """
         if not isinstance(qpos, np.ndarray) and hasattr(qpos, "__array_namespace__"):
             return mass_matrix(self.bodies, qpos)
@@ -97,7 +97,7 @@ class Dynamics:
 
         There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, those of the base.
         ``added`` are spatial inertias (n, 6, 6) that links have in addition, by name
-        (:func:`sim.robot.spatial_inertia.spatial_matrix`).
+        (:func:`batchpid.sim.robot.spatial_inertia.spatial_matrix`).
         """
         if self._spec.fixed_base:
             return self.mass_matrix(qpos) + self._added_mass_matrix(qpos, added or {})

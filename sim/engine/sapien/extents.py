@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sapien import physx
 
-from sim.engine.sapien.collision_groups import may_touch
-from sim.engine.sapien.contact_prediction import WORLD, LinkExtent
+from batchpid.sim.engine.sapien.collision_groups import may_touch
+from batchpid.sim.engine.sapien.contact_prediction import WORLD, LinkExtent
 
 Float64 = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.building import link_inertia, unmerged_links
-from sim.engine.sapien.extents import shape_box
-from sim.robot.description import RobotDescription
-from sim.robot.parts import LinkMass
+from batchpid.sim.engine.sapien.building import link_inertia, unmerged_links
+from batchpid.sim.engine.sapien.extents import shape_box
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.parts import LinkMass
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 

@@ -1,8 +1,8 @@
 """Contacts that robots without collision shapes would have had, by the model of the robot that has them.
 
 A robot is looked at where it leaves a region of joint positions in which nothing touches: with the distance d of two
-links, and the largest speed r_j of one towards the other per unit of joint j's speed, nothing touches while
-``sum_j r_j |q_j - q0_j| < d`` (:mod:`sim.engine.sapien.contact_prediction`). That is about every twentieth tick of a
+links, and the largest speed r_j of one towards the other per unit of joint j's speed, nothing touches while ``sum_j r_j
+|q_j - q0_j| < d`` (:mod:`batchpid.sim.engine.sapien.contact_prediction`). That is about every twentieth tick of a
 motion.
 """
 
@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.contact_prediction import LISTED_DISTANCE
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.sapien.contact_prediction import LISTED_DISTANCE
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 Float64 = NDArray[np.float64]
 

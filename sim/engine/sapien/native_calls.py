@@ -1,7 +1,8 @@
 """Native calls into SAPIEN: reads and writes of all robots of a pack in one call of the extension.
 
 The extension calls functions that SAPIEN's shared library exports, so that it needs nothing of SAPIEN to be compiled.
-It depends on the layout of two of SAPIEN's types, which no header promises: see :mod:`sim.engine.native.verdict`.
+It depends on the layout of two of SAPIEN's types, which no header promises: see
+:mod:`batchpid.sim.engine.native.verdict`.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.native import extension
-from sim.engine.native.library import callback_table, functions
-from sim.engine.sapien.calls import EngineCalls, PythonCalls
+from batchpid.sim.engine.native import extension
+from batchpid.sim.engine.native.library import callback_table, functions
+from batchpid.sim.engine.sapien.calls import EngineCalls, PythonCalls
 
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 _capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
@@ -33,7 +34,7 @@ def engine_calls(
 
 
 class NativeCalls:
-    """The calls of :class:`sim.engine.sapien.calls.PythonCalls`, one for all robots; RuntimeError if SAPIEN fails."""
+    """Calls of :class:`~batchpid.sim.engine.sapien.calls.PythonCalls`, for all robots; RuntimeError if SAPIEN fails."""
 
     def __init__(
         self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
@@ -88,7 +89,7 @@ def gateway_address(gateway: Any) -> int:
 
 
 def gateway_sim_step(address: int, *arrays: NDArray[np.float64]) -> int:
-    """Do a sim step of the group at ``address``: see :class:`sim.engine.sapien.sim_step.NativeStep`."""
+    """Do a sim step of the group at ``address``: see :class:`batchpid.sim.engine.sapien.sim_step.NativeStep`."""
     return extension("_gateway").sim_step(address, *arrays)
 
 

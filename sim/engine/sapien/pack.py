@@ -3,10 +3,10 @@
 A pack is M scenes with one robot each, stepped together, several of them in one PhysX system. All stand at the origin;
 the shapes of each scene are in a collision group to themselves, so that scenes never meet. That is bit-identical to one
 system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
-(:mod:`sim.engine.sapien.contact_prediction`).
+(:mod:`batchpid.sim.engine.sapien.contact_prediction`).
 
-The loop uses only the members of :class:`sim.engine.protocol.EnginePack` and its capabilities. Longer than 300 lines
-because that is the whole interface between loop and engine.
+The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 300
+lines because that is the whole interface between loop and engine.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.actuators import Actuators
-from batchpid.friction import Friction
-from batchpid.single_owner import SingleOwner
-from sim.engine import native
-from sim.engine.coupling import ConstraintEfforts
-from sim.engine.sapien.building import (
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.motors import Actuators
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine import native
+from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.sapien.building import (
     build_scene,
     engine_settings,
     link_frames,
     new_system,
     set_collision_group,
 )
-from sim.engine.sapien.calls import EngineCalls
-from sim.engine.sapien.contact_watch import ContactWatch
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.native_calls import engine_calls
-from sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
-from sim.engine.sapien.sim_step import NativeStep
-from sim.engine.sapien.user_content import SceneContent, refuse_shapes
-from sim.engine.scene_spec import SceneSpec, Variation
-from sim.robot.dissipation import DISSIPATION
-from sim.robot.mimics import coupling_of
+from batchpid.sim.engine.sapien.calls import EngineCalls
+from batchpid.sim.engine.sapien.contact_watch import ContactWatch
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.native_calls import engine_calls
+from batchpid.sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
+from batchpid.sim.engine.sapien.sim_step import NativeStep
+from batchpid.sim.engine.sapien.user_content import SceneContent, refuse_shapes
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.mimics import coupling_of
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
@@ -265,7 +265,7 @@ class Pack(SingleOwner):
             self._assign_systems(rows, qpos, qvel)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Raise TypeError: robots of this pack are those of the model; see :class:`sim.engine.sapien.variation`."""
+        """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""
         raise TypeError("the robots of this pack do not vary; make it with a variation")
 
     def state_sizes(self) -> list[int]:

@@ -1,22 +1,22 @@
-"""SAPIEN as an :class:`sim.engine.protocol.Engine`."""
+"""SAPIEN as an :class:`batchpid.sim.engine.protocol.Engine`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sim.engine.protocol import Capability, Engine
-from sim.engine.sapien.dynamics import Dynamics, loaded_dynamics, robot_dynamics, scene_dynamics
-from sim.engine.sapien.link_masses import link_masses
-from sim.engine.sapien.missed_contact import MissedContacts
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS, Physics
-from sim.engine.sapien.self_contact import self_contact
-from sim.engine.sapien.variation import VariedPack
-from sim.engine.scene_spec import SceneSpec, Variation
-from sim.robot.description import RobotDescription
-from sim.robot.parts import LinkMass
-from sim.robot.self_collision import SelfContact
+from batchpid.sim.engine.protocol import Capability, Engine
+from batchpid.sim.engine.sapien.dynamics import Dynamics, loaded_dynamics, robot_dynamics, scene_dynamics
+from batchpid.sim.engine.sapien.link_masses import link_masses
+from batchpid.sim.engine.sapien.missed_contact import MissedContacts
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
+from batchpid.sim.engine.sapien.self_contact import self_contact
+from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.parts import LinkMass
+from batchpid.sim.robot.self_collision import SelfContact
 
 
 class SapienEngine:
@@ -27,7 +27,7 @@ class SapienEngine:
     physics: Mapping[str, Any] = PHYSICS
 
     def is_physics(self, settings: object) -> bool:
-        """Return whether these are :class:`sim.Physics`."""
+        """Return whether these are :class:`batchpid.sim.Physics`."""
         return isinstance(settings, Physics)
 
     def make_pack(

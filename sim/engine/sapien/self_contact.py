@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.sapien.building import link_groups
-from sim.engine.sapien.collision_groups import Pair
-from sim.engine.sapien.dynamics import Dynamics
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.sapien.trial import in_child
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.description import RobotDescription
-from sim.robot.parts import Joint
-from sim.robot.self_collision import (
+from batchpid.sim.engine.sapien.building import link_groups
+from batchpid.sim.engine.sapien.collision_groups import Pair
+from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.sapien.trial import in_child
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.self_collision import (
     GAP,
     PENETRATION,
     SAMPLES,

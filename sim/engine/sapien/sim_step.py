@@ -9,10 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.engine.native.interface import Group
-from sim.engine.sapien.calls import EngineCalls
-from sim.engine.sapien.contact_watch import ContactWatch
-from sim.engine.sapien.native_calls import NativeCalls, contact_maps, gateway_address, gateway_sim_step, pointer
+from batchpid.sim.engine.native.interface import Group
+from batchpid.sim.engine.sapien.calls import EngineCalls
+from batchpid.sim.engine.sapien.contact_watch import ContactWatch
+from batchpid.sim.engine.sapien.native_calls import (
+    NativeCalls,
+    contact_maps,
+    gateway_address,
+    gateway_sim_step,
+    pointer,
+)
 
 
 class NativeStep:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from batchpid.errors import RobotError
-from sim.engine.sapien.user_content import HeadlessScene
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
 
 TIME_LIMIT = 120
 """Seconds that a trial may take."""
@@ -30,7 +30,7 @@ import json, os, sys
 if os.fork():
     os._exit(0)  # the server is no child of the caller
 sys.path[:] = json.loads(sys.argv[1])
-from sim.engine.sapien.trial import serve
+from batchpid.sim.engine.sapien.trial import serve
 serve(int(sys.argv[2]))
 """
 
@@ -72,7 +72,7 @@ def _ask(request: bytes) -> bytes:
 def _start() -> Connection:
     """Start a server, and return the connection to it."""
     paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
-    paths.append(str(Path(__file__).parents[3]))
+    paths.append(str(Path(__file__).parents[4]))
     ours, theirs = socket.socketpair()
     with theirs:
         # -P: without it a json.py in the working folder would run.

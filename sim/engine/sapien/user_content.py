@@ -13,9 +13,9 @@ from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRi
 from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
-from sim.engine.sapien.mirrored_meshes import MirroringBuilder
-from sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
-from sim.engine.scene_spec import Build
+from batchpid.sim.engine.sapien.mirrored_meshes import MirroringBuilder
+from batchpid.sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
+from batchpid.sim.engine.scene_spec import Build
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Links of a robot by name: the entity that each is part of, and its pose in that, None for the same."""

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from sapien import Pose
 
-from batchpid.friction import Friction
-from sim.engine.sapien.building import center_of_mass, merged, set_inertia
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.pack import Pack
-from sim.engine.scene_spec import SceneSpec, Variation
-from sim.robot.merging import place_links
-from sim.robot.mimics import coupling_of
-from sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.sapien.building import center_of_mass, merged, set_inertia
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total
 
 Float64 = NDArray[np.float64]
 _NO_MASS = 1e-6

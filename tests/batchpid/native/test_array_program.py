@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
 import batchpid as bp
-from batchpid import friction, guard
-from batchpid.actuators import STAGES
-from batchpid.actuators import Coefficients as ActuatorCoefficients
-from batchpid.actuators.envelope import Envelope
+from batchpid.motors import STAGES, friction, guard
+from batchpid.motors import Coefficients as ActuatorCoefficients
+from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import every_operation, program_status

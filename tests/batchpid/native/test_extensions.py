@@ -20,7 +20,7 @@ from batchpid.native.availability import every_operation, first_difference, prog
 from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
 from batchpid.native.operations import OPERATIONS, PROGRAM
 from batchpid.native.tracing import Namespace, Symbol, trace
-from sim.engine.native.interface import EXTENSIONS
+from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no compiler")

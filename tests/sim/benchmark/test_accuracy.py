@@ -5,8 +5,8 @@ import pytest
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
-from sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
+from batchpid.sim.engine.sapien.physics import PHYSICS
 
 
 def falling(robot, qpos, timestep, seconds):

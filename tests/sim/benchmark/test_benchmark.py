@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from sim.benchmark.benchmark import CASES, measure_phases, measure_rates
-from sim.benchmark.peers import PEERS, make_peers
-from sim.benchmark.workload import Workload, run_round
+from batchpid.sim.benchmark.benchmark import CASES, measure_phases, measure_rates
+from batchpid.sim.benchmark.peers import PEERS, make_peers
+from batchpid.sim.benchmark.workload import Workload, run_round
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import numpy as np
 
 import batchpid as bp
-from sim import Robot, Runner
-from sim.benchmark.tutorial import TutorialLoop
+from batchpid.sim import Robot, Runner
+from batchpid.sim.benchmark.tutorial import TutorialLoop
 
 ARM = slice(0, 7)
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sim.cli import main
+from batchpid.sim.cli import main
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim.cli.run import start_poses
+from batchpid.sim.cli.run import start_poses
 
 ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 
@@ -40,8 +40,8 @@ def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Pictures are not drawn: that takes longer than the robots."""
-    monkeypatch.setattr("sim.plots.step_responses", lambda *_, **__: None)
-    monkeypatch.setattr("sim.plots.save", lambda _, path: path)
+    monkeypatch.setattr("batchpid.sim.plots.step_responses", lambda *_, **__: None)
+    monkeypatch.setattr("batchpid.sim.plots.save", lambda _, path: path)
 
 
 @pytest.mark.usefixtures("undrawn")

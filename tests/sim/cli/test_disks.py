@@ -12,12 +12,12 @@ from disks import fill, limited_file_size, make_read_only, small_disk
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
-from batchpid.files import try_writing
-from sim import Recorder, Runner, Snapshot, plots, write_recording
-from sim.benchmark import benchmark
-from sim.cli import run as cli_run
-from sim.tuning import survey as surveying
-from sim.view import film
+from batchpid.io.files import try_writing
+from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
+from batchpid.sim.benchmark import benchmark
+from batchpid.sim.cli import run as cli_run
+from batchpid.sim.tuning import robot_survey as surveying
+from batchpid.sim.view import film
 
 SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
 TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
@@ -151,7 +151,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
             os.truncate(disk / "filler", max(0, (disk / "filler").stat().st_size - free))
 
     with monkeypatch.context() as patched:
-        patched.setattr("sim.cli.outputs.try_writing", try_and_fill)
+        patched.setattr("batchpid.sim.cli.outputs.try_writing", try_and_fill)
         status, err = command(name, path)
     if status:
         assert (status, err.count("\n")) == (2, 1), err

@@ -6,8 +6,8 @@ import pytest
 from tqdm import tqdm
 
 import batchpid as bp
-from sim import Robot, Runner, write_recording
-from sim.tuning.identification.excitation import excite
+from batchpid.sim import Robot, Runner, write_recording
+from batchpid.sim.identification.excitation import excite
 
 pytest.importorskip("scipy")
 pytest.importorskip("cmaes")
@@ -66,7 +66,9 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
 def test_progress_promises_no_remaining_time(batchpid, log, tmp_path, monkeypatch):
     """A fit mostly ends long before its last evaluation."""
     bars = []
-    monkeypatch.setattr("sim.cli.identify.bar", lambda label, **options: bars.append((label, options)) or (lambda x: x))
+    monkeypatch.setattr(
+        "batchpid.sim.cli.identify.bar", lambda label, **options: bars.append((label, options)) or (lambda x: x)
+    )
     robot, recording, gains = log
     options = ("--evaluations", 1, "--workers", 0, "--no-payload", "--out", tmp_path / "motors.yaml")
     batchpid("identify", robot, recording, "--params", gains, *options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
-from sim import Robot
+from batchpid.sim import Robot
 
 ODD = """<robot name="odd">
   <link name="base"/>

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import os
 import subprocess
 import sys
 import warnings
@@ -16,7 +15,7 @@ import batchpid
 from batchpid import __version__ as version
 from batchpid import startup
 from batchpid.errors import InvalidArgumentError
-from sim import cli
+from batchpid.sim import cli
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +152,7 @@ def test_warnings_are_one_line(batchpid, stub, monkeypatch):
 @pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in cli.COMMANDS)], ids=" ".join)
 def test_help_loads_nothing_heavy(arguments):
     code = (
-        "import sys; from sim.cli import main\n"
+        "import sys; from batchpid.sim.cli import main\n"
         f"try: main({arguments})\n"
         "except SystemExit: pass\n"
         "heavy = {'jax', 'sapien', 'matplotlib', 'h5py'} & set(sys.modules); assert not heavy, heavy"
@@ -175,25 +174,12 @@ def test_modules_in_the_working_folder_are_not_imported_by_the_command(command, 
     assert "panda_joint7" in ran.stdout
 
 
-@pytest.mark.parametrize("name", ["sim", "assets"])
-def test_a_module_on_the_path_that_hides_a_package_is_named_and_not_run(name, tmp_path):
-    hiding = tmp_path / f"{name}.py"
-    hiding.write_text("print('the program of the user')")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    ran = subprocess.run(
-        [sys.executable, "-m", "batchpid", "--help"], capture_output=True, text=True, env=environment, cwd="/"
-    )
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr.startswith(f"batchpid: {hiding} hides the package {name!r}")
-    assert ran.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize("name", ["json", "numpy", "secrets"])
 def test_a_program_beside_a_file_that_hides_a_module_is_told_so(name, tmp_path):
     hiding = tmp_path / f"{name}.py"
     hiding.write_text("print('the program of the user')")
-    for program in (["-c", "from sim import Robot"], [tmp_path / "program.py"]):
-        (tmp_path / "program.py").write_text("from sim import Robot")
+    for program in (["-c", "from batchpid.sim import Robot"], [tmp_path / "program.py"]):
+        (tmp_path / "program.py").write_text("from batchpid.sim import Robot")
         ran = subprocess.run([sys.executable, *program], cwd=tmp_path, capture_output=True, text=True)
         line = (
             f"ImportError: {hiding} hides the module {name!r} that batchpid needs; rename it or run in another folder"
@@ -205,28 +191,20 @@ def test_a_program_beside_a_file_that_hides_a_module_is_told_so(name, tmp_path):
 def test_harmless_names_beside_a_program_are_accepted(tmp_path):
     for name in ("os", "test", "calendar", "robots"):
         (tmp_path / f"{name}.py").touch()
-    subprocess.run([sys.executable, "-c", "from sim import Robot"], cwd=tmp_path, check=True)
+    subprocess.run([sys.executable, "-c", "from batchpid.sim import Robot"], cwd=tmp_path, check=True)
 
 
 def test_every_imported_package_is_checked():
     root = Path(batchpid.__file__).parents[1]
     imported = set()
-    for path in (*root.glob("batchpid/**/*.py"), *root.glob("sim/**/*.py")):
+    for path in (*root.glob("batchpid/**/*.py"), *root.glob("batchpid/sim/**/*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 imported.add(node.module.partition(".")[0])
-    packages = imported - sys.stdlib_module_names - {"batchpid", "sim", "assets"}
+    packages = imported - sys.stdlib_module_names - {"batchpid"}
     assert packages <= set(startup.IMPORTED)
-
-
-@pytest.mark.parametrize("name", ["batchpid", "assets"])
-def test_importing_sim_names_a_file_that_hides_a_package_it_needs(name, tmp_path):
-    hiding = tmp_path / f"{name}.py"
-    hiding.touch()
-    ran = subprocess.run([sys.executable, "-c", "import sim"], cwd=tmp_path, capture_output=True, text=True)
-    assert ran.stderr.splitlines()[-1].startswith(f"ImportError: {hiding} hides the package {name!r}")
 
 
 def test_a_closed_stdout_ends_the_command_without_an_error(tmp_path):

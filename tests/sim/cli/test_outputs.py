@@ -11,9 +11,9 @@ from tiny_urdf import one_joint, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner, write_recording
-from sim.cli import COMMANDS, parse
-from sim.cli.outputs import Outputs, beside
+from batchpid.sim import Robot, Runner, write_recording
+from batchpid.sim.cli import COMMANDS, parse
+from batchpid.sim.cli.outputs import Outputs, beside
 
 SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
 WORDS = {
@@ -87,8 +87,10 @@ def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch
 
 
 def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp_path, monkeypatch):
-    monkeypatch.setattr("sim.plots.step_responses", lambda *_, **__: None)
-    monkeypatch.setattr("sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path)
+    monkeypatch.setattr("batchpid.sim.plots.step_responses", lambda *_, **__: None)
+    monkeypatch.setattr(
+        "batchpid.sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path
+    )
     monkeypatch.chdir(tmp_path)
     assert batchpid("demo", *SHORT)[0] == 0
     status, said, complaint = batchpid("demo", *SHORT)

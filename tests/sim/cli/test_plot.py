@@ -6,7 +6,7 @@ import resource
 
 import pytest
 
-from sim import Runner, write_recording
+from batchpid.sim import Runner, write_recording
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from sim import Observation, Rollout
-from sim.cli import report
-from sim.tuning.evaluation import step_response_metrics
+from batchpid.sim import Observation, Rollout
+from batchpid.sim.cli import report
+from batchpid.sim.tuning.evaluation import step_response_metrics
 
 TICKS, ENVS = 200, 5
 

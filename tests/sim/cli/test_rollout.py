@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import Runner
-from sim.cli.run import start_poses
+from batchpid.sim import Runner
+from batchpid.sim.cli.run import start_poses
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 

@@ -17,8 +17,8 @@ from processes import PATIENCE
 from tiny_urdf import one_joint, write
 
 from batchpid import save_params
-from sim import Robot
-from sim.cli import COMMANDS
+from batchpid.sim import Robot
+from batchpid.sim.cli import COMMANDS
 
 BATCHPID = f"{sys.executable} -m batchpid"
 SHORT = "--num-envs 2 --workers 1 --seconds 0.3"

@@ -11,11 +11,11 @@ from robots import load_bundled
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
-from sim import Robot
-from sim.cli import parse
-from sim.tuning.moves import random_moves
-from sim.tuning.search import tune
-from sim.tuning.weights import Weights
+from batchpid.sim import Robot
+from batchpid.sim.cli import parse
+from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
@@ -25,8 +25,10 @@ SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--work
 @pytest.fixture(autouse=True)
 def few_moves(monkeypatch):
     """Let the final of a search and the table of the commands have two random moves."""
-    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 2)
-    monkeypatch.setattr("sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 2), seed))
+    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 2)
+    monkeypatch.setattr(
+        "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 2), seed)
+    )
 
 
 def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_path):
@@ -53,7 +55,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("sim.cli.run.evaluate_gains", interrupt)  # after the search
+        patched.setattr("batchpid.sim.cli.run.evaluate_gains", interrupt)  # after the search
         status, _, complaint = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 130
     assert "interrupted" in complaint
@@ -69,7 +71,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
 
 def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
     out = tmp_path / "panda.yaml"
-    monkeypatch.setattr("sim.tuning.evaluation.Evaluation.drawback", lambda *_: "chatter: tuned 3, designed 2")
+    monkeypatch.setattr("batchpid.sim.tuning.evaluation.Evaluation.drawback", lambda *_: "chatter: tuned 3, designed 2")
     status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
     assert status == 0
     assert "the tuned ones are rejected: chatter: tuned 3, designed 2." in said
@@ -109,7 +111,9 @@ def test_settings_keep_the_types_of_options(batchpid, tmp_path):
 
 def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch):
     robot = load_bundled("panda")
-    monkeypatch.setattr("sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,))
+    monkeypatch.setattr(
+        "batchpid.sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,)
+    )
     found = tune(robot, generations=1, population=4, seconds=0.05, workers=0)  # the designed gains are at 0
     assert found.rejected.startswith("cost in the search: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")
@@ -117,7 +121,7 @@ def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch
     def worse_in_the_final(self, runner, points):
         return (*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),)
 
-    monkeypatch.setattr("sim.tuning.candidates.Candidates.costs", worse_in_the_final)
+    monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.costs", worse_in_the_final)
     found = tune(robot, generations=1, population=5, seconds=0.05, workers=0, timestep=0.0005)
     assert found.rejected.startswith("cost in the final: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")

@@ -9,8 +9,8 @@ from tiny_urdf import INERTIAL, joint, link, robot
 from tiny_urdf import write as write_urdf
 
 import batchpid as bp
-from sim import Observation, Robot, Rollout, write_recording
-from sim.view.address import listen
+from batchpid.sim import Observation, Robot, Rollout, write_recording
+from batchpid.sim.view.address import listen
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -29,7 +29,7 @@ def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sim.view.View.run", interrupted)
+    monkeypatch.setattr("batchpid.sim.view.View.run", interrupted)
     status, said, err = batchpid("view", *SHORT)
     assert (status, err) == (0, "")
     assert "http://127.0.0.1:" in said

@@ -1,10 +1,10 @@
-"""Fixtures of the tests of sim.engine."""
+"""Fixtures of the tests of batchpid.sim.engine."""
 
 from __future__ import annotations
 
 import pytest
 
-from sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.pack import Pack
 
 
 class Packs(list[Pack]):

@@ -7,9 +7,9 @@ import pytest
 from robots import load_bundled
 from tiny_urdf import random_tree, robot, write
 
-from sim import Robot
-from sim.engine import native
-from sim.engine.batch_dynamics import (
+from batchpid.sim import Robot
+from batchpid.sim.engine import native
+from batchpid.sim.engine.batch_dynamics import (
     Friction,
     MovingJoints,
     NativeBatchDynamics,

@@ -7,8 +7,8 @@ import sapien
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.engine.sapien.collision_groups import collision_groups, may_touch
-from sim.engine.sapien.user_content import HeadlessScene
+from batchpid.sim.engine.sapien.collision_groups import collision_groups, may_touch
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
 
 DEFAULT = (1, 1, 0, 0)
 

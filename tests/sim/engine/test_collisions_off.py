@@ -13,13 +13,13 @@ from robots import RUBBING, load_bundled
 
 import batchpid
 from batchpid.errors import InvalidArgumentError
-from sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.missed_contact import DEPTH
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.options import default_params
-from sim.tuning.moves import random_moves
+from batchpid.sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.missed_contact import DEPTH
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.options import default_params
+from batchpid.sim.tuning.moves import random_moves
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.4"/></geometry></collision>'
 TICKS = 15

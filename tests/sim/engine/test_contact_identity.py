@@ -13,9 +13,9 @@ import pytest
 from identical import assert_identical
 from robots import load_bundled
 
-from sim import RecoveryWarning, Robot, Runner
-from sim.engine.sapien.contact_prediction import ContactPredictor
-from sim.tuning.randomization import usual_variation
+from batchpid.sim import RecoveryWarning, Robot, Runner
+from batchpid.sim.engine.sapien.contact_prediction import ContactPredictor
+from batchpid.sim.tuning.randomization_presets import usual_variation
 
 N, TICKS = 16, 20
 OPEN_LOOP = {"kp": 0.0, "ki": 0.0, "kd": 0.0}
@@ -133,7 +133,7 @@ def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
         assert_identical(episodes[2], episodes[0], skip=["time"])
 
 
-@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 @pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_robots_in_free_motion_share_systems(name, packs):
     robot = load_bundled(name)

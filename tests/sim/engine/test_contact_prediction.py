@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from robots import load_bundled
 
-from sim import Runner
-from sim.benchmark.accuracy import contact_moves
-from sim.engine.sapien.building import build_scene, new_system
-from sim.engine.sapien.contact_prediction import (
+from batchpid.sim import Runner
+from batchpid.sim.benchmark.accuracy import contact_moves
+from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.contact_prediction import (
     LISTED_DISTANCE,
     LOOKAHEAD_STEPS,
     MAX_ACCELERATION,
@@ -22,11 +22,11 @@ from sim.engine.sapien.contact_prediction import (
     NearPair,
     SafeRegions,
 )
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.extents import link_extents, touching_pairs
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.extents import link_extents, touching_pairs
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 DT = 1 / 2000
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim import RecoveryWarning, Robot, Runner
+from batchpid.sim import RecoveryWarning, Robot, Runner
 from tests.sim.identical import assert_identical
 from tests.sim.tiny_urdf import write
 

@@ -5,11 +5,11 @@ import sys
 
 import pytest
 
-from sim.engine.lazy_module import LazyModule, imported_lazily
+from batchpid.sim.engine.lazy_module import LazyModule, imported_lazily
 
 PROGRAM = """
 import sys
-import sim.engine.sapien.building
+import batchpid.sim.engine.sapien.building
 assert not {"trimesh", "scipy"} & sys.modules.keys(), "a worker starts without them"
 import sapien.wrapper.urchin.utils as urchin
 import trimesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_urdf import joint, link, robot, write
 
-from sim import Robot
+from batchpid.sim import Robot
 
 FACES = (0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)
 CORNERS = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0.1, 0.1, 0.4]])

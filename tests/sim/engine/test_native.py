@@ -10,11 +10,11 @@ from identical import assert_identical
 from robots import load_bundled
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
-from sim import Robot, Runner
-from sim.engine import native
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim import Robot, Runner
+from batchpid.sim.engine import native
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 BUILT = not native.status().reason.startswith("the extension was not built")
 needs_extension = pytest.mark.skipif(not BUILT, reason="the extension was not built: no C++ compiler")

@@ -16,11 +16,11 @@ from identical import assert_identical
 
 from batchpid.native import extensions
 from batchpid.native.operations import PROGRAM
-from sim import Runner
-from sim.engine import native
-from sim.engine.batch_dynamics import PinocchioBatchDynamics, batch_dynamics
-from sim.engine.native import interface, verdict
-from sim.engine.native.interface import EXTENSIONS
+from batchpid.sim import Runner
+from batchpid.sim.engine import native
+from batchpid.sim.engine.batch_dynamics import PinocchioBatchDynamics, batch_dynamics
+from batchpid.sim.engine.native import interface, verdict
+from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
 OTHERS = {
@@ -99,7 +99,7 @@ def test_worker_processes_take_the_verdict_without_a_warning_of_their_own(monkey
 
 def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path):
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
-    monkeypatch.delitem(sys.modules, "sim.engine.native._gateway", raising=False)
+    monkeypatch.delitem(sys.modules, "batchpid.sim.engine.native._gateway", raising=False)
     monkeypatch.setattr(native, "__path__", [str(tmp_path)])
     importlib.invalidate_caches()
     with warnings.catch_warnings():

@@ -12,17 +12,25 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.friction import Friction
-from sim import Runner, RunnerOptions
-from sim.engine import engines
-from sim.engine.protocol import CompiledPack, CompiledStep, ContactRecord, DrivenPack, Engine, EnginePack, RobotModel
-from sim.engine.sapien.dynamics import Dynamics
-from sim.engine.sapien.missed_contact import MissedContacts
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.sapien_engine import SapienEngine
-from sim.engine.sapien.sim_step import NativeStep
-from sim.engine.sapien.variation import VariedPack
-from sim.loop.backend import describe
+from batchpid.motors.friction import Friction
+from batchpid.sim import Runner, RunnerOptions
+from batchpid.sim.engine import engines
+from batchpid.sim.engine.protocol import (
+    CompiledPack,
+    CompiledStep,
+    ContactRecord,
+    DrivenPack,
+    Engine,
+    EnginePack,
+    RobotModel,
+)
+from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.sapien.missed_contact import MissedContacts
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
+from batchpid.sim.engine.sapien.sim_step import NativeStep
+from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.loop.backend import describe
 
 PANDA = load_bundled("panda")
 PANDA.has_ground  # noqa: B018 - by SAPIEN, before a test replaces it

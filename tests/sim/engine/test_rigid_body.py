@@ -7,8 +7,8 @@ import pytest
 from robots import load_bundled
 from tiny_urdf import random_tree, robot, write
 
-from sim import Robot
-from sim.engine.native import xla
+from batchpid.sim import Robot
+from batchpid.sim.engine.native import xla
 
 jax = pytest.importorskip("jax")
 pytestmark = pytest.mark.skipif(not xla.status().active, reason="there are no native calls")

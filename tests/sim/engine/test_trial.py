@@ -12,7 +12,7 @@ import pytest
 from processes import children, have_ended
 
 from batchpid.errors import RobotError
-from sim.engine.sapien.trial import in_child
+from batchpid.sim.engine.sapien.trial import in_child
 
 
 def parent_and_self() -> tuple[int, int]:
@@ -58,6 +58,6 @@ def test_the_answer_to_an_interrupted_trial_is_not_that_to_the_next():
 def test_a_server_is_no_child_of_its_caller_and_ends_with_it():
     server, _ = in_child(parent_and_self)
     assert psutil.Process(server) not in children()
-    program = "import os; from sim.engine.sapien.trial import in_child; print(in_child(os.getppid))"
+    program = "import os; from batchpid.sim.engine.sapien.trial import in_child; print(in_child(os.getppid))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert have_ended([int(done.stdout)])

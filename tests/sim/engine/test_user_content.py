@@ -7,8 +7,8 @@ import pytest
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
-from sim.engine.sapien.user_content import sapien
+from batchpid.sim import Runner
+from batchpid.sim.engine.sapien.user_content import sapien
 
 ROBOT = load_bundled("panda")
 DROP = 0.5 * 9.81 * 0.2**2

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from robots import load_bundled
 
-from sim.engine.sapien.dynamics import Dynamics
-from sim.engine.sapien.pack import Pack
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.sapien.variation import VariedPack
-from sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.sapien.pack import Pack
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 
 STEPS = 120
 

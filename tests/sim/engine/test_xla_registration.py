@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from sim.engine import native
-from sim.engine.native import xla
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native import xla
 
 jax = pytest.importorskip("jax")
 

@@ -11,9 +11,9 @@ import pytest
 from identical import assert_identical
 
 import batchpid as bp
-from sim import Runner
-from sim.loop.faults import FaultWarning
-from sim.workers.pool import RecoveryWarning
+from batchpid.sim import Runner
+from batchpid.sim.loop.faults import FaultWarning
+from batchpid.sim.workers.pool import RecoveryWarning
 
 ENVS = 10
 SCALES = {

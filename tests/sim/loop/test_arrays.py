@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.arrays import Arrays, Ticks
 
 LAYOUT = Arrays.layout(5, 3, 2)
 

@@ -9,17 +9,26 @@ from hypothesis import strategies as st
 from identical import assert_identical
 
 import batchpid as bp
-from batchpid import guard as guard_model
-from batchpid.actuators import discretise
-from batchpid.coupling import Coupling, Follower
-from batchpid.friction import Friction
-from batchpid.friction import init as init_friction
-from sim import Runner
-from sim.loop import control_step as module
-from sim.loop import numpy_executor, xla_executor
-from sim.loop.arrays import Command
-from sim.loop.control_step import Constants, KnownFriction, Layout, Measured, Model, Step, StepState, control_step
-from sim.loop.pid_law import PIDLaw
+from batchpid.motors import discretise
+from batchpid.motors import guard as guard_model
+from batchpid.motors.coupling import Coupling, Follower
+from batchpid.motors.friction import Friction
+from batchpid.motors.friction import init as init_friction
+from batchpid.sim import Runner
+from batchpid.sim.loop import control_step as module
+from batchpid.sim.loop import numpy_executor, xla_executor
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import (
+    Constants,
+    KnownFriction,
+    Layout,
+    Measured,
+    Model,
+    Step,
+    StepState,
+    control_step,
+)
+from batchpid.sim.loop.pid_law import PIDLaw
 
 DT, ENVS, JOINTS = 1e-3, 4, 3
 MATRIX = np.diag([2.0, 1.0, 0.5]) + 0.1

@@ -13,9 +13,9 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import FaultWarning, Runner, Snapshot
-from sim.loop.custom import flatten, unflatten
-from sim.loop.faults import CAUSES
+from batchpid.sim import FaultWarning, Runner, Snapshot
+from batchpid.sim.loop.custom import flatten, unflatten
+from batchpid.sim.loop.faults import CAUSES
 
 N, TICKS = 5, 12
 
@@ -90,7 +90,7 @@ def test_resets_by_mask_and_snapshots_keep_the_state(panda, tmp_path):
         other.restore(snapshot)
 
 
-@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_lost_worker_is_replaced(panda):
     setpoints = np.ones((2, panda.dof))
     with Runner(panda, N, control=Counter(), workers=2, substeps=10) as runner:
@@ -172,14 +172,14 @@ class Diverges(Counter):
         return state, 0 * passive + 1e38
 
 
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_a_finite_effort_that_ends_the_state_is_a_fault_of_the_state(panda):
     with Runner(panda, 1, control=Diverges(), workers=0, params=panda.params(effort_limit=None)) as runner:
         runner.step(np.zeros(panda.dof))
         assert [fault.cause for fault in runner.faults] == ["state"]
 
 
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_an_env_whose_effort_is_nan_fails_alone(panda):
     setpoint = np.ones((N, panda.dof))
     with Runner(panda, N, control=Counter(), workers=0, substeps=20) as runner:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from sim import Runner, Snapshot
+from batchpid.sim import Runner, Snapshot
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
-from sim import Randomization, Robot, Runner, Uniform
-from sim.engine.sapien.dynamics import scene_dynamics
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
+from batchpid.sim import Randomization, Robot, Runner, Uniform
+from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]

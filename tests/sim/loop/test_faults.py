@@ -11,7 +11,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import FaultWarning, Runner
+from batchpid.sim import FaultWarning, Runner
 
 PANDA = load_bundled("panda")
 N = 6
@@ -82,7 +82,7 @@ def test_a_state_that_is_not_finite_is_detected_at_its_step(control):
     assert not broken.ok[3:, 2].any()
 
 
-@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_an_env_with_unstable_gains_is_suspended():
     gains = PANDA.params().kd.repeat(N, 0)
     gains[4, 6] = 1e9

@@ -10,7 +10,7 @@ from robots import load_bundled
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import step_metrics
-from sim import Runner
+from batchpid.sim import Runner
 
 OMEGA = 9.0
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim import Runner
+from batchpid.sim import Runner
 
 POSE = np.array([0.3, 0.4, -0.2, -1.8, 0.5, 1.9, 0.7, 0.02, 0.02])
 

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.computed_torque import check_gain_units
 from batchpid.errors import InvalidArgumentError
-from sim.engine import native
-from sim.loop.law_program import LawProgram
-from sim.loop.pid_law import PIDLaw
+from batchpid.law.computed_torque import check_gain_units
+from batchpid.sim.engine import native
+from batchpid.sim.loop.law_program import LawProgram
+from batchpid.sim.loop.pid_law import PIDLaw
 
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
 DT = 1 / 2000

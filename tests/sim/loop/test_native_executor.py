@@ -10,14 +10,14 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from sim import Runner
-from sim.engine import native
-from sim.engine.native_mass_matrix import NativeMassMatrix
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.loop import native_executor
-from sim.loop.control_step import control_step
-from sim.loop.native_executor import NativeExecutor
+from batchpid.sim import Runner
+from batchpid.sim.engine import native
+from batchpid.sim.engine.native_mass_matrix import NativeMassMatrix
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.loop import native_executor
+from batchpid.sim.loop.control_step import control_step
+from batchpid.sim.loop.native_executor import NativeExecutor
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
 N = 3
@@ -125,7 +125,7 @@ def test_what_cannot_be_a_program_takes_one_native_call_a_sim_step(panda):
             return super().run(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sim.loop.env_group.NativeExecutor", Seen)
+        patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", Seen)
         for options in ({}, {"actuators": actuators}):
             with Runner(panda, 2, workers=0, **options) as runner:
                 runner.step(panda.settings.target)

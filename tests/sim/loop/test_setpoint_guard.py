@@ -7,7 +7,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner, Snapshot
+from batchpid.sim import Robot, Runner, Snapshot
 
 N = 3
 ARM = """<robot name="arm">

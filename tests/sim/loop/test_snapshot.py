@@ -13,8 +13,8 @@ from identical import assert_identical
 from robots import RUBBING, load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Runner, Snapshot
-from sim.options import default_params
+from batchpid.sim import Runner, Snapshot
+from batchpid.sim.options import default_params
 
 N = 5
 

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.actuators import STAGES, advance_effort, advance_measurement, discretise
-from sim.engine import native
-from sim.loop import stage_program
-from sim.loop.stage_program import compiled_stages
+from batchpid.motors import STAGES, advance_effort, advance_measurement, discretise
+from batchpid.sim.engine import native
+from batchpid.sim.loop import stage_program
+from batchpid.sim.loop.stage_program import compiled_stages
 
 DT, SHAPE = 1 / 2000, (3, 4)
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")

@@ -15,8 +15,8 @@ from robots import RUBBING, load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Runner, Snapshot
-from sim.engine import native
+from batchpid.sim import Runner, Snapshot
+from batchpid.sim.engine import native
 
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
@@ -95,7 +95,7 @@ def test_any_groups_and_packs_are_bit_identical(panda):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::sim.RecoveryWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 @pytest.mark.parametrize("control", ["pid", "mlp"])
 @pytest.mark.parametrize("name", ["panda", RUBBING])
 def test_any_workers_are_bit_identical_and_a_lost_one_is_replaced(name, control):
@@ -189,7 +189,7 @@ def test_resets_by_mask_and_snapshots_keep_its_state(counter, panda, tmp_path):
         other.restore(snapshot)
 
 
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 @pytest.mark.parametrize("on_fault", ["hold", "reset"])
 def test_an_env_whose_effort_is_nan_fails_alone(counter, panda, on_fault):
     setpoint = np.ones((N, panda.dof))
@@ -274,7 +274,7 @@ def test_jax_is_not_imported_unless_it_is_asked_for():
 
 @pytest.mark.slow
 @needs_extension
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 @pytest.mark.parametrize("seed", range(6))
 def test_random_efforts_resets_snapshots_and_faults_are_those_of_the_loop_in_numpy(seed):
     rng = np.random.default_rng(seed)

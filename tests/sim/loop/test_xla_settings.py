@@ -11,11 +11,11 @@ from jax_debugging import SETTINGS, changed
 from robots import RUBBING, load_bundled
 
 import batchpid as bp
-from sim import Runner
+from batchpid.sim import Runner
 
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
-pytestmark = pytest.mark.filterwarnings("ignore::sim.FaultWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 
 
 class Integrator:

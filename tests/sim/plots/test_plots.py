@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from batchpid.errors import InvalidArgumentError
-from sim import Observation, Rollout, RunInfo, plots
-from sim.plots.drawing import MEDIAN, SETPOINT, quantiles
+from batchpid.sim import Observation, Rollout, RunInfo, plots
+from batchpid.sim.plots.drawing import MEDIAN, SETPOINT, quantiles
 
 TICKS, ENVS = 30, 6
 

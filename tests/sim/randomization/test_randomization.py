@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from robots import load_bundled
 
-from batchpid import friction, make_actuators
-from batchpid.actuators import presets
+from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
-from sim.randomization.checks import check_params, check_robot, prepared_actuators
-from sim.randomization.fields import elements
+from batchpid.motors import actuator_presets as presets
+from batchpid.motors import friction
+from batchpid.sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
+from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
+from batchpid.sim.randomization.fields import elements
 
 PANDA = load_bundled("panda")
 FIELDS = {

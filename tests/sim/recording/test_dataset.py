@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip("xarray")
 
-from sim import Runner, write_recording
-from sim.recording.dataset import open_dataset, to_dataset
+from batchpid.sim import Runner, write_recording
+from batchpid.sim.recording.dataset import open_dataset, to_dataset
 
 
 @pytest.fixture(scope="module")

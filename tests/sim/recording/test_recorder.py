@@ -21,10 +21,11 @@ from robots import load_bundled
 h5py = pytest.importorskip("h5py")
 
 from batchpid.errors import ClosedError, InvalidArgumentError  # noqa: E402
-from sim import FaultWarning, Recorder, RecordingError, Runner, read_recording, write_recording  # noqa: E402
-from sim.cli import main  # noqa: E402
-from sim.recording import files, partial_file  # noqa: E402
-from sim.recording import recorder as recorder_module  # noqa: E402
+from batchpid.sim import FaultWarning, Recorder, RecordingError, Runner, read_recording, write_recording  # noqa: E402
+from batchpid.sim.cli import main  # noqa: E402
+from batchpid.sim.recording import partial_file  # noqa: E402
+from batchpid.sim.recording import recorder as recorder_module  # noqa: E402
+from batchpid.sim.recording import recording_files as files  # noqa: E402
 
 ROBOT = load_bundled("panda")
 N = 3
@@ -175,7 +176,7 @@ def test_faults_are_recorded(tmp_path):
 FULL = """
 import os, sys, time, warnings
 warnings.simplefilter("ignore")
-from sim import Robot, Runner, Recorder, read_recording
+from batchpid.sim import Robot, Runner, Recorder, read_recording
 robot = Robot.load("panda")
 with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
     recorder = Recorder(sys.argv[1], runner)
@@ -304,7 +305,7 @@ def test_bad_paths_are_refused(path):
 PROGRAM = """
 import sys, time, numpy as np, warnings
 warnings.simplefilter("ignore")
-from sim import Robot, Runner, Recorder
+from batchpid.sim import Robot, Runner, Recorder
 robot = Robot.load("panda")
 with (
     Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner,

@@ -16,9 +16,10 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from sim import FaultWarning, RecordingError, RunInfo, Runner, read_recording, write_recording
-from sim.recording import files, hdf5
-from sim.recording.files import attribute_checksum
+from batchpid.sim import FaultWarning, RecordingError, RunInfo, Runner, read_recording, write_recording
+from batchpid.sim.recording import hdf5
+from batchpid.sim.recording import recording_files as files
+from batchpid.sim.recording.recording_files import attribute_checksum
 
 SUFFIXES = (".npz", ".h5")
 

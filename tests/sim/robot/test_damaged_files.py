@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from test_meshes import GOOD, arm
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot
 
-import assets
+from batchpid import assets
 from batchpid.errors import RobotError
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 BOX = '<collision><origin xyz="0 0 1" rpy="0 0 0.1"/><geometry><box size="1 1 1"/></geometry></collision>'
 PAIR = '<disable_collisions link1="base" link2="arm" reason="Default"/>'

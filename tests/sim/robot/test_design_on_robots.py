@@ -15,9 +15,9 @@ import pytest
 from robots import load_bundled
 
 import batchpid as bp
-from sim import Robot
-from sim.tuning.evaluation import evaluate_gains
-from sim.tuning.moves import random_moves
+from batchpid.sim import Robot
+from batchpid.sim.tuning.evaluation import evaluate_gains
+from batchpid.sim.tuning.moves import random_moves
 
 FOLDER = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
 ROBOTS = {

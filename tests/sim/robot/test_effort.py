@@ -7,7 +7,7 @@ import pytest
 from tiny_urdf import LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 UNLIMITED = LIMIT.replace('effort="10"', "")
 OFF_CENTRE = '<inertial><origin xyz="0.5 0 0"/><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial>'

@@ -10,12 +10,12 @@ from robots import load_bundled
 from tiny_urdf import link, write
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot
-from sim.engine.sapien.building import build_scene, new_system
-from sim.engine.sapien.physics import PHYSICS
-from sim.engine.scene_spec import SceneSpec
-from sim.robot.kinematics import Kinematics
-from sim.robot.rotations import about, from_rpy, multiply, rotate
+from batchpid.sim import Robot
+from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.rotations import about, from_rpy, multiply, rotate
 
 ODD = """<robot name="odd">
   <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>

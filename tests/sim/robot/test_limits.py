@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 import pytest
 
-from sim import Robot, Runner, SetpointWarning
-from sim.robot.limits import SetpointCheck
+from batchpid.sim import Robot, Runner, SetpointWarning
+from batchpid.sim.robot.limits import SetpointCheck
 from tests.sim.tiny_urdf import joint, link, robot, write
 
 

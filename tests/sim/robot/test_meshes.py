@@ -11,8 +11,8 @@ import pytest
 from tiny_urdf import INERTIAL, one_joint, write
 
 from batchpid.errors import RobotError
-from sim import Robot, Runner
-from sim.robot.meshes import SIZE_LIMIT, mesh_problem
+from batchpid.sim import Robot, Runner
+from batchpid.sim.robot.meshes import SIZE_LIMIT, mesh_problem
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim import Robot
+from batchpid.sim import Robot
 from tests.sim.tiny_urdf import INERTIAL, joint, link, robot, write
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from robots import load_bundled
 from tiny_urdf import LIMIT, joint, link, robot, write
 
-from sim import Robot
-from sim.robot.plausibility import implausible_figures
+from batchpid.sim import Robot
+from batchpid.sim.robot.plausibility import implausible_figures
 
 CODES = {"scale", "mass", "inertia", "load"}
 

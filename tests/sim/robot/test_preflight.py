@@ -10,9 +10,9 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import Finding, Robot, Runner
-from sim.robot.findings import SEVERITIES
-from sim.robot.stability import stability_report
+from batchpid.sim import Finding, Robot, Runner
+from batchpid.sim.robot.findings import SEVERITIES
+from batchpid.sim.robot.loop_stability import stability_report
 
 COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 GAINS = {"kp": 1.0, "ki": 0.0, "kd": 0.1}
@@ -212,7 +212,7 @@ def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, 
             assert not {"ringing", "unstable"} & {finding.code for finding in each.check(params=params)}
 
 
-@pytest.mark.filterwarnings("ignore::sim.FaultWarning", "ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning")
 @pytest.mark.parametrize("filter_time", [0.0, 1e-3])
 @pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
 @pytest.mark.parametrize(("factor", "stays"), [(0.9, True), (1.1, False)])

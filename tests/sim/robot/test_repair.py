@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
-from sim import Robot
-from sim.robot.inertia import ball, nearest_physical, triangle_excess
+from batchpid.sim import Robot
+from batchpid.sim.robot.inertia import ball, nearest_physical, triangle_excess
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")

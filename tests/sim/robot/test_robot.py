@@ -5,7 +5,7 @@ import pytest
 from tiny_urdf import one_joint, write
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 
 @pytest.mark.parametrize("units", ["mass_matrix", "inertia", "effort"])

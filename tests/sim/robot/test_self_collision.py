@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
-from sim import Robot, Runner
-from sim.engine.sapien.dynamics import robot_dynamics
-from sim.robot.self_collision import disabled_pairs, read_srdf
+from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.sapien.dynamics import robot_dynamics
+from batchpid.sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'

@@ -11,8 +11,8 @@ from robots import load_bundled
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import MissingDependencyError, RobotError
-from sim import Robot
-from sim.robot.shapes import FEWEST, MOST, segments_of, surfaces
+from batchpid.sim import Robot
+from batchpid.sim.robot.shapes import FEWEST, MOST, segments_of, surfaces
 
 trimesh = pytest.importorskip("trimesh")
 RED = '<material name="red"><color rgba="1 0 0 0.5"/></material>'

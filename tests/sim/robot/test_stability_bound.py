@@ -7,7 +7,7 @@ import pytest
 from robots import load_bundled
 
 import batchpid as bp
-from sim import Runner
+from batchpid.sim import Runner
 
 DT = 1 / 2000
 DIVERGED = 50.0  # rad/s; PhysX stops joints at 100 rad/s

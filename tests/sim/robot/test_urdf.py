@@ -10,7 +10,7 @@ import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import BatchPIDError, RobotError, RobotNotFoundError
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")

@@ -7,10 +7,10 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim import LogUniform, Randomization, Runner, Uniform
-from sim.tuning.evaluation import arm_joints, evaluate_gains, step_response_metrics
-from sim.tuning.moves import Moves, random_moves, tutorial_move
-from sim.tuning.randomization import PRESETS, load_randomization, payload_capacity, usual_variation
+from batchpid.sim import LogUniform, Randomization, Runner, Uniform
+from batchpid.sim.tuning.evaluation import arm_joints, evaluate_gains, step_response_metrics
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.randomization_presets import PRESETS, load_randomization, payload_capacity, usual_variation
 
 
 def hold(pose, name="hold"):

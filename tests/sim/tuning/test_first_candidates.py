@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid import make_actuators
-from sim import Randomization, Uniform
-from sim.tuning.candidates import Candidates
-from sim.tuning.first_candidates import (
+from batchpid.sim import Randomization, Uniform
+from batchpid.sim.tuning.candidates import Candidates
+from batchpid.sim.tuning.first_candidates import (
     FASTEST,
     PHASE_MARGIN,
     first_gains,
@@ -20,8 +20,8 @@ from sim.tuning.first_candidates import (
     loop_delay,
     phase_margin,
 )
-from sim.tuning.moves import random_moves
-from sim.tuning.weights import Weights
+from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning.weights import Weights
 
 SPEED = st.floats(0.5, 50.0)
 DELAY = st.floats(0.0, 0.2)

@@ -9,7 +9,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning.gain_sets import gain_set
 
 
 def same(one, other):

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from sim.tuning.history import HistoryFile
-from sim.tuning.identification.fit import Step
-from sim.tuning.identification.history import History, State
+from batchpid.sim.identification.fit import Step
+from batchpid.sim.identification.fit_history import History, State
+from batchpid.sim.tuning.history import HistoryFile
 
 SETTINGS = {"robot": "arm", "seed": 3, "weights": {"itae": 1.0}}
 STATE = State(Step(np.array([0.1, 0.2]), 5, np.array([0.0, 0.2]), np.inf), ((0, [0.1, 0.3]),))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.tuning.moves import (
+from batchpid.sim.tuning.moves import (
     Moves,
     random_moves,
     search_moves,

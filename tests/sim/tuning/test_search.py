@@ -11,16 +11,16 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from sim import Physics, Randomization, Robot, Runner, Uniform
-from sim.cli.run import evaluate_sets
-from sim.robot.self_collision import Srdf
-from sim.tuning.evaluation import arm_joints
-from sim.tuning.first_candidates import first_gains
-from sim.tuning.gain_sets import GainSet
-from sim.tuning.moves import random_moves
-from sim.tuning.randomization import ENCODER, load_randomization
-from sim.tuning.search import tune
-from sim.tuning.weights import Weights
+from batchpid.sim import Physics, Randomization, Robot, Runner, Uniform
+from batchpid.sim.cli.run import evaluate_sets
+from batchpid.sim.robot.self_collision import Srdf
+from batchpid.sim.tuning.evaluation import arm_joints
+from batchpid.sim.tuning.first_candidates import first_gains
+from batchpid.sim.tuning.gain_sets import GainSet
+from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning.randomization_presets import ENCODER, load_randomization
+from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
@@ -30,8 +30,8 @@ SMALL = {"generations": 2, "population": 4, "seconds": 0.2}
 @pytest.fixture
 def few_moves(monkeypatch):
     """Search on two moves, with a final on one other."""
-    monkeypatch.setattr("sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed))
-    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 1)
+    monkeypatch.setattr("batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed))
+    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
 
 
 def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda, few_moves):
@@ -52,7 +52,7 @@ def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, f
         options.append((kwargs.get("collisions", True), kwargs.get("physics")))
         return Runner(*args, **kwargs)
 
-    monkeypatch.setattr("sim.tuning.search.Runner", runner)
+    monkeypatch.setattr("batchpid.sim.tuning.search.Runner", runner)
     tune(panda, workers=0, physics="fast", **SMALL)
     assert options == [(False, "free"), (True, "fast")]
     options.clear()
@@ -109,9 +109,9 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(panda, tmp_path):
 
 def test_the_result_is_the_best_of_the_final_not_of_the_search(panda, monkeypatch):
     drawn = iter([random_moves(panda, 1, 3)])
-    monkeypatch.setattr("sim.tuning.search.search_moves", lambda *_: random_moves(panda, 1, 0))
-    monkeypatch.setattr("sim.tuning.search.random_moves", lambda *_: next(drawn))
-    monkeypatch.setattr("sim.tuning.search.FINAL_MOVES", 1)
+    monkeypatch.setattr("batchpid.sim.tuning.search.search_moves", lambda *_: random_moves(panda, 1, 0))
+    monkeypatch.setattr("batchpid.sim.tuning.search.random_moves", lambda *_: next(drawn))
+    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
     found = tune(panda, workers=0, **SMALL)
     costs = sorted(cost for row in found.history for cost in row)
     assert found.cost in [*costs[:3], found.start_cost]

@@ -10,7 +10,7 @@ import pytest
 from tiny_urdf import one_joint
 
 from batchpid.errors import InvalidArgumentError
-from sim.tuning.survey import find_urdfs, survey
+from batchpid.sim.tuning.robot_survey import find_urdfs, survey
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ FLAGS = [
 def serve():
     """Return a function that serves data in a thread until the end of the test."""
     pytest.importorskip("viser")
-    from sim.view import View
+    from batchpid.sim.view import View
 
     running = []
 

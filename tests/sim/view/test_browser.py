@@ -5,8 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from sim import Runner
-from sim.view import LiveSimulation, Playback
+from batchpid.sim import Runner
+from batchpid.sim.view import LiveSimulation, Playback
 
 
 def picture(page):
@@ -120,7 +120,7 @@ def test_charts_draw_the_watched_joint(live, view, open_page, until):
     until(ink, what="the curve")
 
 
-@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_a_recorded_run_plays(jaco2, serve, open_page, until):
     with Runner(jaco2, 2, params=jaco2.params(), workers=0, substeps=66) as runner:
         rollout = runner.rollout(np.broadcast_to(jaco2.settings.target, (45, jaco2.dof)))

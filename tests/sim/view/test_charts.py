@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim import Observation, Rollout
-from sim.view import Playback
-from sim.view.charts import Charts
+from batchpid.sim import Observation, Rollout
+from batchpid.sim.view import Playback
+from batchpid.sim.view.charts import Charts
 
 
 class Gui:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
-from sim.cli import main
-from sim.view import film
+from batchpid.sim import Runner
+from batchpid.sim.cli import main
+from batchpid.sim.view import film
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
-from sim.view.gains import GroupGains, offered_gains
+from batchpid.sim.view.gains import GroupGains, offered_gains
 
 
 def test_the_robots_gains_are_offered_after_the_given_ones(panda):

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from sim.view import LiveSimulation, View
+from batchpid.sim.view import LiveSimulation, View
 
 viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402
@@ -22,9 +22,9 @@ import zstandard  # noqa: E402
 from websockets.asyncio.client import connect  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
-from sim.view.address import listen, resolve  # noqa: E402
-from sim.view.gate import Gate  # noqa: E402
-from sim.view.messages import MAX_BYTES, check_message  # noqa: E402
+from batchpid.sim.view.address import listen, resolve  # noqa: E402
+from batchpid.sim.view.gate import Gate  # noqa: E402
+from batchpid.sim.view.messages import MAX_BYTES, check_message  # noqa: E402
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -116,7 +116,7 @@ def live(panda):
 
 @pytest.fixture
 def view(live, serve, monkeypatch):
-    monkeypatch.setattr("sim.view.page.NOTICE_SECONDS", 0.0)
+    monkeypatch.setattr("batchpid.sim.view.page.NOTICE_SECONDS", 0.0)
     view = serve(live, port=18200)
     view.panel.frames_left = 0
     return view

@@ -1,6 +1,6 @@
 """Names on the control panel."""
 
-from sim.view.panel import short_names
+from batchpid.sim.view.panel import short_names
 
 
 def test_joint_names_lose_the_words_that_all_share(panda, jaco2):

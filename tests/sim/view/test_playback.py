@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
-from sim.view import Playback
-from sim.view.film import film_rows
+from batchpid.sim import Runner
+from batchpid.sim.view import Playback
+from batchpid.sim.view.film import film_rows
 
 
 @pytest.fixture(scope="module")

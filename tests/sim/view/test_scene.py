@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, robot, write
 
-from sim import Robot, Runner, read_recording, write_recording
-from sim.view import LiveSimulation, Playback
-from sim.view.film import add_floor
-from sim.view.layout import arrange_robots
-from sim.view.scene import RobotScene
+from batchpid.sim import Robot, Runner, read_recording, write_recording
+from batchpid.sim.view import LiveSimulation, Playback
+from batchpid.sim.view.film import add_floor
+from batchpid.sim.view.layout import arrange_robots
+from batchpid.sim.view.scene import RobotScene
 
 pytest.importorskip("trimesh")
 LEG = '<collision><origin xyz="0 0 -0.2"/><geometry><box size="0.1 0.1 0.4"/></geometry></collision>'
@@ -69,7 +69,7 @@ def test_an_older_recording_has_the_default_ground(panda, hanging):
 
 
 def test_a_film_has_the_same_floor(hanging):
-    from sim.robot.kinematics import Kinematics
+    from batchpid.sim.robot.kinematics import Kinematics
 
     for ground, height in ((True, 0.0), (False, -0.5)):
         scene = MagicMock()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from batchpid.errors import InvalidArgumentError
-from sim import FaultWarning, Runner
-from sim.view import LiveSimulation
+from batchpid.sim import FaultWarning, Runner
+from batchpid.sim.view import LiveSimulation
 
 STIFF = {"kp": 600.0, "ki": 900.0, "kd": 50.0, "derivative_filter_time": 2e-3}
 """Gains per effort that hold a panda under a payload."""
@@ -137,7 +137,7 @@ def test_pid_and_drive_run_in_two_groups_under_the_same_setpoints(jaco2):
     live.close()
 
 
-@pytest.mark.filterwarnings("ignore::sim.StabilityWarning")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_a_diverged_robot_stays_finite_until_a_reset(live):
     for joint in range(9):
         live.gains["pid"].set("kd", joint, 5000.0)

@@ -19,8 +19,8 @@ from identical import assert_identical
 from processes import have_ended, shared_memory
 
 from batchpid.errors import InvalidArgumentError
-from sim import ClusterWarning, Ray, RecoveryWarning, Runner
-from sim.workers.placement import split_in_shares
+from batchpid.sim import ClusterWarning, Ray, RecoveryWarning, Runner
+from batchpid.sim.workers.placement import split_in_shares
 
 ray = pytest.importorskip("ray")
 pytestmark = FILTERS
@@ -137,7 +137,7 @@ def test_the_envs_of_a_killed_machine_go_to_another(machines, undisturbed):
 
 @pytest.mark.slow
 def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monkeypatch):
-    monkeypatch.setattr("sim.workers.node_worker.SILENCE_LIMIT", 3.0)
+    monkeypatch.setattr("batchpid.sim.workers.node_worker.SILENCE_LIMIT", 3.0)
     with make_runner(cluster=machines.ensure(2).options(2)) as runner:
         pids = pids_of(runner)
         stop = lambda: os.kill(runner.nodes[0].pid, signal.SIGSTOP)  # noqa: E731
@@ -212,7 +212,7 @@ def test_steps_whose_time_are_messages_are_warned_of(machines):
 
 DRIVER = """
 import sys, psutil
-from sim import Ray, Robot, Runner
+from batchpid.sim import Ray, Robot, Runner
 robot = Robot.load("panda")
 runner = Runner(robot, 2, params=robot.params(), cluster=Ray({address!r}, nodes=1))
 pids = [pid for info in runner.nodes for pid in (info.pid, *info.pids)]

@@ -14,9 +14,9 @@ from clusters import FILTERS, ROBOT, Machines, make_runner, pids_of, setpoints
 from identical import assert_identical
 from processes import have_ended
 
-from sim import RecoveryWarning
-from sim.tuning.moves import Moves
-from sim.tuning.search import tune
+from batchpid.sim import RecoveryWarning
+from batchpid.sim.tuning.moves import Moves
+from batchpid.sim.tuning.search import tune
 
 ray = pytest.importorskip("ray")
 pytestmark = [*FILTERS, pytest.mark.slow]

@@ -14,9 +14,9 @@ from processes import children
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from sim import Runner
-from sim.options import RunnerOptions
-from sim.workers.memory import estimate_memory
+from batchpid.sim import Runner
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.workers.memory import estimate_memory
 
 ROBOT = load_bundled("panda")
 
@@ -56,7 +56,7 @@ def test_more_envs_than_the_machine_has_memory_for_are_refused():
 def test_the_estimate_is_below_what_the_envs_take_but_not_far():
     program = (  # a new process, so that no memory is reused
         "import psutil, warnings; warnings.simplefilter('ignore'); from sim import Robot, Runner\n"
-        "from sim.workers.memory import estimate_memory\n"
+        "from batchpid.sim.workers.memory import estimate_memory\n"
         "robot = Robot.load('jaco2'); options = dict(params=robot.params(), workers=0)\n"
         "rss = lambda: psutil.Process().memory_info().rss\n"
         "with Runner(robot, 1, **options): before = rss()\n"

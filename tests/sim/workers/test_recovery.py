@@ -18,7 +18,7 @@ from processes import children, have_ended
 from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
-from sim import RecoveryWarning, Runner
+from batchpid.sim import RecoveryWarning, Runner
 
 ROBOT = load_bundled("panda")
 N, TICKS = 8, 30
@@ -75,10 +75,10 @@ def replace_run(act, in_env=None):
     """Return a ``build`` that lets the loops run ``act`` for a tick: all, or the one of a given env."""
 
     def build(scene, env):
-        import sim.loop.loop
+        import batchpid.sim.loop.loop
 
         if in_env in (None, env):
-            sim.loop.loop.Loop.run = act
+            batchpid.sim.loop.loop.Loop.run = act
 
     return build
 
@@ -208,10 +208,10 @@ def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
     methods = ("reset", "set_params", "run", "snapshot", "restore", "poses")
 
     def build(scene, env):
-        import sim.loop.loop
+        import batchpid.sim.loop.loop
 
         for name in methods:
-            method, killed = getattr(sim.loop.loop.Loop, name), tmp_path / name
+            method, killed = getattr(batchpid.sim.loop.loop.Loop, name), tmp_path / name
             if hasattr(method, "__wrapped__"):
                 continue
 
@@ -223,7 +223,7 @@ def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
                 return result
 
             lethal.__wrapped__ = method
-            setattr(sim.loop.loop.Loop, name, lethal)
+            setattr(batchpid.sim.loop.loop.Loop, name, lethal)
         return []
 
     def program(runner):
@@ -247,7 +247,7 @@ def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
 
 
 def test_a_request_that_kills_every_worker_is_given_up(monkeypatch):
-    monkeypatch.setattr("sim.workers.pool.MAX_LOSSES", 2)
+    monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 2)
 
     def crash(*_):
         os.kill(os.getpid(), signal.SIGSEGV)

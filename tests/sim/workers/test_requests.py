@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from identical import assert_identical
 
-from sim import RecoveryWarning, Runner
-from sim.loop.arrays import Arrays, Command
-from sim.workers.requests import ReadPoses, Reset, Run, SetParams, decode
+from batchpid.sim import RecoveryWarning, Runner
+from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.workers.requests import ReadPoses, Reset, Run, SetParams, decode
 
 N, DOF = 4, 9
 ENVS = slice(1, 3)

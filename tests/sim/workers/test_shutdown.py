@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from processes import PATIENCE, have_ended, shared_memory
 
-from sim import Runner
+from batchpid.sim import Runner
 
 PROGRAM = """
 import sys, numpy as np, warnings
 warnings.simplefilter("ignore")
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
 runner = Runner(robot, 8, params=robot.params(), workers=2)
 print(*runner.pids, flush=True)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 PROGRAM = """
-from sim import Robot, Runner
+from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
 with Runner(robot, 1, workers=1) as runner:
     print(runner.step(robot.start).ok)

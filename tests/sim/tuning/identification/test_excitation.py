@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from sim.tuning.identification.excitation import excite, is_feasible
-from sim.tuning.identification.logs import setpoint_csv
+from batchpid.sim.identification.excitation import excite, is_feasible
+from batchpid.sim.identification.logs import setpoint_csv
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])

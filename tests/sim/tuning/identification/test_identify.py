@@ -10,20 +10,20 @@ import yaml
 from robots import load_bundled
 
 import batchpid as bp
-from sim import Robot
-from sim.cli.identify import report
-from sim.tuning import identify
-from sim.tuning.identification.drive import Drive
-from sim.tuning.identification.excitation import excite
-from sim.tuning.identification.fit import Step, fit
-from sim.tuning.identification.history import History, State
-from sim.tuning.identification.logs import Log, read_logs
-from sim.tuning.identification.plant import Motors, Plant, Segment
-from sim.tuning.identification.problem import Problem
-from sim.tuning.identification.regression import smooth
-from sim.tuning.identification.search import Progress, search
-from sim.tuning.identification.statistics import uncertainty
-from sim.tuning.identification.unknowns import PER_JOINT, Unknowns
+from batchpid.sim import Robot
+from batchpid.sim.cli.identify import report
+from batchpid.sim.identification import identify
+from batchpid.sim.identification.excitation import excite
+from batchpid.sim.identification.fit import Step, fit
+from batchpid.sim.identification.fit_history import History, State
+from batchpid.sim.identification.fit_search import Progress, search
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logs import Log, read_logs
+from batchpid.sim.identification.plant import Motors, Plant, Segment
+from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.regression import smooth
+from batchpid.sim.identification.statistics import uncertainty
+from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"

@@ -4,10 +4,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from sim import Robot, Runner, write_recording
-from sim.tuning import identify
-from sim.tuning.identification.gaps import divided
-from sim.tuning.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
+from batchpid.sim import Robot, Runner, write_recording
+from batchpid.sim.identification import identify
+from batchpid.sim.identification.gaps import divided
+from batchpid.sim.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
 
 ROWS = 60
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("scipy")
-from sim.tuning.identification.noise import CUTOFF, DRAWS, split
-from sim.tuning.identification.wander import spread, whiten
+from batchpid.sim.identification.log_noise import CUTOFF, DRAWS, split
+from batchpid.sim.identification.wander import spread, whiten
 
 DT = 5e-4
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from sim.tuning.identification.drive import Drive
-from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Motors, Plant, Segment
-from sim.tuning.identification.regression import STRONG, Regression, smooth
-from sim.tuning.identification.unknowns import PER_JOINT
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification.plant import Motors, Plant, Segment
+from batchpid.sim.identification.regression import STRONG, Regression, smooth
+from batchpid.sim.identification.unknowns import PER_JOINT
 
 pytest.importorskip("scipy")
 DT = 1 / 2000

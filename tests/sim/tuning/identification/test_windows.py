@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
-from sim import Robot
-from sim.tuning.identification.drive import Drive
-from sim.tuning.identification.logs import Log
-from sim.tuning.identification.plant import Motors, Segment
-from sim.tuning.identification.regression import smooth
-from sim.tuning.identification.windows import Subject, plant_of, whole
+from batchpid.sim import Robot
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification.plant import Motors, Segment
+from batchpid.sim.identification.regression import smooth
+from batchpid.sim.identification.windows import Subject, plant_of, whole
 
 GAINS = st.lists(st.integers(0, 3).map(float), min_size=2, max_size=2)
 DRIVES = st.fixed_dictionaries(

@@ -1,0 +1,1 @@
+"""Gains: their design, the stability of the loop under them, presets."""

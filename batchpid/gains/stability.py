@@ -1,0 +1,185 @@
+r"""Stability of a sampled PID loop on a chain of rigid bodies: in closed form, and exactly.
+
+The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with the mass matrix M,
+implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all diagonal but M)::
+
+    (M + dt B) (v+ - v) = dt (u - B v),   q+ = q + dt v+,   u = -Kp q - Kd d,   d = (tau d' + q - q') / (tau + dt)
+
+Put q_k = x z^k and multiply by x^H: for tau = 0, m (z - 1)^2 + b (z - 1) z + p z + c (z - 1) = 0, where m, b, c and
+p are the positive numbers x^H M x, dt x^H B x, dt x^H Kd x and dt^2 x^H Kp x. Jury's criterion asks for
+2 c + p < 4 m + 2 b: the root that leaves the unit circle does so at z = -1, where neighbouring samples alternate. There
+the filter passes dt / (dt + 2 tau) of the rate. Over all x that is, by the largest eigenvalue of a symmetric matrix::
+
+    ratio = 1/2 lambda_max( (M + dt/2 B)^-1 (dt/(dt + 2 tau) dt Kd + 1/2 dt^2 Kp) ) < 1
+
+and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I without filter it says
+kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
+stretched upright), joints that turn against each other move much less than the diagonal of M says.
+
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation` include it.
+E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.checks.validate import at_least, broadcast, positive, read_array
+from batchpid.errors import InvalidArgumentError
+
+Float64 = NDArray[np.float64]
+
+
+class StabilityBound(NamedTuple):
+    """Share of the sampled loop's stability range that is used."""
+
+    ratio: Float64
+    """(...): below 1 the loop is stable, above 1 it diverges, with alternating signs from step to step."""
+    participation: Float64
+    """(..., joints): share of each joint in the least stable mode; sums to 1."""
+
+
+class Oscillation(NamedTuple):
+    """Least damped oscillation of the sampled loop among those that last; of a loop without any the ratio is 1."""
+
+    damping_ratio: Float64
+    """(...): zeta; after a period exp(-2 pi zeta / sqrt(1 - zeta^2)) of the amplitude is left."""
+    frequency: Float64
+    """(...) [Hz]; 0 without oscillation."""
+    participation: Float64
+    """(..., joints): share of each joint in it; sums to 1."""
+
+
+def stability_bound(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+) -> StabilityBound:
+    """Return the distance of PD gains to the sampled loop's stability limit.
+
+    Parameters
+    ----------
+    mass_matrix
+        (..., joints, joints), symmetric and positive definite [kg m^2 or kg].
+    kp, kd
+        (joints,) or broadcastable to (..., joints): gains >= 0 [N m/rad or N/m, and times s].
+    dt
+        Control and simulation step [s].
+    filter_time
+        Time constant of the derivative's first-order low-pass [s], shaped as kp.
+    damping
+        Viscous damping of the joints, which the simulator integrates implicitly [N m s/rad or N s/m], shaped as kp.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A shape that does not fit, or a mass matrix that is not positive definite.
+    """
+    m, p, c, tau, b = _columns(mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping)
+    passed = dt / (dt + 2 * tau)
+    weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
+    inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
+    values, vectors = np.linalg.eigh(weight[..., :, None] * inverse * weight[..., None, :])
+    return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
+
+
+def spectral_radius(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    ki: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+) -> Float64:
+    """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is stable.
+
+    They are those of the exact one-step matrix of the law, output first, and the plant, on the state
+    (q, q - q', I, d). Arguments are those of :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
+    kp. Where ki is 0 its pole at 1 is left out.
+    """
+    gains = {"kp": kp, "ki": ki, "kd": kd}
+    return np.abs(np.linalg.eigvals(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))).max(
+        -1
+    )
+
+
+def oscillation(
+    mass_matrix: ArrayLike,
+    kp: ArrayLike,
+    ki: ArrayLike,
+    kd: ArrayLike,
+    dt: float,
+    *,
+    filter_time: ArrayLike = 0.0,
+    damping: ArrayLike = 0.0,
+    lasting: float = 1.0,
+) -> Oscillation:
+    """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or longer to fall to 2 %.
+
+    Modes that decay faster are not seen in a motion. The other arguments are those of :func:`spectral_radius`. With the
+    eigenvalue z of a mode, its continuous one is s = log(z) / dt, zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
+    """
+    gains = {"kp": kp, "ki": ki, "kd": kd}
+    values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))
+    joints = values.shape[-1] // 4
+    turns = np.abs(values.imag) > 1e-9
+    s = np.log(np.where(turns, values, 1j)) / dt
+    lasts = turns & (-s.real * positive("lasting", lasting, "s") < -np.log(0.02))
+    ratio = np.where(lasts, -s.real / np.abs(s), 1.0)
+    worst = ratio.argmin(-1)[..., None]
+    found = np.take_along_axis(lasts, worst, -1)
+    shape = np.take_along_axis(vectors, worst[..., None], -1)[..., :joints, 0]
+    # Kinetic energy, apart from the coupling of joints.
+    energy = np.abs(shape) ** 2 * np.diagonal(read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1)
+    energy = np.where(found, energy, 1.0)
+    frequency = np.abs(np.take_along_axis(s, worst, -1).imag) / (2 * np.pi)
+    return Oscillation(
+        damping_ratio=np.take_along_axis(ratio, worst, -1)[..., 0],
+        frequency=np.where(found, frequency, 0.0)[..., 0],
+        participation=energy / energy.sum(-1, keepdims=True),
+    )
+
+
+def _one_step(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> Float64:
+    """Return the matrix (..., 4 joints, 4 joints) of one step on the state (q, q - q', I, d)."""
+    m, p, i, c, tau, b = _columns(
+        mass_matrix, dt, **{name: columns[name] for name in ("kp", "ki", "kd", "filter_time", "damping")}
+    )
+    shape = m.shape[:-1]
+    one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
+
+    def diagonal(values: Float64) -> Float64:
+        return values[..., None] * one
+
+    keep, take = tau / (tau + dt), dt / (tau + dt)
+    # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
+    rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
+    effort = [diagonal(-p), c[..., None] * rate[1], diagonal(np.where(i > 0, 1.0, 0.0)), c[..., None] * rate[3]]
+    implicit = np.linalg.inv(m + diagonal(dt * b))
+    step = [dt**2 * (implicit @ column) for column in effort]
+    step[1] = step[1] + implicit @ m
+    integral = [diagonal(-i * dt), zero, diagonal(np.where(i > 0, 1.0, 0.0)), zero]
+    position = [s + e for s, e in zip(step, [one, zero, zero, zero], strict=True)]
+    return np.block([position, step, integral, rate])
+
+
+def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:
+    """Return the mass matrix and the columns as (..., joints, joints) and (..., joints), checked."""
+    positive("dt", dt, "s")
+    m = read_array("mass_matrix", mass_matrix).astype(np.float64)
+    if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
+        remedy = "pass (joints, joints), or a stack of such"
+        raise InvalidArgumentError("mass_matrix", "is not square", value=m.shape, remedy=remedy)
+    if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
+        remedy = "check the masses and inertias of the robot's links"
+        raise InvalidArgumentError("mass_matrix", "is not positive definite", remedy=remedy)
+    return (m, *(at_least(name, broadcast(name, value, m.shape[:-1]), 0.0) for name, value in columns.items()))

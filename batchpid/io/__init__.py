@@ -1,0 +1,1 @@
+"""Files of params, of actuators, and of arrays."""

@@ -1,0 +1,169 @@
+"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by name."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import reprlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.checks.validate import choice, file_path
+from batchpid.errors import InvalidArgumentError
+
+SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
+
+
+class Schema(NamedTuple):
+    """Form of a document."""
+
+    format: str
+    """Its name and version."""
+    content: str
+    """Of the document, as in "params"."""
+    head: tuple[str, ...]
+    """Keys of the document."""
+    off: Mapping[str, Any]
+    """Options of a joint, with the value that is off."""
+    required: tuple[str, ...] = ()
+    """Options that every joint must have."""
+
+
+def read(path: str | os.PathLike[str]) -> Any:
+    """Return the document in a file; raise InvalidArgumentError if it cannot be read."""
+    path = file_path("path", path, SUFFIXES)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}"
+        raise InvalidArgumentError(str(path), problem, remedy="check its name and your rights") from None
+    return parse(str(path), content, SUFFIXES[path.suffix.lower()])
+
+
+def parse(source: str, text: str | bytes, format: str) -> Any:
+    """Return the document in a text in ``format``; ``source`` names it in errors."""
+    try:
+        text = text.decode() if isinstance(text, bytes) else text
+        return _parse_json(text) if format == "json" else _parse_yaml(text)
+    except Exception as error:  # a damaged text can make the parser raise anything
+        said = " ".join(str(error).split())[:300] or type(error).__name__
+        raise InvalidArgumentError(source, f"cannot be read: {said}", remedy="correct the file") from None
+
+
+def render(document: dict[str, Any], format: str) -> str:
+    """Return a document as text in ``format``, "yaml" or "json"."""
+    if choice("format", format, ("yaml", "json")) == "json":
+        return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
+    import yaml
+
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
+
+
+def check(source: str, document: Any, schema: Schema) -> dict[str, dict[str, Any]]:
+    """Return the joints of ``document`` if it is of the form ``schema``."""
+    if not isinstance(document, dict) or document.get("format") != schema.format:
+        remedy = f"it must contain 'format: {schema.format}'"
+        raise InvalidArgumentError(source, f"holds no {schema.content}", remedy=remedy)
+    for key in document:
+        choice(f"{source}: key", key, schema.head)
+    if not isinstance(document.get("about", {}), dict):
+        raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
+    choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
+    joints = document.get("joints")
+    if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
+        raise error(source, "joints", "must map names to options", "name the joints")
+    for name, options in joints.items():
+        if not isinstance(options, dict):
+            raise error(source, "joints", "must map options to values", "give e.g. an empty mapping, {}", name)
+        for key in schema.required:
+            if key not in options:
+                raise error(source, "joints", f"has no {key}", f"give '{key}: <number>'", name)
+        for key, value in options.items():
+            if key not in schema.off:
+                raise error(source, key, "unknown option", f"use one of {', '.join(schema.off)}", name)
+            wanted: type = type(schema.off[key])
+            for entry in value if isinstance(value, list) and value else [value]:
+                if not (is_number(entry) if wanted is float else isinstance(entry, wanted)):
+                    problem = f"is {reprlib.repr(entry)}, which is no {wanted.__name__}"
+                    remedy = f"give one, as in '{key}: {schema.off[key]}', or a list of one per env"
+                    raise error(source, key, problem, remedy, name)
+    return joints
+
+
+def is_number(entry: Any) -> bool:
+    """Return whether an entry is a number, an infinity included."""
+    whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
+    return whole or isinstance(entry, float) or entry in ("inf", "-inf")
+
+
+def columns(source: str, joints: dict[str, dict[str, Any]], off: Mapping[str, Any]) -> dict[str, Any]:
+    """Return each option that some joint has, as an array (1 or envs, joints)."""
+    columns: dict[str, Any] = {}
+    for key, neutral in off.items():
+        if not any(key in options for options in joints.values()):
+            continue
+        values = {name: options.get(key, neutral) for name, options in joints.items()}
+        lists = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
+        envs = max(map(len, lists.values()))
+        for name, value in lists.items():
+            if len(value) not in (1, envs):
+                raise error(source, key, f"has {len(value)} values, others {envs}", "give one per env", name)
+        dtype: Any = {float: float, bool: bool, str: object}[type(neutral)]
+        columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
+    return columns
+
+
+def error(source: str, key: str, problem: str, remedy: str, joint: str | None = None) -> InvalidArgumentError:
+    """Return the error of a key of a document."""
+    return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)
+
+
+def plain(column: Any) -> Any:
+    """Return a joint's option as one plain value, or a list of one per env."""
+    # The shortest digits that read back as the same number of its dtype: str(float32) has fewer than its float.
+    values = [float(str(value)) if isinstance(value, np.floating) else value for value in column]
+    values = [bool(value) if isinstance(value, np.bool_) else value for value in values]
+    return values[0] if len(values) == 1 else values
+
+
+def _without_infinities(value: Any) -> Any:
+    """Return the document with infinities as the strings "inf" and "-inf": JSON has no number for them."""
+    if isinstance(value, dict):
+        return {key: _without_infinities(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_without_infinities(entry) for entry in value]
+    return str(value) if isinstance(value, float) and math.isinf(value) else value
+
+
+def _parse_json(text: str) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            raise ValueError(f"a key is given twice among {[key for key, _ in pairs]}")
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=unique)
+
+
+def _parse_yaml(text: str) -> Any:
+    import yaml  # here, since params in memory need NumPy alone
+
+    class Loader(yaml.SafeLoader):
+        """SafeLoader without aliases, which can make a short file explode, and without keys given twice."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError(f"aliases are not allowed, {self.peek_event().start_mark}")
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            mapping = super().construct_mapping(node, deep=True)
+            if len(mapping) < len(node.value):
+                raise ValueError(f"a key is given twice{node.start_mark}")
+            return mapping
+
+    return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only

@@ -1,0 +1,143 @@
+"""Params to and from YAML or JSON that people read and edit: one entry per joint, by name.
+
+A file has this form::
+
+    format: batchpid-params-1
+    dtype: float64
+    integration: output_first
+    joints:
+      shoulder: {kp: 40.0, ki: 5.0, kd: 2.0, effort_max: 87.0, anti_windup: conditional}
+      elbow: {kp: 20.0, ki: 5.0, kd: 2.0}
+
+The keys are the options of :func:`batchpid.make_params`; a list gives one value per env. Numbers are written with as
+many digits as it takes to read the same number back. An option left out of a joint is off there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from batchpid.arrays.choices import CHOICES
+from batchpid.checks.validate import file_path, names
+from batchpid.errors import InvalidArgumentError
+from batchpid.io import documents
+from batchpid.io.files import write_atomically
+from batchpid.law.params import PIDParams, make_params
+
+FORMAT = "batchpid-params-1"
+OFF = {
+    "kp": 0.0,
+    "ki": 0.0,
+    "kd": 0.0,
+    "effort_min": -math.inf,
+    "effort_max": math.inf,
+    "effort_rate_limit": math.inf,
+    "integral_min": -math.inf,
+    "integral_max": math.inf,
+    "derivative_filter_time": 0.0,
+    "setpoint_weight": 1.0,
+    "setpoint_weight_derivative": 0.0,
+    "deadband": 0.0,
+    "tracking_time": math.inf,
+    "anti_windup": "none",
+    "continuous": False,
+}
+"""Options of a joint, with the value that is off."""
+SCHEMA = documents.Schema(FORMAT, "params", ("format", "about", "dtype", *CHOICES, "joints"), OFF, required=("kp",))
+
+
+def dumps_params(
+    params: PIDParams, joint_names: Sequence[str], about: Mapping[str, Any] | None = None, format: str = "yaml"
+) -> str:
+    """Return ``params`` as text.
+
+    Parameters
+    ----------
+    joint_names
+        One name per joint.
+    about
+        Kept with the params for :func:`load_about`, e.g. where they come from: plain numbers, strings, lists, mappings.
+    format
+        "yaml" or "json".
+
+    Raises
+    ------
+    InvalidArgumentError
+        Names that do not fit the params, or an unknown format.
+    """
+    joints = names("joint_names", joint_names, params.num_joints)
+    options = params.options()
+    document: dict[str, Any] = {"format": FORMAT}
+    if about:
+        document["about"] = json.loads(json.dumps(dict(about)))
+    document["dtype"] = str(options.pop("dtype"))
+    document |= {name: options.pop(name) for name in CHOICES}
+    document["joints"] = {
+        joint: {name: documents.plain(column[:, index]) for name, column in options.items()}
+        for index, joint in enumerate(joints)
+    }
+    return documents.render(document, format)
+
+
+def loads_params(text: str, joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
+    """Return the params in a text, JSON if it begins with a brace and else YAML; otherwise as :func:`load_params`."""
+    format = "json" if text.lstrip().startswith("{") else "yaml"
+    return _build("text", documents.parse("text", text, format), joint_names)
+
+
+def save_params(
+    path: str | os.PathLike[str], params: PIDParams, joint_names: Sequence[str], about: Mapping[str, Any] | None = None
+) -> None:
+    """Write ``params`` to ``path`` (.yaml, .yml or .json), as :func:`dumps_params`.
+
+    An existing file is replaced as a whole or not at all.
+    """
+    path = file_path("path", path, documents.SUFFIXES)
+    write_atomically(path, dumps_params(params, joint_names, about, documents.SUFFIXES[path.suffix.lower()]))
+
+
+def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
+    """Return the params in a file and their joints' names, in the order of ``joint_names`` if given.
+
+    Nothing in the file is executed, and every value is checked as in :func:`batchpid.make_params`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the file, joint and key.
+    FileNotFoundError
+        The file does not exist.
+    """
+    return _build(str(path), documents.read(path), joint_names)
+
+
+def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the ``about`` that :func:`save_params` wrote; empty if there is none. Raises as :func:`load_params`."""
+    document = documents.read(path)
+    documents.check(str(path), document, SCHEMA)
+    return dict(document.get("about", {}))
+
+
+def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tuple[PIDParams, list[str]]:
+    """Return the params of a document and the names of their joints."""
+    joints = documents.check(source, document, SCHEMA)
+    order = list(joints) if joint_names is None else names("joint_names", joint_names)
+    missing, unknown = sorted(set(order) - set(joints)), sorted(set(joints) - set(order))
+    if missing or unknown:
+        problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
+        raise InvalidArgumentError(source, problem, remedy=f"the file's joints are {', '.join(joints)}")
+    head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
+    for name in order if any("tracking_time" in entry for entry in joints.values()) else ():
+        if "back_calculation" in str(joints[name].get("anti_windup")) and "tracking_time" not in joints[name]:
+            problem = "is missing, while other joints have it"
+            raise documents.error(source, "tracking_time", problem, "give it too", name)
+    options = documents.columns(source, {joint: joints[joint] for joint in order}, OFF)
+    try:
+        return make_params(len(order), **options, **head, joint_names=order), order
+    except InvalidArgumentError as error:
+        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
+        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None

@@ -1,0 +1,1 @@
+"""The PID law: params, state, coefficients and one pure step."""

@@ -1,0 +1,64 @@
+"""Bumpless transfer: from manual to automatic control, or from gains to other gains, without a jump of the effort."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.arrays.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.coefficients import discretise
+from batchpid.law.params import PIDParams
+from batchpid.law.pid import proportional, turned_origin, wrapped_error
+from batchpid.law.state import PIDState
+
+
+def track(
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    effort: Any,
+    *,
+    dt: Any = None,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+) -> PIDState:
+    """Return the state whose next step, on these same inputs, gives ``effort``: its integral makes up the difference.
+
+    Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
+    effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
+    reproduced: the limits hold. ``dt`` is needed where the params integrate first.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the params have no integral (ki is None), or integrate first and dt is missing.
+    """
+    if params.ki is None:
+        raise InvalidArgumentError(
+            "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"
+        )
+    if params.integration is not None and dt is None:
+        raise InvalidArgumentError("dt", "is needed where the params integrate first", remedy="give dt in seconds")
+    xp = namespace(*params, *state, setpoint, measurement, effort)
+    k = discretise(params, 1.0 if dt is None else dt)
+    zero = xp.zeros_like(measurement)
+    error = wrapped_error(k, setpoint, measurement, xp)
+    origin = turned_origin(k, state, measurement, xp)
+    rate = zero if measurement_rate is None else -measurement_rate
+    if setpoint_rate is not None:
+        rate = rate + (setpoint_rate if k.c is None else k.c * setpoint_rate)
+    integral = effort - proportional(k, error, measurement, origin)
+    integral = integral if k.kd is None else integral - k.kd * rate
+    integral = integral if feedforward is None else integral - feedforward
+    integral = integral if params.integration is None else integral - k.ki_dt * error
+    return PIDState(
+        integral=clip(integral, k.integral_min, k.integral_max, xp),
+        measurement=None if state.measurement is None else measurement.copy(),
+        derivative=None if state.derivative is None else rate,
+        setpoint=None if state.setpoint is None else zero + setpoint,
+        setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
+        effort=None if state.effort is None else zero + effort,
+        origin=origin,
+    )

@@ -1,0 +1,78 @@
+"""Coefficients of the law at one time step: what a loop with constant params computes once."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN, namespace, tiny_of
+from batchpid.checks.validate import positive
+from batchpid.law.params import PIDParams
+
+
+class Coefficients(NamedTuple):
+    """:class:`PIDParams` at one dt, in the symbols of :mod:`batchpid.law.pid`; None is off."""
+
+    kp: Any
+    ki_dt: Any
+    kd: Any
+    per_dt: Any
+    """1 / dt."""
+    decay: Any
+    """tau / (tau + dt), the weight of the derivative's old value in its filter."""
+    intake: Any
+    """dt / (tau + dt), the weight of the new one."""
+    effort_min: Any
+    effort_max: Any
+    effort_step: Any
+    """Largest change of the effort in a step."""
+    integral_min: Any
+    integral_max: Any
+    b: Any
+    c: Any
+    deadband: Any
+    tracking: Any
+    """dt / Tt, at most 1: a shorter Tt would correct by more than the whole excess, and oscillate."""
+    conditional: Any
+    turns: Any
+    """1 / (2 pi) on continuous joints, 0 elsewhere."""
+    tiny: Any
+    """Argument of :func:`batchpid.arrays.elementwise.flush`."""
+    integration: Any
+    weight_origin: Any
+    non_finite: Any
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:
+    """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
+
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches twice as fast. A dt
+    that is a Python number must be positive and finite, else InvalidArgumentError is raised.
+    """
+    if isinstance(dt, int | float):
+        positive("dt", dt, "s")
+    tau, tracking = params.derivative_filter_time, params.tracking_time
+    same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
+    k = Coefficients(
+        **same,
+        ki_dt=None if params.ki is None else params.ki * dt,
+        per_dt=1 / dt,
+        decay=None if tau is None else tau / (tau + dt),
+        intake=None if tau is None else dt / (tau + dt),
+        effort_step=None if params.effort_rate_limit is None else params.effort_rate_limit * dt,
+        b=params.setpoint_weight,
+        c=params.setpoint_weight_derivative,
+        tracking=None if tracking is None else dt / namespace(tracking, dt).maximum(tracking, dt),
+        turns=None if params.continuous is None else params.continuous / TURN,
+        tiny=None if tau is None and tracking is None else tiny_of(params.dtype),
+    )
+    if num_envs is None:
+        return k
+    xp, zeros = namespace(*k), namespace(*k).zeros((num_envs, params.num_joints), params.dtype)
+    off = (type(None), tuple)
+    return Coefficients(
+        *(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=params.dtype) for leaf in k)
+    )

@@ -1,0 +1,137 @@
+r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
+
+With kp = w^2 and kd = 2 zeta w, all joints of all robots respond alike, in every pose. There are two ways:
+
+- "inertia": each gain is multiplied by its joint's M_jj(q), as PhysX's drives do in mode "acceleration". The law is
+  otherwise untouched: integral, limits and anti-windup are in effort units.
+- "mass_matrix": u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar,
+  Robot Modeling and Control, 2nd ed., section 9.3). The joints no longer disturb each other.
+
+Where limits apply, clipping each joint of u alone would change the direction of the acceleration and couple the joints
+again. So a is scaled as a whole::
+
+    u = s M a + passive,   s = the largest in [0, 1] with all of u within its limits
+
+which keeps its direction (P. J. Campo and M. Morari, "Robust control of processes subject to saturation
+nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot stays on the straight line to its
+setpoint, however tight the limits. A joint whose passive force alone exceeds its limit is clipped, and left out of s.
+While s < 1, conditional integration does not integrate further into the direction of a.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.arrays.choices import Everywhere, PerMassMatrix
+from batchpid.arrays.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.coefficients import Coefficients
+from batchpid.law.params import PIDParams
+from batchpid.law.pid import advance
+from batchpid.law.state import PIDState, Terms
+
+
+def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
+    """Return the coefficients of an effort law from those of an acceleration law, at ``inertia`` (envs, joints)."""
+    return k._replace(
+        kp=k.kp * inertia,
+        ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
+        kd=None if k.kd is None else k.kd * inertia,
+    )
+
+
+def advance_with_mass_matrix(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    mass_matrix: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+    *,
+    terms: bool = False,
+) -> Any:
+    """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
+
+    Parameters
+    ----------
+    mass_matrix
+        (envs, joints, joints) at about the present positions [kg m^2 or kg].
+    feedforward
+        Effort added to that of the law [N m or N]: passive force and more.
+    """
+    xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
+    low, high = k.effort_min, k.effort_max
+    free = k._replace(effort_min=None, effort_max=None)
+    new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, terms=terms)
+    wanted = _multiply(mass_matrix, a)
+    passive = 0.0 if feedforward is None else feedforward
+    effort = unsaturated = wanted + passive
+    if low is not None or high is not None:
+        share = _share(wanted, passive, low, high, xp)
+        effort = clip(share * wanted + passive, low, high, xp)
+        if k.ki_dt is not None and k.conditional is not None:
+            deeper = (share < 1) & (a * (new.integral - state.integral) > 0)
+            if not isinstance(k.conditional, Everywhere):
+                deeper = deeper & (k.conditional > 0)
+            new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
+    if not terms:
+        return new, effort
+    p, i, d = (_multiply(mass_matrix, term) for term in shown[0][:3])
+    given = xp.zeros_like(wanted) + passive
+    saturated = effort != unsaturated
+    return new, effort, Terms(p, i, d, given, unsaturated, effort.copy(), saturated, shown[0].finite)
+
+
+def check_gain_units(params: PIDParams) -> None:
+    """Raise InvalidArgumentError for options that have no meaning for accelerations.
+
+    With gain_units "mass_matrix" these are back-calculation, an effort rate limit and a policy for non-finite inputs.
+    """
+    instead = {
+        "tracking_time": "anti_windup 'conditional'",
+        "effort_rate_limit": "no effort rate limit",
+        "non_finite": "non_finite 'propagate'",
+    }
+    for option, remedy in instead.items():
+        if isinstance(params.gain_units, PerMassMatrix) and getattr(params, option) is not None:
+            problem = "is not available with gain_units 'mass_matrix'"
+            raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'inertia'")
+
+
+def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Any) -> PIDState:
+    """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of gain_units.
+
+    I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes M^-1 I, an
+    acceleration M I. The integral limits of ``new`` hold.
+
+    Parameters
+    ----------
+    old, new
+        Params before and after the change.
+    mass_matrix
+        (envs, joints, joints) at the present positions [kg m^2 or kg].
+    """
+    was, becomes = (isinstance(params.gain_units, PerMassMatrix) for params in (old, new))
+    if state.integral is None or was == becomes:
+        return state
+    xp = namespace(state.integral, mass_matrix)
+    if was:
+        integral = _multiply(mass_matrix, state.integral)
+    else:
+        integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
+    return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
+
+
+def _multiply(matrix: Any, vector: Any) -> Any:
+    """Return matrix @ vector for each env, with sums in one order for any number of envs."""
+    return (matrix * vector[:, None, :]).sum(-1)
+
+
+def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:
+    """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
+    above, below = (xp.inf if high is None else high - passive), (xp.inf if low is None else passive - low)
+    room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
+    limited = (size > room) & (room > 0)
+    return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1, keepdims=True)

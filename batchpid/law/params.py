@@ -1,0 +1,278 @@
+"""The parameters of the control law: build, broadcast, validate.
+
+A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An option
+that is off is ``None``: it is no leaf, so NumPy skips it and ``jax.jit`` compiles a law without it. Choices that carry
+no number, such as the integration order, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
+structure, and so static under every JAX transform.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.choices import CHOICES, Everywhere
+from batchpid.arrays.display import params_summary
+from batchpid.arrays.leaves import LeafBuilder
+from batchpid.checks.keywords import known_keywords
+from batchpid.checks.validate import at_least, is_traced
+from batchpid.errors import InvalidArgumentError
+
+
+class PIDParams(NamedTuple):
+    """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
+
+    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take traced gains. The
+    fields have the meaning and the units of the options of :func:`make_params`; those with another form say so.
+    """
+
+    kp: Any
+    ki: Any = None
+    kd: Any = None
+    effort_min: Any = None
+    effort_max: Any = None
+    effort_rate_limit: Any = None
+    integral_min: Any = None
+    integral_max: Any = None
+    derivative_filter_time: Any = None
+    setpoint_weight: Any = None
+    setpoint_weight_derivative: Any = None
+    deadband: Any = None
+    tracking_time: Any = None
+    """inf on a joint without back-calculation."""
+    conditional: Any = None
+    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the others."""
+    continuous: Any = None
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    integration: Any = None
+    """IntegrateFirst(); off: the effort is computed first, with the integral of the past errors."""
+    first_derivative: Any = None
+    """DerivativeKick(); off: the derivative of the first sample is 0."""
+    weight_origin: Any = None
+    """WeightFromStart(); off: setpoint weighting measures positions from 0."""
+    non_finite: Any = None
+    """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
+    measurement_rate: Any = None
+    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
+    gain_units: Any = None
+    """PerInertia() or PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return int(self.kp.shape[-1])
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs with params of their own; 1 where all envs share them."""
+        return max(leaf.shape[-2] for leaf in self if _is_array(leaf))
+
+    @property
+    def dtype(self) -> Any:
+        """Dtype of every leaf."""
+        return self.kp.dtype
+
+    def for_envs(self, envs: slice | Any) -> PIDParams:
+        """Return the params of some envs (a slice or an index array); shared rows stay shared."""
+        return PIDParams(*(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self))
+
+    def __repr__(self) -> str:
+        return params_summary(self)
+
+    def options(self) -> dict[str, Any]:
+        """Return the options that are on, as arguments of :func:`make_params` that build these params again.
+
+        "clamp" shows as the integral limits it stands for. Where its leaves are traced, anti_windup is left out.
+        """
+        options: dict[str, Any] = {}
+        for name, leaf in zip(self._fields, self, strict=True):
+            if name in CHOICES:
+                (options[name],) = (n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf))
+            elif _is_array(leaf) and name != "conditional":
+                options[name] = leaf if is_traced(leaf) else np.array(leaf)
+        if self.continuous is not None:
+            options["continuous"] = options["continuous"] > 0
+        if not is_traced(self.tracking_time) and not is_traced(self.conditional):
+            strategy = np.full((1, self.num_joints), "none", dtype=object)
+            if self.tracking_time is not None:
+                strategy = np.where(np.isfinite(self.tracking_time), "back_calculation", strategy)
+            if self.conditional is not None:
+                everywhere = isinstance(self.conditional, Everywhere)
+                strategy = np.where(everywhere or np.asarray(self.conditional) > 0, "conditional", strategy)
+            options["anti_windup"] = strategy
+        return {**options, "dtype": np.dtype(self.dtype)}
+
+    def replace(self, **options: Any) -> PIDParams:
+        """Return params with some options of :func:`make_params` changed, checked as there."""
+        known = self.options()
+        for end in ("effort", "integral"):
+            if f"{end}_limit" in options:
+                known.pop(f"{end}_min", None)
+                known.pop(f"{end}_max", None)
+        if any(is_traced(value) for value in options.values()):
+            del known["dtype"]
+        if "anti_windup" in options or "anti_windup" not in known:
+            known.pop("tracking_time", None)
+        params = make_params(self.num_joints, **{**known, **options})
+        if "anti_windup" not in options and "anti_windup" not in known:  # traced: the leaves are kept
+            kept = {"tracking_time": self.tracking_time, "conditional": self.conditional}
+            cast = {name: leaf.astype(params.dtype) if _is_array(leaf) else leaf for name, leaf in kept.items()}
+            params = params._replace(**cast)
+            params.check(params.num_envs)
+        return params
+
+    def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
+        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+        shapes = (1, self.num_joints), (num_envs, self.num_joints)
+        for name, leaf in zip(self._fields, self, strict=True):
+            if not _is_array(leaf):
+                continue
+            if leaf.shape not in shapes:
+                raise InvalidArgumentError(
+                    f"params.{name}",
+                    f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
+                    remedy="slice or rebuild the params",
+                )
+            if leaf.dtype != self.dtype:
+                raise InvalidArgumentError(
+                    f"params.{name}", f"is {leaf.dtype}, but kp is {self.dtype}", remedy="use one dtype"
+                )
+            if not is_traced(leaf):
+                low = -math.inf if name in _SIGNED else 0.0
+                at_least(f"params.{name}", np.asarray(leaf), low, joint_names, infinite=True)
+
+
+@known_keywords
+def make_params(
+    joints: int,
+    kp: Any,
+    ki: Any = None,
+    kd: Any = None,
+    *,
+    effort_limit: Any = None,
+    effort_min: Any = None,
+    effort_max: Any = None,
+    effort_rate_limit: Any = None,
+    integral_limit: Any = None,
+    integral_min: Any = None,
+    integral_max: Any = None,
+    derivative_filter_time: Any = None,
+    setpoint_weight: Any = None,
+    setpoint_weight_derivative: Any = None,
+    deadband: Any = None,
+    anti_windup: str | Sequence[Any] = "none",
+    tracking_time: Any = None,
+    continuous: Any = None,
+    integration: str = "output_first",
+    first_derivative: str = "zero",
+    weight_origin: str = "zero",
+    non_finite: str = "propagate",
+    measurement_rate: str = "difference",
+    gain_units: str = "effort",
+    joint_names: Sequence[str] | None = None,
+    dtype: Any = None,
+) -> PIDParams:
+    """Build validated :class:`PIDParams`; a number may be a scalar, (joints,) or (envs, joints).
+
+    ``None`` is off. A value that changes nothing anywhere (an infinite limit, a filter time of 0, a deadband of 0,
+    weights b = 1 and c = 0) is off too. A gain of 0 stays: it can be tuned, and an integral of gain 0 can carry
+    the bias of :func:`batchpid.track`.
+
+    Numbers may be traced by jax.jit, jax.grad or jax.vmap. Their shapes are checked, their values are not, and an
+    option that is traced is on.
+
+    Parameters
+    ----------
+    joints
+        Number of joints.
+    kp, ki, kd
+        Gains >= 0, in effort per position, per position and second, and per position/second.
+    effort_limit, effort_min, effort_max
+        Limits of the *total* effort [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
+    effort_rate_limit
+        Largest change of the effort per second, > 0. The first step may go this far from an effort of 0.
+    integral_limit, integral_min, integral_max
+        Limits of the integral term, in effort units.
+    derivative_filter_time
+        Time constant of the derivative's first-order low-pass [s]; 0: unfiltered.
+    setpoint_weight, setpoint_weight_derivative
+        b and c: the proportional term acts on b*setpoint - measurement, the derivative on c*setpoint - measurement.
+    deadband
+        Half width of the dead zone: within it P and I act on an error of 0, outside on the distance to the zone.
+    anti_windup
+        "none", "clamp" (limit the integral, to the effort limits unless integral limits are given), "conditional"
+        (do not integrate further into saturation) or "back_calculation"; or a nested list of these of shape
+        (joints,) or (envs, joints).
+    tracking_time
+        Back-calculation's time constant [s]; steps shorter than it are needed for more than a one-step correction.
+        None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID Control, 2006, sec. 3.5).
+    continuous
+        Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the short way round.
+    integration
+        "output_first" (control_toolbox) or "integrate_first" (simple-pid, Newton).
+    first_derivative
+        "zero", or "kick": the error before the first sample counts as 0 (for parity with peers).
+    weight_origin
+        "zero", or "start": setpoint weighting measures positions from the first measurement.
+    non_finite
+        What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or keep the state and
+        command "zero" effort, or "hold" the last effort.
+    measurement_rate
+        Rate of the measurement that the derivative uses: "difference" of successive measurements, or "measured": the
+        velocity that :class:`batchpid.sim.Runner` reads from the simulator. A law that is given none differences.
+    gain_units
+        "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
+        which :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (see
+        :mod:`batchpid.law.computed_torque`).
+    joint_names
+        Used in error messages.
+    dtype
+        float32 or float64; None: float64, or that of the traced arrays.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, joint, env and value.
+    """
+    build = LeafBuilder(joints, joint_names, dtype, locals().values())
+    if kp is None:
+        raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
+    p, i, d = (build.array(name, gain, 0.0) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
+    integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
+    clamp, conditional, back = build.strategies(anti_windup)
+    integral_ends = build.clamped(clamp, integral_ends, effort_ends)
+    return PIDParams(
+        kp=build.freeze(p),
+        ki=build.freeze(i),
+        kd=build.freeze(d),
+        effort_min=build.freeze(effort_ends[0]),
+        effort_max=build.freeze(effort_ends[1]),
+        effort_rate_limit=build.option("effort_rate_limit", effort_rate_limit, neutral=math.inf, above=True),
+        integral_min=build.freeze(integral_ends[0]),
+        integral_max=build.freeze(integral_ends[1]),
+        derivative_filter_time=build.option("derivative_filter_time", derivative_filter_time, neutral=0.0),
+        setpoint_weight=build.option("setpoint_weight", setpoint_weight, neutral=1.0),
+        setpoint_weight_derivative=build.option("setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0),
+        deadband=build.option("deadband", deadband, neutral=0.0),
+        tracking_time=build.tracking_time(tracking_time, back, p, i, d),
+        conditional=Everywhere() if conditional is not None and conditional.all() else build.freeze(conditional),
+        continuous=build.mask("continuous", continuous),
+        integration=build.choice("integration", integration),
+        first_derivative=build.choice("first_derivative", first_derivative),
+        weight_origin=build.choice("weight_origin", weight_origin),
+        non_finite=build.choice("non_finite", non_finite),
+        measurement_rate=build.choice("measurement_rate", measurement_rate),
+        gain_units=build.choice("gain_units", gain_units),
+    )
+
+
+_SIGNED = ("effort_min", "effort_max", "integral_min", "integral_max")
+
+
+def _is_array(leaf: Any) -> bool:
+    """Return whether an entry of the params is an array, neither off nor a choice."""
+    return leaf is not None and not isinstance(leaf, tuple)

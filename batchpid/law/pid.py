@@ -1,0 +1,225 @@
+r"""The control law: pure functions on (envs, joints) arrays, one definition for NumPy and JAX.
+
+With setpoint r, measurement y and step dt, per env and joint::
+
+    e      = dead(wrap(r - y))                                  error
+    P      = kp (b e - (1 - b) (y - o))                         = kp (b r - y), off: b = 1
+    v      = c dr/dt - dy/dt                                    measured rates, else wrapped differences / dt
+    d      = (tau d' + dt v) / (tau + dt)                       low-pass, backward Euler: stable for any dt
+    D      = kd d
+    u      = P + I + D + feedforward                            unsaturated effort
+    effort = min(max(u, effort_min), effort_max)                after |effort - effort'| <= rate limit * dt
+    I     <- I + ki e dt + (dt / Tt) (effort - u)               back-calculation
+    I     <- I + ki e dt   unless (u - effort) e > 0            conditional integration
+    I     <- min(max(I, integral_min), integral_max)            clamp
+
+A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
+whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
+is what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
+conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.arrays.choices import Everywhere, HoldEffort
+from batchpid.arrays.elementwise import clip, flush, namespace, wrap
+from batchpid.law.coefficients import Coefficients, discretise
+from batchpid.law.params import PIDParams
+from batchpid.law.state import PIDState, Terms
+
+
+def init(params: PIDParams, measurement: Any) -> PIDState:
+    """Return the state before the first step.
+
+    The derivative starts from ``measurement`` (envs, joints) [rad or m]: the first step has no derivative kick,
+    unless the params ask for one.
+    """
+    xp = namespace(*params, measurement)
+    y = xp.zeros_like(measurement, dtype=xp.result_type(params.kp, measurement)) + measurement
+    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
+    weights_rate = differentiates and params.setpoint_weight_derivative is not None
+    keeps_effort = params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort)
+
+    def filled(value: float, wanted: bool) -> Any:  # no two leaves share a buffer: JAX donates each of them
+        return xp.full_like(y, value) if wanted else None
+
+    return PIDState(
+        integral=None if params.ki is None else clip(filled(0.0, True), params.integral_min, params.integral_max, xp),
+        measurement=y.copy() if differentiates or (weights and params.continuous is not None) else None,
+        derivative=filled(0.0, differentiates and params.derivative_filter_time is not None),
+        setpoint=y.copy() if weights_rate else None,
+        setpoint_seen=filled(float(params.first_derivative is not None), weights_rate),
+        effort=filled(0.0, keeps_effort),
+        origin=y.copy() if weights and params.weight_origin is not None else filled(0.0, weights),
+    )
+
+
+def step(
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    dt: Any,
+    *,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+    terms: bool = False,
+) -> Any:
+    """Advance the law by ``dt`` seconds; return ``(state, effort)``, with ``terms`` also :class:`Terms`.
+
+    Arrays are (envs, joints), or (1, joints) for all envs, in the params' dtype; none is written to.
+
+    Parameters
+    ----------
+    setpoint, measurement
+        r and y [rad or m].
+    dt
+        Time step > 0 [s].
+    measurement_rate
+        dy/dt, if measured [rad/s or m/s]; None: the difference quotient of the measurement.
+    setpoint_rate
+        dr/dt, if known; it enters with weight c, or 1 without one. None: the difference quotient of the setpoint
+        with a weight c, else 0.
+    feedforward
+        Effort added before saturation [N m or N]: passive force, acceleration feedforward, ...
+
+    Raises
+    ------
+    InvalidArgumentError
+        If dt is a Python number that is not positive and finite.
+    """
+    rates = measurement_rate, setpoint_rate
+    return advance(discretise(params, dt), state, setpoint, measurement, *rates, feedforward, terms=terms)
+
+
+def advance(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+    *,
+    terms: bool = False,
+) -> Any:
+    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`."""
+    xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
+    finite = None
+    if k.non_finite is not None:
+        finite = xp.isfinite(r) & xp.isfinite(y)
+        for optional in (r_rate, y_rate, ff):
+            finite = finite if optional is None else finite & xp.isfinite(optional)
+        r, y, r_rate, y_rate, ff = (None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff))
+
+    error = wrapped_error(k, r, y, xp)
+    origin = turned_origin(k, state, y, xp)
+    p = proportional(k, error, y, origin)
+    u = p
+
+    integral = state.integral
+    if k.ki_dt is not None:
+        integral = integral + k.ki_dt * error
+        if k.integration is not None:
+            integral = clip(integral, k.integral_min, k.integral_max, xp)
+        i = state.integral if k.integration is None else integral
+        u = u + i
+
+    derivative = None
+    if k.kd is not None:
+        rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
+        if r_rate is not None:
+            rate = rate + (r_rate if k.c is None else k.c * r_rate)
+        elif k.c is not None:
+            rate = rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
+        derivative = rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
+        d = k.kd * derivative
+        u = u + d
+    if ff is not None:
+        u = u + ff
+
+    effort = u
+    if k.effort_step is not None:
+        effort = clip(u, state.effort - k.effort_step, state.effort + k.effort_step, xp)
+    effort = clip(effort, k.effort_min, k.effort_max, xp)
+
+    if k.ki_dt is not None:
+        if effort is not u and k.conditional is not None:
+            deeper = (u - effort) * error > 0
+            if not isinstance(k.conditional, Everywhere):
+                deeper = deeper & (k.conditional > 0)
+            integral = xp.where(deeper, state.integral, integral)
+        if effort is not u and k.tracking is not None:
+            integral = flush(integral + k.tracking * (effort - u), k.tiny)
+        integral = clip(integral, k.integral_min, k.integral_max, xp)
+
+    new = PIDState(
+        integral=integral,
+        measurement=None if state.measurement is None else y.copy(),  # the caller may reuse its buffer
+        derivative=None if state.derivative is None else derivative,
+        setpoint=None if state.setpoint is None else r + xp.zeros_like(y),
+        setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(y),
+        effort=None if state.effort is None else effort.copy(),
+        origin=origin,
+    )
+    if finite is not None:
+        new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
+        effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
+    if not terms:
+        return new, effort
+
+    zero = xp.zeros_like(u)
+
+    def shown(term: Any) -> Any:  # a copy, over all envs
+        return zero + term if finite is None else xp.where(finite, term, zero)
+
+    return (
+        new,
+        effort,
+        Terms(
+            p=shown(p),
+            i=zero if k.ki_dt is None else shown(i),
+            d=zero if k.kd is None else shown(d),
+            feedforward=zero if ff is None else shown(ff),
+            unsaturated=shown(u),
+            effort=effort,
+            saturated=effort != u if finite is None else finite & (effort != u),
+            finite=xp.isfinite(u) if finite is None else finite,
+        ),
+    )
+
+
+def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
+    """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs, joints).
+
+    ``keep_integral`` keeps their integral term, e.g. a learnt load.
+    """
+    xp = namespace(*state, *params, measurement, mask)
+    fresh = init(params, measurement)
+    if keep_integral:
+        fresh = fresh._replace(integral=state.integral)
+    chosen = xp.asarray(mask)[:, None]
+    return PIDState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))
+
+
+def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
+    """Return the wrapped error, less the dead zone."""
+    error = wrap(r - y, k.turns, xp)
+    return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
+
+
+def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
+    """Return the origin of setpoint weighting, moved by the whole turns that y jumped."""
+    if state.origin is None or k.turns is None:
+        return state.origin
+    moved = y - state.measurement
+    return state.origin + (moved - wrap(moved, k.turns, xp))
+
+
+def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
+    """Return kp (b e - (1 - b) (y - o)), which has no spike where y wraps."""
+    return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))

@@ -1,0 +1,66 @@
+"""State of the law between steps, and the terms of one step."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+
+
+class PIDState(NamedTuple):
+    """State of the law, arrays (envs, joints); None where no option needs it."""
+
+    integral: Any = None
+    """I, in effort units."""
+    measurement: Any = None
+    """y of the last step [rad or m]."""
+    derivative: Any = None
+    """d, the filtered rate of c r - y [rad/s or m/s]."""
+    setpoint: Any = None
+    """r of the last step [rad or m]."""
+    setpoint_seen: Any = None
+    """1.0 once ``setpoint`` holds a value to take a difference from, else 0.0."""
+    effort: Any = None
+    """Effort of the last step [N m or N]."""
+    origin: Any = None
+    """o: where setpoint weighting measures positions from [rad or m]."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+    def for_envs(self, envs: slice | Any) -> PIDState:
+        """Return the state of some envs (a slice or an index array)."""
+        return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
+
+    def leaves(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+
+    def matched_to(self, fresh: PIDState) -> PIDState:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped."""
+        both = zip(self, fresh, strict=True)
+        return PIDState(*(new if new is None or old is None else old for old, new in both))
+
+
+class Terms(NamedTuple):
+    """Terms of the law in one step, each (envs, joints); 0 for a term that is off."""
+
+    p: Any
+    """Proportional term [N m or N]."""
+    i: Any
+    """Integral term as it entered the effort."""
+    d: Any
+    """Derivative term."""
+    feedforward: Any
+    """Feedforward as given."""
+    unsaturated: Any
+    """Their sum: the computed effort."""
+    effort: Any
+    """The applied effort, after saturation."""
+    saturated: Any
+    """Bool: a limit (of the effort or its rate) changed the effort."""
+    finite: Any
+    """Bool: every input of this env and joint was finite."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")

@@ -1,0 +1,56 @@
+"""Actuators and sensors between the controller and the joints: delay, lag, envelope, strength, resolution.
+
+Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and :func:`measure`::
+
+    actuators = bp.make_actuators(joints=7, command_delay=0.005, strength=0.9)
+    state = bp.actuators.init(actuators, qpos, dt)
+    state, measured, rate = bp.actuators.measure(actuators, state, qpos, qvel, dt)
+    state, effort = bp.actuators.deliver(actuators, state, effort, qpos, qvel, dt)
+
+See docs/actuators.md.
+"""
+
+from batchpid.motors import actuator_presets as presets
+from batchpid.motors.actuator_dynamics import (
+    STAGES,
+    Coefficients,
+    Stages,
+    advance_effort,
+    advance_measurement,
+    command_limits,
+    deliver,
+    discretise,
+    init,
+    measure,
+    measurement_noise,
+    reset,
+)
+from batchpid.motors.actuator_fields import JOINT_SIDE
+from batchpid.motors.actuator_files import dumps_actuators, load_actuators, loads_actuators, save_actuators
+from batchpid.motors.actuator_state import ActuatorState
+from batchpid.motors.actuators import Actuators, check_actuators, make_actuators
+
+__all__ = [
+    "JOINT_SIDE",
+    "STAGES",
+    "ActuatorState",
+    "Actuators",
+    "Coefficients",
+    "Stages",
+    "advance_effort",
+    "advance_measurement",
+    "check_actuators",
+    "command_limits",
+    "deliver",
+    "discretise",
+    "dumps_actuators",
+    "init",
+    "load_actuators",
+    "loads_actuators",
+    "make_actuators",
+    "measure",
+    "measurement_noise",
+    "presets",
+    "reset",
+    "save_actuators",
+]

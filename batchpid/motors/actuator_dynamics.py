@@ -1,0 +1,311 @@
+r"""From the effort asked for to the effort delivered, and from the joint's state to its measurement.
+
+Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and velocity v, and the
+effort u that the controller asks for::
+
+    x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
+    v_x    = v, 0 within the play
+    y, v_y = x(t - d_s), v_x(t - d_s)                      sensor delay
+    y      = r rint((y + sigma z) / r)                     noise, resolution; of v_y likewise
+
+    m      = s u(t - d_c) + b                              command delay, strength, bias
+    e      = min(max(m, low(q, v)), high(q, v))            envelope: batchpid.motors.envelope
+    e      = e' + (1 - exp(-dt / T)) (e - e')              lag, again within the envelope; exact for a constant e
+
+A command u is delivered unclipped, where nothing is late, if (low - b) / s <= u <= (high - b) / s:
+:func:`command_limits`.
+
+A prime is the value of the step before. The play is the backlash hysteresis (G. Tao and P. Kokotovic, Adaptive Control
+of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
+see :mod:`batchpid.motors.friction`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.motors import delay
+from batchpid.motors import sensor_noise as noise
+from batchpid.motors.actuator_state import ActuatorState
+from batchpid.motors.actuators import Actuators
+from batchpid.motors.envelope import Envelope, command_envelope, envelope, limits
+
+_ONE = np.uint32(1)
+
+
+class Coefficients(NamedTuple):
+    """:class:`Actuators` at one time step, in the symbols of :mod:`batchpid.motors.actuator_dynamics`; None is off."""
+
+    command: delay.Delay | None = None
+    sensor: delay.Delay | None = None
+    envelope: Any = Envelope()
+    commands: Any = Envelope()
+    """Envelope of the commands that the motor delivers unclipped."""
+    intake: Any = None
+    """1 - exp(-dt / T)."""
+    strength: Any = None
+    bias: Any = None
+    play: Any = None
+    """B / 2."""
+    position_resolution: Any = None
+    velocity_resolution: Any = None
+    position_noise: Any = None
+    velocity_noise: Any = None
+    turns: Any = None
+    """1 / (2 pi) on continuous joints, 0 elsewhere."""
+    sensor_turns: Any = None
+    """The same for positions and velocities (1 | envs, 2 joints)."""
+
+    def __repr__(self) -> str:
+        return array_summary(self._replace(command=None, sensor=None, envelope=None, commands=None), "envs", "joints")
+
+
+def init(
+    actuators: Actuators,
+    qpos: Any,
+    dt: float,
+    *,
+    qvel: Any = None,
+    effort: Any = None,
+    envs: Any = None,
+    episode: Any = 0,
+    samples: int | None = None,
+) -> ActuatorState:
+    """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort`` asked so far.
+
+    Parameters
+    ----------
+    qpos, qvel, effort
+        Position [rad or m], velocity and effort [N m or N] (envs, joints) so far; velocity and effort are 0 by default.
+    dt
+        Time step [s].
+    envs, episode
+        Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on both.
+    samples
+        Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that is traced by JAX.
+
+    Raises
+    ------
+    InvalidArgumentError
+        ``max_delay`` is traced and ``samples`` is missing, or it needs too many samples.
+    """
+    xp = namespace(*actuators, qpos)
+    zeros = xp.zeros_like(qpos)
+    position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
+    asked = zeros if effort is None else zeros + effort
+    command = sensor = encoder = key = step = None
+    if actuators.max_delay is not None:
+        samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
+        if actuators.command_delay is not None:
+            command = delay.start(asked, samples)
+        if actuators.sensor_delay is not None:
+            sensor = delay.start(xp.concatenate((position, velocity), axis=1), samples)
+    if actuators.backlash is not None:
+        encoder = position
+    if actuators.seed is not None:
+        numbers = xp.arange(len(zeros)) if envs is None else envs
+        episodes = xp.broadcast_to(xp.asarray(episode), (len(zeros),))
+        key = noise.keys(actuators.seed, numbers, episodes, xp)
+        step = xp.zeros(len(zeros), xp.uint32)
+    state = ActuatorState(command, None, sensor, encoder, key, step)
+    if actuators.lag is None:
+        return state
+    k = discretise(actuators, state, dt)
+    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros)
+
+
+def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: int | None = None) -> Coefficients:
+    """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
+
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster.
+    """
+    a, xp = actuators, namespace(*actuators)
+    turns = None if a.continuous is None else a.continuous / TURN
+    k = Coefficients(
+        command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
+        sensor=None if a.sensor_delay is None else delay.discretise(_twice(a.sensor_delay, xp), dt, state.sensor),
+        envelope=envelope(a),
+        commands=command_envelope(a),
+        intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
+        strength=a.strength,
+        bias=a.bias,
+        play=None if a.backlash is None else 0.5 * a.backlash,
+        position_resolution=_step(a.position_resolution, xp),
+        velocity_resolution=_step(a.velocity_resolution, xp),
+        position_noise=a.position_noise,
+        velocity_noise=a.velocity_noise,
+        turns=turns,
+        sensor_turns=None if turns is None else xp.concatenate((turns, 0 * turns), axis=1),
+    )
+    if num_envs is None:
+        return k
+
+    def spread(leaf: Any) -> Any:
+        if leaf is None or (leaf.ndim == 3 and leaf.shape[1] == num_envs):
+            return leaf
+        return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
+
+    flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
+    ends, commands = (Envelope(*map(spread, each)) for each in (k.envelope, k.commands))
+    return k._replace(**flat, envelope=ends, commands=commands)
+
+
+def deliver(
+    actuators: Actuators, state: ActuatorState, effort: Any, qpos: Any, qvel: Any, dt: Any
+) -> tuple[ActuatorState, Any]:
+    """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m or N].
+
+    ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions [rad or m] and
+    velocities, all (envs, joints); none is written to.
+    """
+    return advance_effort(discretise(actuators, state, dt), state, effort, qpos, qvel)
+
+
+def measure(
+    actuators: Actuators, state: ActuatorState, qpos: Any, qvel: Any, dt: Any
+) -> tuple[ActuatorState, Any, Any]:
+    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs, joints).
+
+    ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities; none is written to.
+    """
+    return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
+
+
+class Stages(NamedTuple):
+    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints); a loop may compile them."""
+
+    delivered: Callable[..., tuple[Any]]
+    """Effort of the step before, effort asked for, position and velocity -> effort delivered."""
+    limits: Callable[..., tuple[Any, Any]]
+    """:func:`command_limits`."""
+    play: Callable[..., tuple[Any, Any]]
+    """Encoder's position of the step before, position and velocity -> both behind the backlash."""
+    encode: Callable[..., tuple[Any, Any]]
+    """Position, velocity and the noise of each -> both as measured."""
+
+
+def _motor(k: Coefficients, effort: Any) -> Any:
+    """Return s u + b."""
+    effort = effort if k.strength is None else k.strength * effort
+    return effort if k.bias is None else effort + k.bias
+
+
+def _delivered(k: Coefficients, behind: Any, effort: Any, qpos: Any, qvel: Any) -> tuple[Any]:
+    """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step before, None without."""
+    xp = namespace(effort, qpos, qvel)
+    low, high = limits(k.envelope, qpos, qvel)
+    motor = clip(_motor(k, effort), low, high, xp)
+    if k.intake is not None:
+        motor = clip(behind + k.intake * (motor - behind), low, high, xp)
+    return (motor,)
+
+
+def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+    """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
+
+    They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
+    difference from the effort asked for they would leak into the integral. None is no limit.
+    """
+    return limits(k.commands, qpos, qvel)
+
+
+def _play(k: Coefficients, encoder: Any, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+    """Return position and velocity behind the backlash; ``encoder`` is the position of the step before."""
+    xp = namespace(qpos, qvel)
+    behind = wrap(encoder - qpos, k.turns, xp)
+    offset = clip(behind, -k.play, k.play, xp)
+    return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
+
+
+def _encode(k: Coefficients, qpos: Any, qvel: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
+    """Return position and velocity with noise, ``position`` and ``velocity`` or None, in steps of the resolution."""
+    xp = namespace(qpos, qvel)
+    qpos = qpos if position is None else qpos + position
+    qvel = qvel if velocity is None else qvel + velocity
+    if k.position_resolution is not None:
+        qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
+    if k.velocity_resolution is not None:
+        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
+    return qpos, qvel
+
+
+STAGES = Stages(_delivered, command_limits, _play, _encode)
+"""Stages for NumPy and JAX, as this module computes them."""
+
+
+def advance_effort(
+    k: Coefficients, state: ActuatorState, effort: Any, qpos: Any, qvel: Any, stages: Stages = STAGES
+) -> tuple[ActuatorState, Any]:
+    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
+    xp = namespace(effort, qpos, qvel)
+    command, behind = state.command, state.effort
+    if k.command is not None:
+        command = delay.push(command, effort, xp)
+        effort = delay.read(command, k.command, None, xp)
+    (motor,) = stages.delivered(k, behind, effort, qpos, qvel)
+    return ActuatorState(command, behind if k.intake is None else motor, *state[2:]), motor
+
+
+def advance_measurement(
+    k: Coefficients,
+    state: ActuatorState,
+    qpos: Any,
+    qvel: Any,
+    drawn: tuple[Any, Any] | None = None,
+    stages: Stages = STAGES,
+) -> tuple[ActuatorState, Any, Any]:
+    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
+
+    ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
+    """
+    xp = namespace(qpos, qvel)
+    command, effort, sensor, encoder, key, step = state
+    if k.play is not None:
+        encoder, qvel = stages.play(k, encoder, qpos, qvel)
+        qpos = encoder
+    if k.sensor is not None:
+        sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
+        seen, joints = delay.read(sensor, k.sensor, k.sensor_turns, xp), qpos.shape[1]
+        qpos, qvel = seen[:, :joints], seen[:, joints:]
+    more: tuple[Any, Any] = (None, None)
+    if key is not None:
+        more = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
+        step = step + _ONE
+    qpos, qvel = stages.encode(k, qpos, qvel, *more)
+    return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
+
+
+def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) -> tuple[Any, Any]:
+    """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
+
+    ``key`` is that of the state, and ``like`` an array (envs, joints) of the same dtype.
+    """
+    both = noise.normals(key, step, like.shape[1], like.dtype, xp)
+    deviations = k.position_noise, k.velocity_noise
+    position, velocity = (None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True))
+    return position, velocity
+
+
+def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorState:
+    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
+    xp = namespace(*state, mask)
+    chosen = xp.asarray(mask)
+
+    def choose(new: Any, old: Any) -> Any:
+        return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return ActuatorState(*(choose(new, old) for new, old in zip(fresh, state, strict=True)))
+
+
+def _twice(delay: Any, xp: Any) -> Any:
+    return xp.concatenate((delay, delay), axis=1)
+
+
+def _step(resolution: Any, xp: Any) -> Any:
+    """Return the step of a sensor; 2^-60, which is below the last bit that matters, where there is none."""
+    return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)

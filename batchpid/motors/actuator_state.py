@@ -1,0 +1,51 @@
+"""State of actuators and sensors between steps."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+
+
+class ActuatorState(NamedTuple):
+    """State of actuators and sensors; None where no effect needs it. Every array has the envs as its first axis."""
+
+    command: Any = None
+    """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
+    effort: Any = None
+    """Effort behind the lag (envs, joints) [N m or N]."""
+    sensor: Any = None
+    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2 joints)."""
+    encoder: Any = None
+    """Position of the sensor's side of the play (envs, joints) [rad or m]."""
+    key: Any = None
+    """Key of the noise, a hash of seed, env and episode (envs, 2) uint32."""
+    step: Any = None
+    """Measurements since the reset (envs,) uint32."""
+
+    def __repr__(self) -> str:
+        return array_summary(self._replace(key=None, step=None), "envs", "joints")
+
+    def leaves(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+
+    def matched_to(self, fresh: ActuatorState) -> ActuatorState:
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped.
+
+        A history that is longer there is continued by its oldest sample. The key is that of ``fresh``.
+        """
+        both = zip(self, fresh, strict=True)
+        matched = (new if new is None or old is None else _resized(old, new) for old, new in both)
+        return ActuatorState(*matched)._replace(key=fresh.key)
+
+
+def _resized(old: Any, new: Any) -> Any:
+    """Return a history of the length of another; other arrays as they are."""
+    if old.ndim < 3 or old.shape == new.shape:
+        return old
+    xp, samples = old.__array_namespace__(), new.shape[1]
+    if samples < old.shape[1]:
+        return old[:, :samples].copy()
+    oldest = xp.broadcast_to(old[:, -1:], (old.shape[0], samples - old.shape[1], old.shape[2]))
+    return xp.concatenate((old, oldest), axis=1)

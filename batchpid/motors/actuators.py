@@ -1,0 +1,282 @@
+"""Parameters of actuators and sensors: build, broadcast, validate.
+
+:class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
+that is off is ``None``: it is no leaf and costs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.display import span, summary
+from batchpid.arrays.leaves import LeafBuilder
+from batchpid.checks.keywords import known_keywords
+from batchpid.checks.validate import at_least, entries, integer, is_traced, number, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.motors.actuator_fields import JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
+
+
+class Actuators(NamedTuple):
+    """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
+
+    Build it with :func:`make_actuators`, change it with :meth:`replace`: both validate. The fields have the meaning
+    and the units of the options of :func:`make_actuators`.
+    """
+
+    command_delay: Any = None
+    sensor_delay: Any = None
+    lag: Any = None
+    strength: Any = None
+    bias: Any = None
+    saturation_effort: Any = None
+    no_load_speed: Any = None
+    effort_limit: Any = None
+    limit_positions: Any = None
+    """x_k of the limit that depends on the position (1, joints, points)."""
+    limit_efforts: Any = None
+    """L_k (1, joints, points)."""
+    coulomb: Any = None
+    static: Any = None
+    viscous: Any = None
+    armature: Any = None
+    backlash: Any = None
+    position_resolution: Any = None
+    velocity_resolution: Any = None
+    position_noise: Any = None
+    velocity_noise: Any = None
+    continuous: Any = None
+    """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
+    max_delay: Any = None
+    """Length of the histories of delayed signals (1, 1) [s]; None without delays."""
+    seed: Any = None
+    """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
+
+    @property
+    def num_joints(self) -> int | None:
+        """Number of joints; None where every effect is off."""
+        return next((int(leaf.shape[1]) for leaf in self[:-2] if leaf is not None), None)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs with actuators of their own; 1 where all envs share them."""
+        return max((leaf.shape[0] for leaf in self if leaf is not None), default=1)
+
+    @property
+    def measures(self) -> bool:
+        """True if measurements differ from the joints' true positions or velocities."""
+        return any(getattr(self, name) is not None for name in SENSOR_SIDE)
+
+    @property
+    def delivers(self) -> bool:
+        """True if the efforts delivered differ from those asked for."""
+        return any(getattr(self, name) is not None for name in MOTOR_SIDE)
+
+    @property
+    def is_ideal(self) -> bool:
+        """True if every effect is off."""
+        return not (self.measures or self.delivers) and all(leaf is None for leaf in self.joint_side())
+
+    def for_envs(self, envs: slice | Any) -> Actuators:
+        """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
+        return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+
+    def joint_side(self) -> Actuators:
+        """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
+        return Actuators(**{name: getattr(self, name) for name in JOINT_SIDE})
+
+    def options(self) -> dict[str, Any]:
+        """Return the effects that are on, as arguments of :func:`make_actuators` that build these actuators again."""
+        options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
+        if self.continuous is not None:
+            options["continuous"] = self.continuous > 0
+        if self.limit_positions is not None:
+            options["position_limit"] = options.pop("limit_positions"), options.pop("limit_efforts")
+        if self.seed is not None:
+            options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
+        if self.max_delay is not None and not is_traced(self.max_delay):
+            options["max_delay"] = float(self.max_delay[0, 0])
+        if options:
+            options["dtype"] = next(leaf.dtype for leaf in self if leaf is not None)
+        return options
+
+    def replace(self, **options: Any) -> Actuators:
+        """Return actuators with some options of :func:`make_actuators` changed, checked as there.
+
+        With other delays max_delay is theirs, unless it is given too.
+        """
+        known = self.options()
+        if not options.keys().isdisjoint(("command_delay", "sensor_delay")):
+            known.pop("max_delay", None)
+        if any(is_traced(value) for value in options.values()):
+            known.pop("dtype", None)
+        if self.num_joints is None and "joints" not in options:
+            remedy = "build them with make_actuators(), or give joints="
+            raise InvalidArgumentError("joints", "is not known: every effect is off", remedy=remedy)
+        return make_actuators(**{"joints": self.num_joints, **known, **options})
+
+    def __repr__(self) -> str:
+        on = {name: leaf for name, leaf in self._asdict().items() if leaf is not None and name != "seed"}
+        sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [f"{self.num_joints} joints"] * bool(on)
+        return summary("Actuators", [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())])
+
+
+@known_keywords
+def make_actuators(
+    joints: int,
+    *,
+    command_delay: Any = None,
+    sensor_delay: Any = None,
+    lag: Any = None,
+    strength: Any = None,
+    bias: Any = None,
+    saturation_effort: Any = None,
+    no_load_speed: Any = None,
+    effort_limit: Any = None,
+    position_limit: tuple[Any, Any] | None = None,
+    coulomb: Any = None,
+    static: Any = None,
+    viscous: Any = None,
+    armature: Any = None,
+    backlash: Any = None,
+    position_resolution: Any = None,
+    velocity_resolution: Any = None,
+    position_noise: Any = None,
+    velocity_noise: Any = None,
+    seed: int = 0,
+    max_delay: float | None = None,
+    continuous: Any = None,
+    joint_names: Sequence[str] | None = None,
+    dtype: Any = None,
+) -> Actuators:
+    """Build validated :class:`Actuators`; a number may be a scalar, (joints,) or (envs, joints).
+
+    ``None`` is off, and so is a value that changes nothing anywhere. Numbers may be traced by JAX; their shapes are
+    checked, their values are not.
+
+    Parameters
+    ----------
+    joints
+        Number of joints.
+    command_delay, sensor_delay
+        Age of the command that the motor follows, and of the position and velocity that the controller sees, from 0 to
+        1 [s]. Any real number: values between two samples are interpolated.
+    lag
+        Time constant T >= 0 of the effort's first-order lag [s].
+    strength
+        Factor >= 0 of the effort, 1 for a motor as the controller believes it to be.
+    bias
+        Effort added by the motor [N m or N].
+    saturation_effort, no_load_speed
+        Effort at stall, > 0 [N m or N], and speed without load, > 0 [rad/s or m/s], of the line between them: the
+        torque-speed envelope (:mod:`batchpid.motors.envelope`). Given together.
+    effort_limit
+        Largest effort that the motor delivers, >= 0 [N m or N].
+    position_limit
+        Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there [N m or N], both
+        (points,), (joints, points) or (envs, joints, points). Linear between the points, constant outside.
+    coulomb, viscous
+        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to that of the robot's description, by
+        the model of :mod:`batchpid.motors.friction`.
+    static
+        Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >= ``coulomb``, also
+        in addition to the description's. 0: as much as while it moves.
+    armature
+        Reflected inertia of the motor >= 0 [kg m^2 or kg].
+    backlash
+        Play >= 0 between the joint and its sensor, from one end to the other [rad or m].
+    position_resolution, velocity_resolution
+        Step >= 0 of measured positions [rad or m] and velocities [rad/s or m/s].
+    position_noise, velocity_noise
+        Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
+    seed
+        Of the noise, from 0 to 2^64 - 1.
+    max_delay
+        Length of the histories that delayed signals have [s]; None: the largest delay of all envs. A longer one is
+        needed where delays are to grow in flight: what is older than the history is its oldest sample.
+    continuous
+        Bools: joints whose position is an angle modulo 2 pi [rad].
+    joint_names
+        Used in error messages.
+    dtype
+        float32 or float64; None: float64, or that of the traced arrays.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, joint, env and value.
+    """
+    given = locals()
+    build = LeafBuilder(joints, joint_names, dtype, given.values())
+    leaves: dict[str, Any] = {}
+    for name, neutral in NEUTRAL.items():
+        above, low = name in ("saturation_effort", "no_load_speed"), -math.inf if name == "bias" else 0.0
+        leaves[name] = build.option(name, given[name], neutral=neutral, above=above, low=low)
+    longest = MAX_DELAY if max_delay is None else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+    delays = [(name, delay) for name in ("command_delay", "sensor_delay") if (delay := leaves[name]) is not None]
+    for name, delay in delays:
+        if not is_traced(delay) and (delay > longest).any():
+            remedy = f"use a number from 0 to {longest:g} (seconds)"
+            raise InvalidArgumentError(name, "out of range", value=float(delay.max()), remedy=remedy)
+    if max_delay is None and not any(is_traced(delay) for _, delay in delays):
+        longest = max((float(delay.max()) for _, delay in delays), default=0.0)
+    if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
+        missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
+        raise InvalidArgumentError(missing, "is missing", remedy="give both ends of the torque-speed line, or none")
+    if (static := leaves["static"]) is not None and not is_traced(static):
+        coulomb = 0.0 if leaves["coulomb"] is None else leaves["coulomb"]
+        good = is_traced(coulomb) or (static >= coulomb) | (static == 0)
+        entries("static", static, good, "is less than coulomb", joint_names, remedy="give at least coulomb, or 0")
+    points, efforts = _table(build, position_limit)
+    noisy = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
+    words = integer("seed", seed, 0, 2**64 - 1)
+    return Actuators(
+        **leaves,
+        limit_positions=points,
+        limit_efforts=efforts,
+        continuous=build.mask("continuous", continuous),
+        max_delay=build.freeze(np.array([[longest]])) if delays else None,
+        seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if noisy else None,
+    )
+
+
+def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Any, Any]:
+    """Return the positions and efforts of a limit that depends on the position (1 | envs, joints, points)."""
+    if table is None:
+        return None, None
+    remedy = "give positions and efforts (points,), (joints, points) or (envs, joints, points), with two points or more"
+    if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
+        raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
+    rows = [read_array("position_limit", each).astype(build.dtype) for each in table]
+    for each in rows:
+        if each.ndim not in (1, 2, 3) or each.shape[-1] < 2 or (each.ndim > 1 and each.shape[-2] != build.joints):
+            raise InvalidArgumentError("position_limit", f"has shape {each.shape}", remedy=remedy)
+    if rows[0].shape[-1] != rows[1].shape[-1]:
+        problem = f"has {rows[0].shape[-1]} positions and {rows[1].shape[-1]} efforts"
+        raise InvalidArgumentError("position_limit", problem, remedy=remedy)
+    shape = (1, build.joints, rows[0].shape[-1])
+    positions, efforts = (np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows)
+    rising = np.isfinite(positions).all(2) & (np.diff(positions) >= 0).all(2)
+    entries("position_limit", positions[..., 0], rising, "has positions that do not ascend", build.names)
+    good = (efforts >= 0).all(2) & (np.isfinite(efforts).all(2) | np.isinf(efforts).all(2))
+    entries("position_limit", efforts[..., 0], good, "has an effort < 0 or not finite", build.names)
+    return (None, None) if np.isinf(efforts).all() else (build.freeze(positions), build.freeze(efforts))
+
+
+def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
+    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+    shapes = (1, len(joint_names)), (num_envs, len(joint_names))
+    for name, leaf in actuators._asdict().items():
+        if leaf is None or name in ("max_delay", "seed"):
+            continue
+        if (leaf.shape if leaf.ndim == 2 else leaf.shape[:2]) not in shapes:
+            raise InvalidArgumentError(
+                f"actuators.{name}",
+                f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
+                remedy=f"give one row, or one row per env, of {', '.join(joint_names)}",
+            )
+        low = -math.inf if name in ("bias", "limit_positions") else 0.0
+        at_least(f"actuators.{name}", np.asarray(leaf), low, joint_names, infinite=True)

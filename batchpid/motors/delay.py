@@ -1,0 +1,83 @@
+r"""Delay of sampled signals by any time, interpolated between samples.
+
+With samples x_k at t = k dt, and a delay d = (n + f) dt with whole n and 0 <= f < 1::
+
+    y_k = (1 - f) x_{k-n} + f x_{k-n-1}
+
+A sine of angular frequency w is delayed by d exactly at f = 0, and by d to second order in w dt otherwise, with its
+amplitude lowered by at most the factor cos(w dt / 2) (T. I. Laakso et al., "Splitting the unit delay", IEEE Signal
+Processing Magazine 13, 1996: linear interpolation is the Lagrange filter of order 1).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from batchpid.arrays.elementwise import namespace, wrap
+from batchpid.checks.validate import is_traced
+from batchpid.errors import InvalidArgumentError
+
+MOST_SAMPLES = 20_000
+_NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding is one
+
+
+class Delay(NamedTuple):
+    """A delay at one time step, for histories (envs, samples, joints)."""
+
+    index: Any
+    """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
+    fraction: Any
+    """f (envs, joints); None: 0 everywhere."""
+
+
+def samples_of(longest: Any, dt: float) -> int:
+    """Return the samples that a history needs for delays up to ``longest`` (1, 1) [s].
+
+    Raises
+    ------
+    InvalidArgumentError
+        It is traced by JAX, so that its size is not known, or it needs too many samples.
+    """
+    if is_traced(longest) or is_traced(dt):
+        raise InvalidArgumentError("max_delay", "is traced, so that it is not known", remedy="pass samples= to init")
+    count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
+    if count > MOST_SAMPLES:
+        remedy = f"use a longer time step, or delays of at most {(MOST_SAMPLES - 2) * dt:g} s"
+        raise InvalidArgumentError("max_delay", f"needs {count} samples", value=float(longest[0, 0]), remedy=remedy)
+    return count
+
+
+def discretise(delay: Any, dt: Any, history: Any) -> Delay:
+    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, joints), its longest."""
+    xp = namespace(delay, history)
+    envs, samples, joints = history.shape
+    steps = delay / dt
+    whole = xp.rint(steps)
+    steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
+    steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
+    floor = xp.minimum(xp.floor(steps), samples - 2)
+    fraction = steps - floor
+    first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)[None]
+    later = first + floor.astype(int) * joints
+    if not is_traced(fraction) and not fraction.any():
+        return Delay(later[None], None)
+    return Delay(xp.stack((later, later + joints)), fraction)
+
+
+def start(value: Any, samples: int) -> Any:
+    """Return a history (envs, samples, joints) that has been ``value`` (envs, joints) so far."""
+    xp = namespace(value)
+    return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
+
+
+def push(history: Any, value: Any, xp: Any) -> Any:
+    """Return ``history`` (envs, samples, joints) with ``value`` (envs, joints) as its latest sample."""
+    return xp.concatenate((value[:, None], history[:, :-1]), axis=1)
+
+
+def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
+    """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
+    values = history.take(k.index)
+    later = values[0]
+    return later if k.fraction is None else later + k.fraction * wrap(values[1] - later, turns, xp)

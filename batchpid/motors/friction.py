@@ -1,0 +1,166 @@
+r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), for NumPy and JAX.
+
+With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and Coulomb friction F,
+a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves and any |f| <= F that holds it at rest.
+In steps of dt both are taken at the end of the step (backward Euler), which is stable at any ratio of B dt and F dt to
+the inertia (R. Kikuuwe et al., "Fixed-step friction simulation: from classical Coulomb model to modern continuous
+models", IROS 2005)::
+
+    M (v+ - v) = dt (tau - h - B v+ - f),      f in F Sgn(v+)
+
+- Viscous: (M + dt B) (v+ - v) = dt (tau - h - f - B v). The simulator adds the armature dt B to its joints, and
+  -B v is part of the effort: exact for the whole robot, without its mass matrix.
+- Coulomb: u = tau - f is the effort in [tau - F, tau + F] that brings v+ nearest to 0. With u' and v' of the
+  step before, the load as it was then, and the share w of a change of velocity that damping leaves, the velocity under
+  an unchanged u' is predicted as v + w (v - v'), and::
+
+    u = min(max(u' - K (v + w (v - v')), tau - F), tau + F)             K = J / dt,  w = 1 - dt B / J
+
+  J = 1 / ((M + dt B)^-1)_jj is the inertia that the joint shows. At rest u becomes the load h, whatever tau does within
+  F of it, and the joint stays. In velocities integrated over time K is a spring of stiffness K / dt that yields at F:
+  elastic, then plastic, so that a load below F never makes it creep, unlike LuGre's (P. Dupont, V. Hayward,
+  B. Armstrong and F. Altpeter, "Single state elastoplastic friction models", IEEE Transactions on Automatic Control 47,
+  2002). The yield by clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
+  (1998), section 1.4.
+
+With a static friction F_s > F the bound is F_s until the joint yields, and F until it holds again.
+
+With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled joints share it: with
+the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 / (A_jj sum_i |C_ij|) keeps the eigenvalues
+of A J within [0, 1], by Gershgorin's theorem. SHARE of K is left for inertias that change between two refreshes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import clip, namespace
+
+SHARE = 0.7
+"""Share of the deadbeat gain K that is used."""
+LOOKAHEAD = 0.1
+"""Time by which the setpoint is looked ahead to tell the direction of the wanted motion [s]."""
+
+
+class Friction(NamedTuple):
+    """Friction and damping of joints, (envs, joints) or (1, joints); None for none."""
+
+    coulomb: Any = None
+    """F >= 0 [N m or N]."""
+    viscous: Any = None
+    """B >= 0 [N m s/rad or N s/m]."""
+    static: Any = None
+    """F_s >= F, which holds the joint at rest; 0: F [N m or N]."""
+
+
+class FrictionState(NamedTuple):
+    """State of the model, arrays (envs, joints); None where there is no Coulomb friction."""
+
+    effort: Any = None
+    """u of the last step, motor and Coulomb friction [N m or N]."""
+    velocity: Any = None
+    """v of the last step [rad/s or m/s]."""
+    gain: Any = None
+    """K (1 + w - dt^2 k / J), with the stiffness k of an implicit drive; the factor of v [N m s/rad or N s/m]."""
+    memory: Any = None
+    """K w: the factor of v' [N m s/rad or N s/m]."""
+    sliding: Any = None
+    """1.0 where the friction had yielded in the last step, else 0.0."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+def init(
+    friction: Friction, velocity: Any, load: Any, mass_matrix: Any, dt: float, damping: Any = 0.0, stiffness: Any = 0.0
+) -> FrictionState:
+    """Return the state of joints that move at ``velocity`` (envs, joints), without Coulomb friction so far.
+
+    Parameters
+    ----------
+    load
+        Effort that holds the joints, h (envs, joints) [N m or N]; an estimate is as good, but for the first step.
+    mass_matrix, dt, damping, stiffness
+        As in :func:`refresh`.
+    """
+    if friction.coulomb is None:
+        return FrictionState()
+    xp = namespace(velocity, load, mass_matrix, *friction)
+    zero = xp.zeros_like(velocity)
+    state = FrictionState(load + zero, velocity + zero, zero, zero, zero)
+    return refresh(friction, state, mass_matrix, dt, damping, stiffness)
+
+
+def refresh(
+    friction: Friction, state: FrictionState, mass_matrix: Any, dt: float, damping: Any = 0.0, stiffness: Any = 0.0
+) -> FrictionState:
+    """Return ``state`` with K and w at ``mass_matrix`` (envs, joints, joints) [kg m^2 or kg].
+
+    ``damping`` and ``stiffness`` (envs, joints) or (1, joints) are those of a drive that the simulator integrates
+    implicitly [N m s/rad, N m/rad].
+    """
+    if friction.coulomb is None:
+        return state
+    xp = namespace(mass_matrix, *friction)
+    rubs = xp.zeros_like(state.effort) + friction.coulomb > 0
+    implicit = (0.0 if friction.viscous is None else friction.viscous) + damping + dt * stiffness
+    implicit = xp.zeros_like(state.effort) + implicit
+    diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
+    inverse = xp.linalg.inv(mass_matrix + dt * diagonal)
+    mobility = xp.einsum("ejj->ej", inverse)
+    scale = xp.sqrt(mobility)
+    correlation = xp.abs(inverse) / (scale[:, :, None] * scale[:, None, :])
+    shared = (correlation * rubs.astype(correlation.dtype)[:, None, :]).sum(-1)
+    k = xp.where(rubs, SHARE / (dt * mobility * xp.where(rubs, shared, 1.0)), 0.0)
+    w = 1 - dt * implicit * mobility
+    return state._replace(gain=k * (1 + w - dt**2 * stiffness * mobility), memory=k * w)
+
+
+def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any) -> tuple[FrictionState, Any]:
+    """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m or N].
+
+    The joints' armature has to be dt B. ``effort`` is that of the motors, at ``velocity``; none is written to.
+    """
+    total = effort
+    if friction.coulomb is not None:
+        xp = namespace(effort, velocity, *state)
+        held, bound = state.effort - state.gain * velocity + state.memory * state.velocity, friction.coulomb
+        if friction.static is not None:
+            bound = xp.where(state.sliding > 0, bound, xp.maximum(bound, friction.static))
+        total = xp.minimum(xp.maximum(held, effort - bound), effort + bound)
+        if friction.static is not None:
+            state = state._replace(sliding=(total != held).astype(total.dtype))
+        state = state._replace(effort=total, velocity=velocity)
+    if friction.viscous is not None:
+        total = total - friction.viscous * velocity
+    return state, total
+
+
+def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
+    """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') / band in [-1, 1].
+
+    Its sign is that of the wanted motion and not of the velocity, so it cannot chatter: friction, which is at least as
+    large and opposes the velocity, leaves no more than 0 in the direction of motion. A joint that is at rest within
+    ``band`` of its setpoint stays there.
+
+    Parameters
+    ----------
+    coulomb
+        F, known (joints,) or (envs, joints) [N m or N].
+    error, rate
+        e = r - q and r' (envs, joints) [rad or m, and per s]; a rate of None is 0.
+    band
+        Half width in which the sign is blurred (joints,) [rad or m].
+    """
+    xp = namespace(coulomb, error, rate, band)
+    coulomb, band = xp.atleast_2d(coulomb), xp.atleast_2d(band)
+    ahead = error if rate is None else error + LOOKAHEAD * rate
+    return clip(ahead * (coulomb / band), -coulomb, coulomb, xp)
+
+
+def reset(state: FrictionState, fresh: FrictionState, mask: Any) -> FrictionState:
+    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
+    xp = namespace(*state, mask)
+    chosen = xp.asarray(mask)[:, None]
+    return FrictionState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))

@@ -1,0 +1,151 @@
+r"""Guard of setpoints: limits of their position, rate and acceleration. Pure functions on (envs, joints).
+
+With the setpoint r that is asked for, the guarded setpoint g and its rate v, primes for the step before, and limits
+lower, upper, V, A::
+
+    e    = min(max(r, lower), upper) - g'                                the short way round on continuous joints
+    m    = max(ceil(sqrt(1/4 + 2 |e| / (A dt^2)) - 1/2), 1)              steps of a stop within e
+    stop = |e| / (m dt) + (m - 1) A dt / 2                               e / dt without A
+    w    = min(stop, V) sgn(e)
+    v    = min(max(w, v' - A dt), v' + A dt)
+    g    = g' + dt v
+
+``stop`` is the rate whose m steps of deceleration A end at rest at e: m stop dt - A dt^2 m (m - 1) / 2 = |e|. So g
+reaches a constant r in the shortest time that the limits allow, without overshoot, and does not leave [lower, upper]
+once inside: the sampled form of the nonlinear trajectory filters of L. Biagiotti and C. Melchiorri, Trajectory Planning
+for Automatic Machines and Robots (Springer, 2008), section 4.6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.arrays.leaves import LeafBuilder
+from batchpid.errors import InvalidArgumentError
+
+
+class Guard(NamedTuple):
+    """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with :func:`make_guard`."""
+
+    lower: Any = None
+    upper: Any = None
+    rate: Any = None
+    """V [rad/s or m/s]."""
+    acceleration: Any = None
+    """A [rad/s^2 or m/s^2]."""
+    turns: Any = None
+    """1 / (2 pi) on continuous joints, 0 elsewhere."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+    def for_envs(self, envs: slice | Any) -> Guard:
+        """Return the guard of some envs (a slice or an index array); shared rows stay shared."""
+        return Guard(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+
+
+class GuardState(NamedTuple):
+    """State of the guard (envs, joints)."""
+
+    setpoint: Any
+    """g [rad or m]."""
+    rate: Any
+    """v [rad/s or m/s]."""
+
+
+def make_guard(
+    joints: int,
+    *,
+    lower: Any = None,
+    upper: Any = None,
+    rate: Any = None,
+    acceleration: Any = None,
+    continuous: Any = None,
+    joint_names: Sequence[str] | None = None,
+    dtype: Any = None,
+) -> Guard:
+    """Build a validated :class:`Guard`; a number may be a scalar, (joints,) or (envs, joints), None is off.
+
+    Parameters
+    ----------
+    lower, upper
+        Limits of the position [rad or m]; without effect on ``continuous`` joints.
+    rate, acceleration
+        Limits > 0 of the setpoint's rate and acceleration [rad/s or m/s, and per second].
+    continuous
+        Bools: joints whose position is an angle modulo 2 pi [rad].
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, joint, env and value.
+    """
+    build = LeafBuilder(joints, joint_names, dtype, (lower, upper, rate, acceleration))
+    mask = build.mask("continuous", continuous)
+    low, high = build.limits("setpoint", None, lower, upper)
+    if mask is not None:
+        xp = namespace(mask)
+        low = None if low is None else xp.where(mask > 0, -math.inf, low)
+        high = None if high is None else xp.where(mask > 0, math.inf, high)
+    return Guard(
+        lower=build.freeze(low),
+        upper=build.freeze(high),
+        rate=build.option("rate", rate, neutral=math.inf, above=True),
+        acceleration=build.option("acceleration", acceleration, neutral=math.inf, above=True),
+        turns=None if mask is None else build.freeze(mask / TURN),
+    )
+
+
+def init(guard: Guard, qpos: Any) -> GuardState:
+    """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) [rad or m]."""
+    zeros = namespace(*guard, qpos).zeros_like(qpos)
+    return GuardState(zeros + qpos, zeros)
+
+
+def advance(guard: Guard, state: GuardState, setpoint: Any, dt: float) -> tuple[GuardState, Any]:
+    """Advance the guard by ``dt`` [s]; return the state, whose ``setpoint`` is guarded, and what was changed (bool).
+
+    ``setpoint`` (envs, joints) [rad or m] is the one that is asked for; it is not written to.
+    """
+    xp = namespace(*guard, setpoint, *state)
+    target = clip(setpoint, guard.lower, guard.upper, xp)
+    error = wrap(target - state.setpoint, guard.turns, xp)
+    wanted = rate = error / dt
+    if guard.acceleration is not None:
+        rate = xp.sign(error) * _stop(guard.acceleration, xp.abs(error), dt, xp)
+    if guard.rate is not None:
+        rate = clip(rate, -guard.rate, guard.rate, xp)
+    if guard.acceleration is not None:
+        most = dt * guard.acceleration
+        rate = clip(rate, state.rate - most, state.rate + most, xp)
+    guarded = xp.where(rate == wanted, target, state.setpoint + dt * rate)
+    return GuardState(guarded, rate), guarded != setpoint
+
+
+def _stop(acceleration: Any, distance: Any, dt: float, xp: Any) -> Any:
+    """Return the largest rate that stops within ``distance``."""
+    finite = xp.isfinite(acceleration)
+    a = xp.where(finite, acceleration, 1.0)
+    steps = xp.maximum(xp.ceil(xp.sqrt(0.25 + 2 * distance / (a * dt**2)) - 0.5), 1.0)
+    steps = xp.where(finite, steps, 1.0)
+    return distance / (steps * dt) + (steps - 1) * (0.5 * dt * a)
+
+
+def reset(state: GuardState, fresh: GuardState, mask: Any) -> GuardState:
+    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
+    xp = namespace(*state, mask)
+    chosen = xp.asarray(mask)[:, None]
+    return GuardState(*(xp.where(chosen, new, old) for new, old in zip(fresh, state, strict=True)))
+
+
+def check_guard(guard: Guard, num_envs: int, joint_names: Sequence[str]) -> None:
+    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints)."""
+    shapes = (1, len(joint_names)), (num_envs, len(joint_names))
+    for name, leaf in guard._asdict().items():
+        if leaf is not None and leaf.shape not in shapes:
+            problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
+            raise InvalidArgumentError(f"guard.{name}", problem, remedy=f"give one value for {', '.join(joint_names)}")

@@ -1,0 +1,249 @@
+"""Identification of motors from logs: regression, fit, uncertainty, and the error on the part that was kept."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from dataclasses import replace
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.arrays.digest import digest
+from batchpid.checks.validate import choice, flag, instance, integer, number
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.io.versions import package_versions
+from batchpid.sim.engine import native
+from batchpid.sim.identification.fit import Step
+from batchpid.sim.identification.fit_history import History, State
+from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked, read_logs
+from batchpid.sim.identification.plant import Motors, Plant
+from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.regression import Motion, best_drive, smooth
+from batchpid.sim.identification.result import Fit, Identification
+from batchpid.sim.identification.start import begin
+from batchpid.sim.identification.statistics import uncertainty
+from batchpid.sim.identification.unknowns import Unknowns
+from batchpid.sim.identification.windows import rows_of
+from batchpid.sim.options import Compensation
+from batchpid.sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+
+
+def identify(
+    robot: Robot,
+    logs: Iterable[str | os.PathLike[str] | Log],
+    *,
+    params: bp.PIDParams | None = None,
+    compensate: Compensation = "gravity+coriolis+friction",
+    timestep: float = 1 / 2000,
+    sim_steps: int = 1,
+    payload: bool = True,
+    hold: bool = False,
+    evaluations: int = 25,
+    seed: int = 0,
+    workers: int | None = None,
+    history: Path | str | None = None,
+    progress: Callable[[Any], Any] | None = None,
+) -> Identification:
+    """Find the motors of ``robot`` from logs of its motion.
+
+    Parameters
+    ----------
+    logs
+        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read.
+    params
+        Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
+        are used. None: the efforts.
+    compensate
+        What the robot compensates by itself, "none" for nothing. Whether that passes through its motors is found. A
+        log of efforts that holds them in full has "none"; where the log tells, this is found, too.
+    timestep
+        Time step of the control that drove the robot [s].
+    sim_steps
+        Sim steps of each. More than one where the robot, or its simulator, moved in smaller steps than its control:
+        a real robot under control at 500 Hz or less. Otherwise half the difference is taken for delay.
+    payload
+        Find a payload at the tool, too.
+    hold
+        Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
+    evaluations
+        Most evaluations of each fit, with and without noise in the law; one simulates the robot, and a changed one for
+        each unknown.
+    seed
+        Of CMA-ES, which finds where the fit begins.
+    workers
+        Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
+    history
+        File (.json), written before each step. If it exists the fit resumes from it.
+    progress
+        Wraps the range of evaluations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An option is out of range, a file holds no log of this robot, or a history is of another fit.
+    MissingDependencyError
+        A package is missing.
+
+    Warns
+    -----
+    LogWarning
+        A joint is at a limit.
+    """
+    for package in ("scipy", "cmaes"):
+        if find_spec(package) is None:
+            raise MissingDependencyError(package, "identification", "tune")
+    instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
+    choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
+    timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
+    sim_steps = integer("sim_steps", sim_steps, 1, 100)
+    control, timestep = timestep, timestep / sim_steps
+    evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
+    if workers is not None:
+        integer("workers", workers, 0, 1024)
+    payload, kind = flag("payload", payload), "effort" if params is None else "setpoint"
+    found = _logs(robot, logs, kind, flag("hold", hold))
+    joints = found[0].joints
+    if params is not None:
+        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
+    measured = params is not None and params.measurement_rate is not None
+    settings = {
+        **robot.about(),
+        "logs": [log.source for log in found],
+        "data": digest([replace(log, source="") for log in found]),
+        "command": kind,
+        "params": None if params is None else digest(params),
+        "compensate": compensate,
+        "timestep": control,
+        "sim_steps": sim_steps,
+        "payload": payload,
+        "evaluations": evaluations,
+        "seed": seed,
+        "native": native.status().active,
+        "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
+    }
+    record = History(history, settings)
+    drive = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
+    motions = [smooth(log, timestep) for log in found]
+    drive, regression = best_drive(robot, joints, drive, found, motions, payload)
+    unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
+    variants = _variants(drive, motions)
+    known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(variants))
+    processes = len(os.sched_getaffinity(0)) if workers is None else workers
+    pool: Any = nullcontext()
+    if processes > 1:
+        verdict: Any = {"initializer": native.take_verdict, "initargs": (native.environment(),)}
+        pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), **verdict)
+    with pool as executor:
+        problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in variants]
+        ideal = _ideal(robot, joints)
+        state = known or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
+        bar = Progress(len(problems), evaluations, progress)
+        problem, best = search(problems, state, evaluations, record, bar)
+        before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
+        sure = uncertainty(problem, best)
+    before = [residual[0] for residual in before]
+    errors = tuple(_held_out(problem, residuals) for residuals in (before, after))
+    if not errors[1] < errors[0]:  # the fit failed: nothing is known
+        sure = sure._replace(identified=np.zeros_like(sure.identified))
+    fits = tuple(
+        Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b, a)
+        for w, b, a in zip(problem.windows, before, after, strict=True)
+    )
+    fitted = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
+    noise = np.sqrt((fitted**2).mean(0))
+    return Identification(
+        robot, joints, unknowns, best.theta, sure, (errors[0], errors[1]), noise, problem.drive, settings, fits
+    )
+
+
+def _variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
+    """Return ways in which the law may measure: with the sensors' noise or without, rates or differences of positions.
+
+    Without noise, positions and rates are those of the simulation.
+    """
+    if drive.params is None:
+        return [drive]
+    quiet = replace(drive, measured_rate=False)
+    seen = any(motion.sensor.size.any() for motion in motions)
+    return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
+
+
+def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]:
+    given = [logs] if isinstance(logs, str | os.PathLike | Log) else list(logs)
+    found = [
+        log
+        for each in given
+        for log in (checked(robot, each) if isinstance(each, Log) else read_logs(robot, [each], kind, hold=hold))
+    ]
+    if not found:
+        raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
+    for log in found:
+        if log.joints != found[0].joints:
+            raise InvalidArgumentError(
+                log.source, f"holds other joints than {found[0].source}", remedy="fit them one by one"
+            )
+        if log.kind != kind:
+            remedy = "give the params that drove the robot" if log.kind == "setpoint" else "give no params"
+            raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
+        if stopped := at_limits(robot, log):
+            message = "; ".join(stopped) + ": stops are no part of the model; record between the limits"
+            warnings.warn(message, LogWarning, stacklevel=4)
+    return found
+
+
+def _of_joints(params: bp.PIDParams, robot: Robot, joints: tuple[int, ...]) -> bp.PIDParams:
+    """Return the params of ``joints``, one row."""
+    if params.num_envs != 1:
+        raise InvalidArgumentError("params", f"hold {params.num_envs} envs", remedy="give those of the logged robot")
+    if params.num_joints == len(joints):
+        return params
+    if params.num_joints != robot.dof:
+        problem = f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs {len(joints)}"
+        raise InvalidArgumentError("params", problem, remedy="give one gain per joint of the robot")
+    return bp.PIDParams(*(leaf[:, list(joints)] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+
+
+def _unknowns(
+    robot: Robot, joints: tuple[int, ...], drive: Drive, motors: Motors, motions: list[Motion], payload: bool
+) -> Unknowns:
+    """Return the unknowns with typical sizes from the motion."""
+    plant = Plant(robot, joints, drive)
+    qpos = np.concatenate([motion.qpos[::200] for motion in motions])
+    matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
+    links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors.armature[0]
+    inertia = links + armature
+    speed, acceleration = (
+        np.sqrt(np.mean(np.concatenate([getattr(motion, name) for motion in motions]) ** 2, axis=0))
+        for name in ("qvel", "qacc")
+    )
+    speed = np.maximum(speed, 1e-3)
+    effort = np.maximum(inertia * acceleration + motors.friction[0], inertia * 0.1)
+    return Unknowns.of(links, armature, effort, speed, payload)
+
+
+def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
+    """Return the motors of the robot as its description says."""
+    zero, own = np.zeros((1, len(joints))), list(joints)
+    damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
+    return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def _held_out(problem: Problem, residuals: list[Float64]) -> float:
+    """Return the root mean square of the residuals on the rows that were kept."""
+    kept = [r[~w.fitted] for r, w in zip(residuals, problem.windows, strict=True)]
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
+    return error if np.isfinite(error) else float("inf")

@@ -1,0 +1,56 @@
+"""Control of the robot in a log, and its PID law along simulated and measured motions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.sim.loop.pid_law import PIDLaw
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Control of the robot in a log."""
+
+    timestep: float
+    """Time step of the simulation [s]."""
+    params: bp.PIDParams | None
+    """Params of the PID law, of the logged joints; None for a log of efforts."""
+    compensate: str
+    """"gravity+coriolis", "gravity" or "none"."""
+    through: bool = False
+    """True if the compensation passes through the motors, with their strength and delay."""
+    knows_payload: bool = False
+    """True if the compensation is that of the robot with its payload."""
+    noisy: bool = False
+    """True if the law is given the positions of the log, with their noise, False if it is given those without."""
+    substeps: int = 1
+    """Sim steps of a step of the law, whose effort holds meanwhile."""
+    measured_rate: bool = False
+    """True if the law is given the joint velocity, False if it takes differences of positions."""
+
+
+class Law:
+    """PID law of many candidates."""
+
+    def __init__(self, drive: Drive, qpos: Float64, qvel: Float64) -> None:
+        params = drive.params
+        assert params is not None
+        self._law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
+        self._k = bp.discretise(params, drive.timestep * drive.substeps, len(qpos))
+        self._state = bp.init(params, qpos)
+
+    def effort(
+        self, setpoint: Float64, qpos: Float64, qvel: Float64, matrix: Float64, feedforward: Float64 | None
+    ) -> Float64:
+        """Advance the law by a step and return the efforts (n, joints)."""
+        given = matrix if self._law.whole else np.diagonal(matrix, axis1=1, axis2=2)
+        self._state, effort, _ = self._law.advance(
+            self._k, self._state, (setpoint, None), qpos, qvel, feedforward, given
+        )
+        return np.asarray(effort)

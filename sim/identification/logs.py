@@ -1,0 +1,241 @@
+"""Logs of a robot in motion: commands and measured positions over time, from CSV, HDF5 or recordings.
+
+A CSV file has a header and one row per sample, in SI units::
+
+    time, setpoint:JOINT or effort:JOINT ..., qpos:JOINT ..., optionally qvel:JOINT ...
+
+An HDF5 file has one dataset per column, of the same names. In a row stand the position measured at ``time`` and the
+command computed from it, which acts from then on. Columns may have any order, joints may be missing, and times need not
+be equidistant. Columns of other quantities are ignored.
+
+Where the times have a gap, such as between two recordings, each stretch without gap is a log
+(:mod:`batchpid.sim.identification.gaps`).
+
+In a recording (:func:`batchpid.sim.write_recording`) the command of a row acted in the tick that ends at its time, and
+each env is a log.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.checks.validate import choice, file_path
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
+from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
+from batchpid.sim.identification.log import CommandKind, Log, LogWarning
+from batchpid.sim.observation import Rollout
+from batchpid.sim.recording.recording_files import HDF5, read_recording
+from batchpid.sim.robot.robot import Robot
+from batchpid.trajectories import Trajectory
+
+Float64 = NDArray[np.float64]
+__all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs", "setpoint_csv"]
+
+SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
+AT_LIMIT = 1e-3
+"""Distance to a joint limit at which a joint counts as stopped by it, over its range."""
+BEYOND = {"rad": 0.3, "m": 0.05}
+"""Distance beyond a joint limit at which a position counts as given in another unit."""
+
+
+def read_logs(
+    robot: Robot, paths: Iterable[str | os.PathLike[str]], kind: CommandKind | None = None, *, hold: bool = False
+) -> list[Log]:
+    """Return the logs in files, one for each stretch without gaps in time.
+
+    Parameters
+    ----------
+    kind
+        Command to read where a file has both: "setpoint" or "effort"; default the one that it has, else "effort".
+    hold
+        True if the commands of CSV and HDF5 files hold from row to row, False to interpolate between rows, as for
+        commands that changed between rows as well. Recordings are always held.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A file holds no log of this robot; the message names the file, line and column.
+    RecordingError
+        A recording cannot be read.
+    MissingDependencyError
+        h5py is not installed, which .h5 files need.
+    FileNotFoundError
+        There is no such file.
+    """
+    logs = [log for path in paths for log in _read(robot, file_path("log", path, SUFFIXES), kind, hold)]
+    if not logs:
+        raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
+    kinds = {log.kind for log in logs}
+    if len(kinds) > 1:
+        remedy = "use logs of one kind"
+        raise InvalidArgumentError("logs", "hold setpoints in some files and efforts in others", remedy=remedy)
+    return logs
+
+
+def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool) -> list[Log]:
+    if not path.exists():
+        raise FileNotFoundError(2, "there is no such file", str(path))
+    if path.suffix.lower() in (".csv", ".txt"):
+        columns, lines = read_csv(path)
+        return _build(robot, str(path), columns, lines, kind, hold)
+    if path.suffix.lower() in HDF5:
+        found = read_hdf5_columns(path)
+        if found is not None:
+            return _build(robot, str(path), found, None, kind, hold)
+    return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
+
+
+def logs_of_rollout(
+    robot: Robot, rollout: Rollout, kind: CommandKind | None = None, source: str = "rollout"
+) -> list[Log]:
+    """Return one log for each env of ``rollout``, whose setpoints are efforts under control "effort".
+
+    Raises InvalidArgumentError if it is of other joints, or an env has failed.
+    """
+    info = rollout.info
+    if info.joint_names != robot.joint_names:
+        problem = f"is of the joints {', '.join(info.joint_names)}"
+        raise InvalidArgumentError(source, problem, remedy=f"{robot.name!r} has {', '.join(robot.joint_names)}")
+    if info.own_command is not None:
+        problem = f"was made with setpoints of {', '.join(info.own_command.names)}, not of joints"
+        raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
+    found: CommandKind = "effort" if info.control == "effort" else "setpoint"
+    if kind is not None and kind != found:
+        problem = f"was made under control {info.control!r} and holds {found}s"
+        raise InvalidArgumentError(source, problem, remedy=f"fit its {found}s")
+    if not rollout.ok.all():
+        env = int(np.argmin(rollout.ok.all(0)))
+        raise InvalidArgumentError(source, "has failed", env=env, remedy="record a run without faults")
+    joints = tuple(np.flatnonzero(robot.independent).tolist())
+    begin = rollout.time - rollout.tick
+    logs = []
+    for env in range(rollout.num_envs):
+        tables = {
+            name: np.asarray(getattr(rollout, name), float)[:, env, joints] for name in ("setpoint", "qpos", "qvel")
+        }
+        name = source if rollout.num_envs == 1 else f"{source}, env {env}"
+        log = Log(name, joints, found, rollout.time, tables["qpos"], begin, tables["setpoint"], True, tables["qvel"])
+        logs += checked(robot, log)
+    return logs
+
+
+def _build(
+    robot: Robot,
+    source: str,
+    columns: dict[str, Float64],
+    lines: list[int] | None,
+    kind: CommandKind | None,
+    hold: bool,
+) -> list[Log]:
+    """Return the logs that the columns of a file hold."""
+    if "time" not in columns:
+        problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
+        raise error(source, problem, "begin the header with time, in seconds")
+    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
+    for name, values in columns.items():
+        quantity, colon, joint = name.partition(":")
+        quantity, joint = quantity.strip(), joint.strip()
+        if colon and quantity in by:
+            choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
+            if joint in by[quantity]:
+                raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
+            by[quantity][joint] = values
+    if not by["qpos"]:
+        raise error(
+            source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
+        )
+    kinds: list[CommandKind] = [each for each in ("effort", "setpoint") if by[each]]
+    if not kinds or (kind is not None and kind not in kinds):
+        wanted = kind or "setpoint"
+        raise error(
+            source, f"has no column {wanted}:JOINT", f"commands are needed, e.g. {wanted}:{robot.joint_names[0]}"
+        )
+    found = kind or kinds[0]
+    for joint in by[found].keys() ^ by["qpos"].keys():
+        lacking = "qpos" if joint in by[found] else found
+        remedy = "give both of a joint or neither; a joint that is left out rests at the robot's start pose"
+        raise InvalidArgumentError(f"{source}: column {lacking}:{joint}", "is missing", remedy=remedy)
+    names = [name for name in robot.joint_names if name in by["qpos"]]
+    names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free and name in names]
+    if not names:
+        raise error(source, "holds followers alone, which their leaders move", "give the columns of the leaders")
+    read = [values for q in ("qpos", "qvel", found) for name, values in by[q].items() if name in names]
+    if len({len(columns["time"]), *map(len, read)}) > 1:
+        raise error(source, "has columns of different lengths", "give one value per row in each")
+    tables = {q: np.stack([by[q][n] for n in names], axis=1) for q in ("qpos", found)}
+    qvel = np.stack([by["qvel"][n] for n in names], axis=1) if by["qvel"].keys() >= {*names} else None
+    joints = tuple(robot.joint_names.index(name) for name in names)
+    time = columns["time"]
+    log = Log(source, joints, found, time, tables["qpos"], time, tables[found], hold, qvel)
+    return checked(robot, log, lines)
+
+
+def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[Log]:
+    """Return the stretches of ``log``, if its times increase and its values are finite and in SI units.
+
+    ``lines`` are the numbers of its rows in a file.
+    """
+
+    def row(index: int) -> str:
+        return f"row {index + 1}" if lines is None else f"line {lines[index]}"
+
+    names = [robot.joint_names[joint] for joint in log.joints]
+    for quantity, table in (("qpos", log.qpos), (log.kind, log.command), ("qvel", log.qvel)):
+        if table is not None and not np.isfinite(table).all():
+            index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
+            remedy = "remove the row, or give the number"
+            raise error(log.source, f"{row(index)}, column '{quantity}:{names[joint]}' is empty or not finite", remedy)
+    if not np.isfinite(log.time).all():
+        index = int(np.argmin(np.isfinite(log.time)))
+        raise error(log.source, f"{row(index)}, column 'time' is empty or not finite", "remove the row")
+    if (log.time[1:] <= log.time[:-1]).any():
+        index = int(np.argmax(log.time[1:] <= log.time[:-1])) + 1
+        raise error(log.source, f"{row(index)}: time does not increase", "sort the rows, and give each time once")
+    if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
+        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
+        raise error(log.source, problem, f"record {MIN_ROWS} rows and {MIN_SECONDS} s at least; time is in seconds")
+    with np.errstate(over="ignore"):
+        period = float(np.median(np.diff(log.time)))
+    if period > 0.05:
+        remedy = "record at 100 Hz or more; time is in seconds"
+        raise error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
+    reach = np.array([BEYOND[robot.units[joint]] for joint in log.joints])
+    free = robot.continuous[list(log.joints)]
+    low, high = (limit[list(log.joints)] for limit in (robot.lower, robot.upper))
+    beyond = ((log.qpos < low - reach) | (log.qpos > high + reach)) & ~free
+    if beyond.any():
+        index, joint = (int(n) for n in np.argwhere(beyond)[0])
+        problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
+        remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
+        raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
+    return divided(log, row)
+
+
+def at_limits(robot: Robot, log: Log) -> list[str]:
+    """Return a line for each joint that ``log`` shows at a limit, where a stop acts and not the motor alone."""
+    lines = []
+    for column, joint in zip(log.qpos.T, log.joints, strict=True):
+        low, high = robot.lower[joint], robot.upper[joint]
+        if robot.continuous[joint] or not np.isfinite(high - low):
+            continue
+        touching = (column < low + AT_LIMIT * (high - low)) | (column > high - AT_LIMIT * (high - low))
+        if touching.any():
+            limits = f"limits {low:g} to {high:g} {robot.units[joint]}"
+            place = f"{log.source}: joint {robot.joint_names[joint]!r} is at its limit"
+            lines.append(f"{place} in {touching.mean():.2g} of the rows ({limits})")
+    return lines
+
+
+def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
+    """Return the setpoints of ``motion`` as CSV, with the header of a log; its first row is for time 0."""
+    lines = [",".join(["time", *(f"setpoint:{name}" for name in robot.joint_names)])]
+    dt = float(motion.time[0])
+    for time, row in zip(motion.time - dt, motion.position, strict=True):
+        lines.append(",".join([f"{time:.9g}", *(f"{value:.9g}" for value in row)]))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,212 @@
+r"""Simulated motions of candidates along logs: residuals, their likelihood, and their Jacobian.
+
+The residuals of joint j are its measured positions y less the simulated ones, r = y - q(theta). A log is divided into
+stretches b; in each the residuals of a joint are white noise of unknown size, so that the negative logarithm of the
+likelihood is, over the number of rows and joints::
+
+    mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
+
+f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or
+later than it did, the size is large, and the stretch counts little.
+
+What moves the robot besides and is not known, as the sensors' noise between the rows, is taken out of residuals and
+Jacobian (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean of several draws of it.
+
+Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
+change.
+
+Under the PID law a whole log is one simulation. A log of efforts is cut into short windows, because an error of an
+uncontrolled arm grows: multiple shooting (H. G. Bock, "Recent advances in parameter identification techniques for
+O.D.E.", 1983). The state at the start of a window is unknown, too; its effect, linear for small errors, is projected
+out of the residual and the Jacobian of that window.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification.regression import Motion
+from batchpid.sim.identification.unknowns import Unknowns
+from batchpid.sim.identification.wander import spread, whiten
+from batchpid.sim.identification.windows import Subject, Window, cut, project, rows_of, simulate, whole
+from batchpid.sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+CHUNK = 48
+"""Most simulations at once."""
+STRETCH = 0.5
+"""Length of the stretches of a log [s], about."""
+NOISES = 2
+"""Least size of residuals, over the noise of the sensor."""
+LEAST_NOISE = 1e-6
+"""Least noise of a sensor, over the range of the motion."""
+WORST = 1e6
+"""Largest size of residuals that counts [rad or m]."""
+STATE_STEP = 1e-4
+"""Change of an initial position [rad or m], and of a velocity per second, for the projection."""
+
+
+class Evaluation(NamedTuple):
+    """Residuals of a point, and their Jacobian, of one window."""
+
+    residual: Float64
+    """Measured less simulated positions (rows, joints) [rad or m]."""
+    white: Float64
+    """Those of the fitted rows without wander (rows, joints)."""
+    jacobian: Float64
+    """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
+    determinant: Float64
+    """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
+
+
+@dataclass
+class Problem:
+    """Logs to fit, cut into windows."""
+
+    robot: Robot
+    joints: tuple[int, ...]
+    drive: Drive
+    logs: list[Log]
+    motions: list[Motion]
+    unknowns: Unknowns
+    executor: Executor | None = None
+    windows: list[Window] = field(init=False)
+    noise: Float64 = field(init=False)
+    """Least sizes of residuals (joints,) [rad or m]."""
+    stretches: list[list[NDArray[np.intp]]] = field(init=False)
+    """Numbers of the fitted rows in each stretch of each window."""
+
+    def __post_init__(self) -> None:
+        self._subject = Subject.of(self.robot, self.joints, self.drive)
+        divide = whole if self.drive.params is not None else cut
+        self.windows = [
+            window
+            for number, (log, motion) in enumerate(zip(self.logs, self.motions, strict=True))
+            for window in divide(number, log, motion, self.drive.timestep)
+        ]
+        if not self.draws:
+            self.windows = [window._replace(errors=window.errors[:0]) for window in self.windows]  # not to be sent
+        self.stretches = [self._divided(window) for window in self.windows]
+        self._rows = [len(rows) for stretches in self.stretches for rows in stretches]
+        qpos = np.concatenate([log.qpos for log in self.logs])
+        measured = np.sqrt(np.mean([motion.sensor.size**2 for motion in self.motions], axis=0))
+        self.noise = np.maximum(NOISES * measured, LEAST_NOISE * (np.ptp(qpos, axis=0) + 1e-3))
+
+    def _divided(self, window: Window) -> list[NDArray[np.intp]]:
+        rows = np.flatnonzero(window.fitted)
+        seconds = np.ptp(self.logs[window.log].time[rows_of(window)][rows]) if len(rows) else 0.0
+        return [part for part in np.array_split(rows, max(1, int(seconds / STRETCH))) if len(part)]
+
+    @property
+    def count(self) -> int:
+        """Number of fitted positions."""
+        return sum(self._rows) * len(self.joints)
+
+    @property
+    def draws(self) -> int:
+        """Number of draws of noise that the law is given, or of jitter of the efforts; 0 if it is known."""
+        return min(len(window.errors) for window in self.windows) if self.shoots or self.drive.noisy else 0
+
+    @property
+    def shoots(self) -> bool:
+        """True if the initial states of the windows are unknown."""
+        return self.drive.params is None
+
+    def residuals(self, points: Float64) -> list[Float64]:
+        """Return the residuals (points, rows, joints) of each window, without noise that is not known.
+
+        What initial states explain is left out of those of windows that shoot, with their effect at the first point.
+        """
+        joints = len(self.joints)
+        states = np.eye(2 * joints).reshape(-1, 2, joints) if self.shoots else np.zeros((0, 2, joints))
+        found = []
+        simulated = self._simulate(points, np.zeros(len(points), int), states)
+        for window, (positions, effect) in zip(self.windows, simulated, strict=True):
+            residual = window.measured - positions
+            none = np.zeros((*residual.shape[1:], 0))
+            found.append(np.stack([project(effect, each, none)[0] for each in residual]) if self.shoots else residual)
+        return found
+
+    def sizes(self, residuals: list[Float64]) -> Float64:
+        """Return the sizes (..., stretches, joints) of the residuals (..., rows, joints) of all windows."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = [
+                (residual[..., rows, :] ** 2).mean(-2)
+                for residual, stretches in zip(residuals, self.stretches, strict=True)
+                for rows in stretches
+            ]
+            return np.sqrt(np.stack(squares, axis=-2) + self.noise**2)
+
+    def costs(self, sizes: Float64, determinants: Float64 | float = 0.0) -> Float64:
+        """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).
+
+        They are finite where a simulation diverges, too.
+        """
+        return np.average(np.log(np.fmin(sizes, WORST)) + determinants, axis=-2, weights=self._rows)
+
+    def evaluate(self, theta: Float64) -> list[Evaluation]:
+        """Return residuals and Jacobian of each window at one point (unknowns,)."""
+        changes, joints = self.unknowns.changes(theta), len(self.joints)
+        inverse, count = np.linalg.inv(changes).T, len(changes) + 1
+        points = np.vstack([theta, theta + changes, np.tile(theta, (self.draws, 1))])
+        draws = np.r_[np.zeros(count, int), 1 + np.arange(self.draws)]
+        states = np.eye(2 * joints).reshape(-1, 2, joints)[0 if self.shoots else joints :]
+        found = []
+        simulated = self._simulate(points, draws, states)
+        for window, stretches, (positions, effect) in zip(self.windows, self.stretches, simulated, strict=True):
+            drawn = positions[count:] if self.draws else positions[:1]
+            residual = window.measured - drawn.mean(0)
+            jacobian = (positions[1:count] - positions[0]).transpose(1, 2, 0) @ inverse
+            wander = spread(drawn)
+            if self.shoots:
+                _, wander = project(effect, residual, wander)
+                residual, jacobian = project(effect, residual, jacobian)
+            else:
+                wander = np.concatenate([wander, effect * window.speed_error], axis=2)
+            wander /= (self.noise / NOISES)[:, None]
+            found.append(Evaluation(residual, *whiten(wander, stretches, residual, jacobian)))
+        return found
+
+    def lags(self, seconds: float) -> list[int]:
+        """Return how many rows of each log are ``seconds`` long."""
+        return [round(seconds / float(np.median(np.diff(log.time)))) for log in self.logs]
+
+    def _simulate(self, points: Float64, draws: NDArray[np.intp], states: Float64) -> list[tuple[Float64, Float64]]:
+        """Return for each window the positions (points, rows, joints), and the effect of its initial state.
+
+        ``draws`` (points,) are the numbers of the noise. The effect, at the first point, is that of changes ``states``
+        (states, 2, joints) of positions and velocities, over the change (rows, joints, states).
+        """
+        count = len(points)
+        numbers = np.r_[np.arange(count), np.zeros(len(states), int)]
+        states = np.concatenate([np.zeros((count, *states.shape[1:])), STATE_STEP * states])
+        motors, draws = self.unknowns.motors(points[numbers]), draws[numbers]
+        groups = [list(group) for _, group in groupby(self.windows, lambda w: (w.segment.command.shape, w.past))]
+        tasks, places = [], []
+        for number, group in enumerate(groups):
+            most = max(1, CHUNK // len(group))
+            parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
+            tasks += [(group, motors.take(part), states[part], draws[part]) for part in parts]
+            places += [number] * len(parts)
+        simulated = self._map(tasks)
+        found = []
+        for number, group in enumerate(groups):
+            pieces = [piece for piece, place in zip(simulated, places, strict=True) if place == number]
+            for at in range(len(group)):
+                positions = np.concatenate([piece[at] for piece in pieces])
+                effect = (positions[count:] - positions[0]) / STATE_STEP
+                found.append((positions[:count], effect.transpose(1, 2, 0)))
+        return found
+
+    def _map(self, tasks: list[Any]) -> list[list[Float64]]:
+        if self.executor is None:
+            return [simulate(self._subject, *task) for task in tasks]
+        return list(self.executor.map(simulate, [self._subject] * len(tasks), *zip(*tasks, strict=True)))

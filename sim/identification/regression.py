@@ -1,0 +1,237 @@
+r"""Start of the fit: inverse-dynamics regression, linear in all unknowns at a given delay.
+
+With the measured motion filtered without phase lag, and the effort u filtered alike, each joint obeys::
+
+    s u(t - d) + b + c - h - (M q'')_j = A q''_j + B q'_j + F sgn(q'_j)
+
+which is solved by least squares with A, B, F >= 0, for each delay d of a grid, where the joint moves fast enough not to
+stick (J. Swevers, W. Verdonck and J. De Schutter, "Dynamic model identification for industrial robots", IEEE Control
+Systems Magazine 27(5), 2007; M. Gautier, "Dynamic identification of robots with power model", ICRA 1997). Under the PID
+law u is computed from the filtered positions. A weak prior keeps what the log does not show at strength 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.identification.log_noise import Noise, split
+from batchpid.sim.identification.logged_control import Drive, Law
+from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification.plant import Motors, Plant
+
+Float64 = NDArray[np.float64]
+CUTOFF = 15.0
+"""Corner of the filter [Hz]."""
+DELAY_STEP = 5e-4
+DELAYS = np.arange(0.0, 0.03, DELAY_STEP)
+"""Delays that are tried [s]."""
+MOVES, LEAST_ROWS = 0.4, 50
+"""Speed, over its root mean square, below which a joint may stick, and the fewest rows that are left without those."""
+EDGE = 0.15
+"""Time left out at both ends of a log, where the filter begins [s]."""
+STOPPING = 5e-3
+_EVERY = 0.005
+PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
+"""Payloads that are tried [kg]."""
+EVIDENCE = 0.3
+"""Least decrease of the logarithm of a joint's mean square that counts, on average over the joints."""
+_PRIOR = 0.005
+"""Weight of the prior at ideal motors, over the effort's size."""
+NO_PRIOR, WEAK, STRONG = 1e-3, 0.1, 3.0
+"""Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
+
+
+class Motion(NamedTuple):
+    """Smoothed motion of a log on the grid of the sim steps, from its first row on; arrays (steps, joints)."""
+
+    qpos: Float64
+    qvel: Float64
+    qacc: Float64
+    command: Float64
+    sensor: Noise
+    """Noise of the measured positions."""
+    jitter: Noise | None
+    """That of the efforts of a log of efforts that change between its rows; None where the commands are known."""
+
+
+class Start(NamedTuple):
+    """Result of the regression."""
+
+    motors: Motors
+    cost: float
+    """Sum of the logarithms of the joints' mean squares of the efforts' residuals."""
+
+
+def smooth(log: Log, timestep: float) -> Motion:
+    """Return the motion of ``log`` on the grid, filtered without phase lag."""
+    from scipy.signal import butter, sosfiltfilt
+
+    time = log.time[0] + timestep * np.arange(int(log.seconds / timestep) + 1)
+    raw = np.stack([np.interp(time, log.time, column) for column in log.qpos.T], axis=1)
+    period = float(np.median(np.diff(log.time)))
+    sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / timestep, output="sos")
+    pad = min(len(raw) - 1, round(0.5 / timestep))
+    qpos = sosfiltfilt(sections, raw, axis=0, padlen=pad)
+    qvel = np.gradient(qpos, timestep, axis=0)
+    command, jitter = log.commands_at(time), None
+    if log.kind == "effort" and not log.held:
+        efforts, jitter = split(log.command_time, log.command, time, given=True)
+        command = efforts + jitter.values if jitter.size.any() else command
+    sensor = split(log.time, log.qpos, time)[1]
+    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), command, sensor, jitter)
+
+
+class Regression:
+    """Efforts that the motions took and those that were commanded, filtered alike, for regressions at any delay."""
+
+    def __init__(self, plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> None:
+        from scipy.signal import butter, sosfiltfilt
+
+        drive, dt = plant.drive, plant.drive.timestep
+        period = max(float(np.median(np.diff(log.time))) for log in logs)
+        sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
+        blocks: list[tuple[Float64, ...]] = []
+        late: list[Float64] = []
+        for motion in motions:
+            edge = min(round(EDGE / dt), len(motion.qpos) // 5)
+            rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
+            v, a = motion.qvel[rows], motion.qacc[rows]
+            empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
+            effort = motion.command if drive.params is None else _law_efforts(drive, plant, motion)
+            unloaded = np.zeros((len(motion.qpos), 1))
+            if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
+                effort = effort + held
+            if drive.params is None:  # the law's efforts are of filtered positions already
+                effort = sosfiltfilt(sections, effort, axis=0)
+            time = np.arange(len(effort)) * dt
+            late.append(
+                np.array([np.stack([np.interp(time[rows] - d, time, u) for u in effort.T], axis=1) for d in DELAYS])
+            )
+            still = 0.01 * np.abs(v).max(0) + 1e-9
+            sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
+            blocks.append((empty, loaded - empty, a, v, sign))
+        self._efforts = np.concatenate(late, axis=1)
+        self._columns = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+        fast = np.abs(speeds := self._columns[3]) > MOVES * np.sqrt((speeds**2).mean(0))
+        self._moves = fast | (fast.sum(0) < LEAST_ROWS)
+        self._payload = payload
+
+    def at(self, delay: float, kg: float = 0.0, strength_prior: float | Float64 = WEAK) -> Start:
+        """Return the motors that explain the efforts best at a ``delay`` [s], with a payload.
+
+        ``strength_prior`` is the weight of the prior at strength 1, of all joints or of each (joints,).
+        """
+        empty, per_kg, a, v, sign = self._columns
+        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
+        below, share = int(place), place % 1.0
+        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
+        tables = empty + kg * per_kg, a, v, sign, effort
+        priors = np.broadcast_to(strength_prior, empty.shape[1])
+        both = []
+        for joint, rows in enumerate(self._moves.T):
+            required, *columns = (table[rows, joint] for table in tables)
+            both.append(_solve_joint(required, columns, float(priors[joint])))
+        cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
+        armature, damping, friction, strength, bias = np.array([found for _, found in both]).T[:, None]
+        common = (np.array([[value]]) for value in (delay, STOPPING, kg))
+        return Start(Motors(armature, damping, friction, strength, bias, *common), cost)
+
+    @cached_property
+    def best(self) -> Start:
+        """Motors at the delay, and with the payload if one is asked for, that explain the efforts best."""
+        empty = self._at_best_delay(0.0)
+        if not self._payload:
+            return empty
+        loaded = empty
+        for _ in range(2):
+            costs = [self.at(loaded.motors.delay[0, 0], kg, NO_PRIOR).cost for kg in PAYLOADS]
+            loaded = self._at_best_delay(PAYLOADS[int(np.argmin(costs))])
+        return loaded if explains_better(loaded, empty) else empty
+
+    def _at_best_delay(self, kg: float) -> Start:
+        return min((self.at(delay, kg, NO_PRIOR) for delay in DELAYS), key=lambda start: start.cost)
+
+
+def explains_better(special: Start, plain: Start) -> bool:
+    """Return whether ``special`` explains the efforts so much better than ``plain`` that it is not by chance."""
+    return plain.cost - special.cost > EVIDENCE * plain.motors.armature.shape[1]
+
+
+def _law_efforts(drive: Drive, plant: Plant, motion: Motion) -> Float64:
+    """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
+    law = Law(drive, motion.qpos[:1], motion.qvel[:1])
+    needs = drive.params is not None and drive.params.gain_units is not None
+    none = np.zeros((1, 1))
+    matrix = plant.mass_matrix(motion.qpos[:1], none)
+    efforts = np.empty_like(motion.qpos)
+    for step in range(len(motion.qpos)):
+        if step % drive.substeps:
+            efforts[step] = efforts[step - 1]
+            continue
+        q, v = motion.qpos[step : step + 1], motion.qvel[step : step + 1]
+        if needs and step % 8 == 0:
+            matrix = plant.mass_matrix(q, none)
+        efforts[step] = law.effort(motion.command[step : step + 1], q, v, matrix, None)[0]
+    return efforts
+
+
+def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
+    """Return the efforts that a motion takes beyond what the robot compensates apart from its motors."""
+    q, v, a = (table[rows] for table in motion[:3])
+    kg = np.full((len(q), 1), payload)
+    effort = (plant.mass_matrix(q, kg) @ a[..., None])[..., 0] + plant.passive(q, v, kg)
+    held = None if plant.drive.through else plant.compensation(q, v, kg)
+    return effort if held is None else effort - held
+
+
+def _solve_joint(required: Float64, motion: list[Float64], strength_prior: float) -> tuple[float, Float64]:
+    """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint.
+
+    ``motion`` is acceleration, velocity, its sign, and the commanded effort (rows,).
+    """
+    from scipy.optimize import lsq_linear
+
+    a, v, sign, effort = motion
+    columns = np.stack([a, v, sign, -effort, -np.ones_like(a)], axis=1)
+    size = np.abs(columns).max(0) + 1e-12
+    matrix = columns / size
+    weights = np.array([_PRIOR, _PRIOR, _PRIOR, strength_prior / size[3], _PRIOR])
+    prior = (weights * (np.sqrt((effort**2).mean()) + 1e-9)) ** 2 * len(a)
+    information = matrix.T @ matrix + np.diag(prior)
+    target = -matrix.T @ required + prior * np.array([0, 0, 0, size[3], 0])
+    root = np.linalg.cholesky(information + 1e-12 * np.eye(5))
+    low = np.array([0, 0, 0, 0.2, -np.inf]) * size
+    high = np.array([np.inf, np.inf, np.inf, 3.0, np.inf]) * size
+    found = lsq_linear(root.T, np.linalg.solve(root, target), (low, high)).x
+    return float(((matrix @ found + required) ** 2).mean()), found / size
+
+
+def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
+    """Return the ways in which the robot may compensate: outside its motors, knowing its payload or not, or through.
+
+    The logged efforts may also hold the compensation.
+    """
+    if drive.compensate == "none":
+        return [drive]
+    ways = [drive, replace(drive, through=True)]
+    if payload:
+        ways.append(replace(drive, knows_payload=True))
+    return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
+
+
+def best_drive(
+    robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], motions: list[Motion], payload: bool
+) -> tuple[Drive, Regression]:
+    """Return the drive that explains the logs best, with its regression."""
+    ways = hypotheses(drive, payload)
+    found = [(Regression(Plant(robot, joints, each), logs, motions, payload), each) for each in ways]
+    best, chosen = found[0]
+    for other, way in found[1:]:
+        if explains_better(other.best, best.best):
+            best, chosen = other, way
+    return chosen, best

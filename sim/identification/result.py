@@ -1,0 +1,160 @@
+"""Result of an identification: motors with their intervals, as plain values and as actuators."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.checks.validate import choice, integer
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
+from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
+from batchpid.sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+
+
+class Fit(NamedTuple):
+    """Position errors along a simulated stretch of a log: measured less simulated positions [rad or m]."""
+
+    log: int
+    """Number of the log."""
+    time: Float64
+    """Times (rows,) [s]."""
+    fitted: NDArray[np.bool_]
+    """Rows that were fitted; the others were kept to judge (rows,)."""
+    before: Float64
+    """Of the robot as its description says (rows, joints)."""
+    after: Float64
+    """Of the robot as identified."""
+
+
+class Identification(NamedTuple):
+    """Motors that explain the logs, with their uncertainty."""
+
+    robot: Robot
+    joints: tuple[int, ...]
+    """Numbers of the joints that the logs hold."""
+    unknowns: Unknowns
+    estimate: Float64
+    """Point that was found (unknowns,)."""
+    uncertainty: Uncertainty
+    held_out_error: tuple[float, float]
+    """Root mean square of the position error [rad or m] on the part of the logs that was kept, of the robot as its
+    description says and as identified; inf if the simulation diverges."""
+    noise: Float64
+    """Root mean square of the residuals (joints,) [rad or m]."""
+    drive: Drive
+    """Control of the robot, as assumed or found."""
+    settings: dict[str, Any]
+    """Logs, options and versions, for the record."""
+    fits: tuple[Fit, ...]
+    """Errors along each stretch of the logs that was simulated."""
+
+    def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
+        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
+
+        ``kind`` is "armature", "damping", "friction", "strength" or "bias" of a ``joint``, by its number among
+        :attr:`joints`; or "delay", "stopping" or "payload", without joint.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The logs do not hold that joint, or there is no such unknown.
+        """
+        kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
+        if (kind in PER_JOINT) != (joint is not None):
+            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind in PER_JOINT else "leave it out"
+            raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
+        if joint is not None:
+            joint = integer("joint", joint, 0, len(self.joints) - 1)
+        index = self.unknowns.names.index((kind, joint))
+        if not self.uncertainty.identified[index]:
+            return None
+        value, half = self.estimate[index], INTERVAL * self.uncertainty.deviation[index]
+        low, high = self.unknowns.low[index], self.unknowns.high[index]
+        return float(value), float(max(value - half, low)), float(min(value + half, high))
+
+    @property
+    def not_identified(self) -> list[str]:
+        """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
+        of_joints, others = self.missing()
+        return [f"{joint}: {kind}" for joint, kinds in of_joints.items() for kind in kinds] + others
+
+    def missing(self) -> tuple[dict[str, list[str]], list[str]]:
+        """Return the kinds of unknowns that the logs do not identify, by joint, and the others: delay and payload."""
+        of_joints: dict[str, list[str]] = {}
+        others = []
+        for (kind, joint), known in zip(self.unknowns.names, self.uncertainty.identified, strict=True):
+            if not known and joint is not None:
+                of_joints.setdefault(self.robot.joint_names[self.joints[joint]], []).append(kind)
+            elif not known and kind != "stopping":
+                others.append(kind)
+        return of_joints, others
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write :meth:`actuators` to a .yaml or .json file, with the names of the logs and of unidentified values."""
+        of_joints, others = self.missing()
+        logged = {self.robot.joint_names[number] for number in self.joints}
+        own = zip(self.robot.joint_names, self.robot.independent, strict=True)
+        about = {
+            "identified_from": self.settings["logs"],
+            "held_out_error": self.document()["held_out_error"],
+            "not_identified_hence_ideal": of_joints | ({"all joints": others} if others else {}),
+            "not_in_the_logs_hence_ideal": [name for name, free in own if free and name not in logged],
+        }
+        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as plain values; what is not identified is [None, None, None]."""
+
+        def row(kind: str, joint: int | None = None) -> list[float | None]:
+            return list(self.interval(kind, joint) or (None, None, None))
+
+        document: dict[str, Any] = {
+            "joints": {
+                self.robot.joint_names[number]: {kind: row(kind, joint) for kind in PER_JOINT}
+                for joint, number in enumerate(self.joints)
+            },
+            "delay": row("delay"),
+        }
+        if ("payload", None) in self.unknowns.names:
+            document["payload"] = row("payload")
+        return document | {
+            "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
+            "not_identified": self.not_identified,
+            "singular_values": self.uncertainty.singular_values.tolist(),
+            "noise": self.noise.tolist(),
+            "compensation": "through the motors" if self.drive.through else self.drive.compensate,
+            "about": self.settings,
+        }
+
+    def actuators(self) -> bp.Actuators:
+        """Return the identified actuators of all joints; what was not identified, and other joints, are ideal.
+
+        Friction is that in addition to the robot's description, where that has less.
+        """
+        robot = self.robot
+        columns = {kind: np.zeros(robot.dof) for kind in PER_JOINT}
+        columns["strength"][:] = 1.0
+        columns["damping"][:], columns["friction"][:] = robot.damping, robot.friction
+        for joint, index in enumerate(self.joints):
+            for kind in PER_JOINT:
+                if (found := self.interval(kind, joint)) is not None:
+                    columns[kind][index] = found[0]
+        delay = self.interval("delay")
+        return bp.make_actuators(
+            robot.dof,
+            command_delay=0.0 if delay is None else delay[0],
+            strength=columns["strength"],
+            bias=columns["bias"],
+            coulomb=np.maximum(columns["friction"] - robot.friction, 0.0),
+            viscous=np.maximum(columns["damping"] - robot.damping, 0.0),
+            armature=columns["armature"],
+            joint_names=robot.joint_names,
+        )

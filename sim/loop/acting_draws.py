@@ -1,0 +1,51 @@
+"""Robots, params and actuators of a loop, changed by the draws of the randomization."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.draws import Draws
+from batchpid.sim.randomization.fields import PHYSICAL, elements, nominal_values
+
+
+def make_pack(options: RunnerOptions, scene: SceneSpec, size: int, first_env: int, draws: Draws | None) -> EnginePack:
+    """Return the pack of ``size`` envs; without ``draws`` the robots are those of the model."""
+    randomization, robot, packed = options.randomization, options.robot, options.scenes_per_system
+    make = options.load_engine().make_pack
+    if randomization is None or not randomization.changes_robot:
+        return make(scene, size, first_env, packed)
+    varied, links = variation(options, size, draws), elements("link_mass", robot)
+    return make(scene, size, first_env, packed, varied, randomization.carrier(robot), links)
+
+
+def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:
+    """Return the differences of ``size`` robots from the model."""
+    randomization, robot = options.randomization, options.robot
+    assert randomization is not None
+    values = {}
+    for name in PHYSICAL:
+        if name in randomization.given:
+            nominal = np.nan_to_num(nominal_values(name, robot), nan=1.0)  # an unknown mass can be scaled alone
+            rows = np.tile(nominal, (size, 1)) if draws is None else randomization.apply(name, nominal, draws, robot)
+            values[name] = rows / nominal if name == "link_mass" else rows
+    if "payload" in values:
+        values["payload"] = values["payload"][:, 0]
+    return Variation(**values)
+
+
+def acting_params(options: RunnerOptions, params: bp.PIDParams, draws: Draws | None) -> bp.PIDParams:
+    """Return ``params`` with the draws applied."""
+    randomization = options.randomization
+    return params if randomization is None else randomization.randomized_params(params, draws, options.robot)
+
+
+def acting_actuators(
+    options: RunnerOptions, actuators: bp.Actuators | None, draws: Draws | None
+) -> bp.Actuators | None:
+    """Return ``actuators`` with the draws applied."""
+    randomization = options.randomization
+    return actuators if randomization is None else randomization.randomized_actuators(actuators, draws, options.robot)

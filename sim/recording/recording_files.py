@@ -1,0 +1,316 @@
+"""Rollouts in files: written as a whole, or tick by tick by :class:`batchpid.sim.Recorder`, and read back.
+
+A file is .npz (NumPy) or .h5 (HDF5). Both hold the arrays of a :class:`batchpid.sim.Rollout` under their names, ticks
+first, and what is known of its :class:`batchpid.sim.RunInfo`: as further arrays in an .npz file, as attributes of an
+.h5 file. ``params``, ``versions`` and ``faults`` are JSON text. An .h5 file has checksums too: the attribute
+``checksum`` of all others, and the dataset ``checksum`` of each tick's rows (Fletcher-32 covers whole chunks, whose
+older rows a kill would lose).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.checks.validate import file_path, instance, integer
+from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
+from batchpid.io.files import write_atomically
+from batchpid.io.npz import read_npz
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.loop.faults import Fault
+from batchpid.sim.observation import RECORDED, Observation, Redraw, Rollout, RunInfo
+from batchpid.sim.recording.hdf5 import NOT_WRITTEN, read_hdf5
+
+if TYPE_CHECKING:
+    import h5py
+
+FORMAT = "batchpid-recording-1"
+HDF5 = (".h5", ".hdf5")
+_DRAW = "draw."  # in front of the names of draws
+_COMMAND_NAMES, _COMMAND_UNITS = "command_names", "command_units"
+CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
+DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
+"""Dtype of each array of a recording."""
+
+
+class RecordingError(BatchPIDError, OSError):
+    """A recording cannot be written or read; the message names the file and the cause."""
+
+
+def write_recording(
+    rollout: Rollout, path: str | os.PathLike[str], *, seed: int | None = None, overwrite: bool = False
+) -> Path:
+    """Write ``rollout`` to ``path`` as a whole or not at all, making its folder, and return the path.
+
+    Parameters
+    ----------
+    path
+        File to write, ending in .npz (compressed), .h5 or .hdf5.
+    seed
+        Seed of the run, kept in the recording; default that of ``rollout.info``.
+    overwrite
+        Whether an existing file is replaced.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The file exists already, or its name ends otherwise.
+    MissingDependencyError
+        h5py is not installed, which .h5 files need.
+    RecordingError
+        The file cannot be written.
+    """
+    instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
+    path = check_path(path, (".npz", *HDF5), overwrite=overwrite)
+    info = rollout.info if seed is None else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
+    h5py = None if path.suffix.lower() == ".npz" else load_h5py()
+
+    def write(file: Any) -> None:
+        if h5py is None:
+            tables: dict[str, Any] = rollout.arrays() | _attributes(info, rollout.num_envs, rollout.tick)
+            np.savez_compressed(file, **tables)
+            return
+        whole = io.BytesIO()  # HDF5 can crash the process after a write that failed
+        with h5py.File(whole, "w", libver="latest") as opened:
+            append_rows(create_datasets(opened, info, rollout.num_envs, rollout.tick), rollout.arrays())
+        file.write(whole.getbuffer())
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, write)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: int | None = None) -> Rollout:
+    """Read a recording: complete, cut short by a kill (``NAME.h5.partial``), or one that is still being written.
+
+    ``info.complete`` of the result says whether the run came to its end. The file may come from a stranger: nothing in
+    it is executed, no other file is opened, and checksums are verified.
+
+    Parameters
+    ----------
+    path
+        An .npz or .h5 file of any name.
+    every
+        Keep every n-th tick.
+    max_bytes
+        Largest size of the arrays in the file; default 1 GiB, or eight times the size of the file if that is more.
+
+    Raises
+    ------
+    RecordingError
+        The file is missing, damaged, too large, or no recording.
+    MissingDependencyError
+        h5py is not installed, which .h5 files need.
+    """
+    path, every = file_path("path", path), integer("every", every, 1, 10**9)
+    max_bytes = None if max_bytes is None else integer("max_bytes", max_bytes, 0, 2**63 - 1)
+    try:
+        if path.is_dir():
+            raise RecordingError(f"{path}: is a folder, not a recording")
+        if not path.is_file():
+            raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
+        limit = max(1 << 30, 8 * path.stat().st_size) if max_bytes is None else max_bytes
+        with path.open("rb") as file:
+            zipped = file.read(2) == b"PK"
+        if zipped:
+            attributes = read_npz(path, limit)
+            arrays = {name: attributes.pop(name)[::every] for name in DTYPES if name in attributes}
+        else:
+            load_h5py()
+            arrays, attributes = read_hdf5(path, ("checksum", *DTYPES), every, limit)
+        checksums = arrays.pop("checksum", None)
+        present = DTYPES.keys() & arrays.keys()
+        if "guarded" not in arrays and "qpos" in arrays:  # recorded before there were guards
+            arrays["guarded"] = np.zeros(arrays["qpos"].shape, bool)
+        if lacking := DTYPES.keys() - arrays:
+            raise ValueError(f"it does not hold {', '.join(sorted(lacking))}")
+        arrays = {name: arrays[name].astype(dtype, casting="same_kind", copy=False) for name, dtype in DTYPES.items()}
+        info = _info(attributes)
+        tick = float(attributes["tick"] if "tick" in attributes else attributes["timestep"] * attributes["substeps"])
+        _check(arrays, tick, info)
+        if checksums is not None and not np.array_equal(
+            checksums, row_checksums({name: rows for name, rows in arrays.items() if name in present})
+        ):
+            raise ValueError("its data are damaged: a checksum differs")
+    except (RecordingError, MissingDependencyError):
+        raise
+    except Exception as error:  # a damaged file can make the libraries raise anything
+        raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
+    time, setpoint, *seen = arrays.values()
+    return Rollout(time, setpoint, Observation(*seen), tick * every, info)
+
+
+def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overwrite: bool) -> Path:
+    """Return ``path`` if a recording can be written there.
+
+    Raises
+    ------
+    InvalidArgumentError
+        It ends in none of ``suffixes``, or the file exists and ``overwrite`` is False.
+    """
+    path = file_path("path", path, suffixes)
+    if os.path.lexists(path) and not overwrite:
+        raise InvalidArgumentError(
+            "path", "exists already", value=str(path), remedy="choose another name, or pass overwrite=True"
+        )
+    return path
+
+
+def load_h5py() -> Any:
+    """Return the package h5py; raise MissingDependencyError if it is not installed."""
+    try:
+        import h5py
+    except ImportError:
+        raise MissingDependencyError("h5py", "recording to HDF5", "record") from None
+    return h5py
+
+
+def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) -> dict[str, h5py.Dataset]:
+    """Write ``info`` to a new .h5 file, and return empty datasets that can grow: time and all of :data:`RECORDED`."""
+    for name, value in _attributes(info, num_envs, tick).items():
+        file.attrs[name] = value
+    datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan)}
+    datasets["time"].attrs["unit"] = ["s"]
+    for name, quantity in RECORDED.items():
+        row = info.row_shape(name, num_envs)
+        dtype = np.dtype(quantity.dtype)
+        rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * dtype.itemsize))
+        datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
+        if quantity.per_joint:
+            datasets[name].attrs["unit"] = list(info.units_of(name))
+    datasets["checksum"] = file.create_dataset(
+        "checksum", (0,), "i8", maxshape=(None,), chunks=(1024,), fillvalue=NOT_WRITTEN
+    )
+    return datasets
+
+
+def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Append ``arrays``, ticks first, to the datasets of their names; their checksums, which readers count, last."""
+    arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items()}
+    for name, rows in (arrays | {"checksum": row_checksums(arrays)}).items():
+        dataset = datasets[name]
+        done = len(dataset)
+        dataset.resize(done + len(rows), axis=0)
+        dataset[done:] = rows
+        dataset.flush()
+
+
+def row_checksums(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+    """Return the CRC-32 of each tick's rows of all ``arrays``, (ticks,)."""
+    sums = np.zeros(len(arrays["time"]), np.int64)
+    for tick, rows in enumerate(zip(*map(np.ascontiguousarray, arrays.values()), strict=True)):
+        for row in rows:
+            sums[tick] = zlib.crc32(row, sums[tick])
+    return sums
+
+
+def attribute_checksum(attributes: Mapping[str, Any]) -> int:
+    """Return the CRC-32 of all ``attributes`` but the checksum."""
+    values = {name: np.asarray(value).tolist() for name, value in attributes.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
+
+
+def faults_text(faults: Iterable[Fault]) -> str:
+    """Return ``faults`` as the JSON text that a recording holds."""
+    return json.dumps([fault._asdict() for fault in faults])
+
+
+def redraws_text(redraws: Iterable[Redraw]) -> str:
+    """Return ``redraws`` as the JSON text that a recording holds."""
+    return json.dumps([list(redraw) for redraw in redraws])
+
+
+def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
+    """Return what is known of a run as numbers, texts, and arrays of them."""
+    known = {name: value for name, value in vars(info).items() if value is not None}
+    known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
+    if (command := known.pop("own_command", None)) is not None:
+        known |= {_COMMAND_NAMES: list(command.names), _COMMAND_UNITS: list(command.units)}
+    if info.params is not None:
+        known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
+    if info.actuators is not None:
+        known["actuators"] = bp.actuators.dumps_actuators(info.actuators, info.joint_names, format="json")
+    for name in ("versions", "randomization"):
+        if name in known:
+            known[name] = json.dumps(dict(known[name]))
+    known["redraws"] = redraws_text(info.redraws)
+    known |= {f"{_DRAW}{name}": rows for name, rows in known.pop("draws", {}).items()}
+    known |= {"format": FORMAT, "num_envs": num_envs, "tick": tick}
+    return known | {"checksum": attribute_checksum(known)}
+
+
+def _info(attributes: Mapping[str, Any]) -> RunInfo:
+    """Return what the attributes of a recording say of its run."""
+    if (found := str(attributes.get("format", FORMAT))) != FORMAT:
+        raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
+    known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}
+    if lacking := [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]:
+        raise ValueError(f"it does not say its {', '.join(lacking)}")
+    if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
+        raise ValueError("its attributes are damaged: the checksum differs")
+    names = tuple(map(str, known["joint_names"]))
+    texts = ("robot", "urdf", "dissipation", "control", "compensate", "physics", "begun")
+    decode: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(texts, str),
+        **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
+        **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
+        "timestep": float,
+        "substeps": int,
+        **dict.fromkeys(("complete", "merge_fixed", "collisions", "ground"), bool),
+        "params": lambda text: bp.loads_params(str(text), names)[0],
+        "actuators": lambda text: bp.actuators.loads_actuators(str(text), names)[0],
+        "seed": lambda value: None if str(value) == "none" else int(value),
+        **dict.fromkeys(("versions", "randomization"), lambda text: dict(json.loads(str(text)))),
+        "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),
+        "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
+    }
+    for name in ("units", "lower", "upper", "effort_limit"):
+        if np.shape(known[name]) != (len(names),):
+            raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
+    draws = {name.removeprefix(_DRAW): _numbers(rows) for name, rows in attributes.items() if name.startswith(_DRAW)}
+    command = None
+    if _COMMAND_NAMES in attributes:
+        command = CommandSpec(attributes[_COMMAND_NAMES].tolist(), attributes[_COMMAND_UNITS].tolist())
+    return RunInfo(
+        **{name: decode[name](value) for name, value in known.items()},
+        draws=draws or None,
+        own_command=command,
+    )
+
+
+def _numbers(value: NDArray[Any]) -> NDArray[Any]:
+    if value.dtype.kind not in "iuf":
+        raise ValueError(f"it has {value.dtype} where numbers belong")
+    return value
+
+
+def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> None:
+    """Check that shapes agree and times are numbers."""
+    ticks, dof = len(arrays["time"]), len(info.joint_names)
+    envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0
+    shapes = {name: (ticks, *info.row_shape(name, envs)) for name in RECORDED}
+    for name, shape in ({"time": (ticks,)} | shapes).items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"its {name} has shape {arrays[name].shape}, not {shape}")
+    if not (0 < tick < np.inf and np.isfinite(arrays["time"]).all()):
+        raise ValueError("its times are not finite")
+    if info.start is not None and info.start.shape != (envs, dof):
+        raise ValueError(f"its start has shape {info.start.shape}, not {(envs, dof)}")
+    if info.episodes is not None and info.episodes.shape != (envs, 2):
+        raise ValueError(f"its episodes have shape {info.episodes.shape}, not {(envs, 2)}")
+    for name, rows in (info.draws or {}).items():
+        if rows.ndim != 2 or len(rows) != envs:
+            raise ValueError(f"its draws of {name} have shape {rows.shape}, not one row for each of {envs} envs")

@@ -1,0 +1,84 @@
+"""Actuators of a robot: checked against its joints and the control."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid as bp
+from batchpid.checks.validate import instance
+from batchpid.errors import InvalidArgumentError
+from batchpid.motors import JOINT_SIDE, check_actuators
+from batchpid.sim.robot.description import RobotDescription
+
+FRICTION_SHARE = 0.8
+"""Share of the robot's own actuators' Coulomb friction that is compensated.
+
+Friction that is compensated by more than there is lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust
+control for servo-mechanisms under inexact friction compensation", Automatica 29, 1993), and figures from a log are
+inexact, other than those of a description, by which the joint is simulated.
+"""
+
+
+class KnownJoints(NamedTuple):
+    """Joints as a controller knows them, in addition to the robot's description, (dof,)."""
+
+    coulomb: NDArray[np.float64]
+    """Coulomb friction to compensate [N m or N]."""
+    viscous: NDArray[np.float64]
+    """Viscous damping [N m s/rad or N s/m]."""
+    armature: NDArray[np.float64]
+    """Reflected inertia of the motors [kg m^2 or kg]."""
+
+
+def known_joints(robot: RobotDescription) -> KnownJoints:
+    """Return friction, damping and armature of the robot's own actuators, which its controller knows."""
+    own = bp.Actuators() if robot.actuators is None else robot.actuators
+    coulomb, viscous, armature = (
+        np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
+        for leaf in (own.coulomb, own.viscous, own.armature)
+    )
+    return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
+
+
+def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescription) -> bp.Actuators:
+    """Return actuators of ``robot``, given or in a file.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not fit the robot, or the file cannot be read.
+    FileNotFoundError
+        The file does not exist.
+    """
+    if isinstance(source, str | Path):
+        source, _ = bp.load_actuators(source, robot.joint_names)
+    return fit_actuators(source, robot, 1, "pid")
+
+
+def fit_actuators(actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object) -> bp.Actuators:
+    """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
+
+    Followers have no motor: their bias, friction and armature are left out.
+
+    Raises
+    ------
+    InvalidArgumentError
+        They do not fit.
+    """
+    instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
+    check_actuators(actuators, num_envs, robot.joint_names)
+    if control == "drive" and (actuators.measures or actuators.delivers):
+        raise InvalidArgumentError(
+            "actuators",
+            "act on efforts and measurements, and PhysX's drives bypass both",
+            remedy=f"use control 'pid', or leave only {', '.join(JOINT_SIDE)}",
+        )
+    if actuators.num_joints is None:
+        return actuators
+    own = {name: getattr(actuators, name) for name in ("bias", *JOINT_SIDE)}
+    own = {name: leaf * robot.independent for name, leaf in own.items() if leaf is not None}
+    return actuators.replace(**own, continuous=robot.continuous)

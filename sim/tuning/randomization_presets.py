@@ -1,0 +1,103 @@
+"""Randomization for evaluation and search: presets, files, and payloads that the robot can carry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.checks.validate import file_path, number
+from batchpid.errors import InvalidArgumentError
+from batchpid.io import documents
+from batchpid.motors import JOINT_SIDE
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.checks import check_robot
+from batchpid.sim.randomization.distributions import Uniform
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
+
+GRAVITY = 9.81
+ENCODER = 2 * np.pi / 2**18
+"""Resolution of an 18-bit encoder [rad]."""
+PAYLOAD_SHARE = 0.5
+"""Share that a payload may take of the effort that the robot's own weight leaves."""
+PAYLOAD = 0.5
+"""Largest payload of the presets [kg]; less where the robot cannot carry it."""
+PRESETS: dict[str, dict[str, Any]] = {
+    "payload": {},
+    "model": {
+        "link_mass": Uniform(0.9, 1.1, operation="scale"),
+        "friction": Uniform(0.5, 1.5, operation="scale", shared=True),
+        "damping": Uniform(0.5, 1.5, operation="scale", shared=True),
+    },
+}
+"""Fields of the presets, in addition to the payload."""
+
+
+def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomization:
+    """Return a preset for ``robot``, or the randomization in a YAML or JSON file; without a seed there, with ``seed``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such preset or file, or it does not fit the robot.
+    """
+    if name in PRESETS:
+        payload = Uniform(0, min(PAYLOAD, payload_capacity(robot)))
+        return Randomization(seed=seed, payload=payload, **PRESETS[str(name)])
+    path = file_path("randomize", name)
+    if path.suffix.lower() not in documents.SUFFIXES or not path.exists():
+        raise InvalidArgumentError(
+            "randomize",
+            "is neither a preset nor a file",
+            value=str(name),
+            remedy=f"use a .yaml or .json file, or {' or '.join(PRESETS)}",
+        )
+    known = documents.read(path)
+    known = {"seed": seed, **known} if isinstance(known, dict) else known
+    randomization = Randomization.from_dict(known)
+    check_robot(randomization, robot)
+    return randomization
+
+
+def usual_variation(
+    robot: Robot, payload: float = 2.0, friction: float = 0.1, timestep: float = RunnerOptions.timestep
+) -> tuple[Randomization, bp.Actuators]:
+    """Return the robots of ``--variation``: payload and friction drawn uniformly, 18-bit sensors, efforts a step late.
+
+    Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; friction from 0 to
+    ``friction`` [N m or N], added to all joints alike. Raises InvalidArgumentError for a number out of range.
+    """
+    payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "N m or N")
+    drawn = Randomization(
+        payload=Uniform(0, min(payload, payload_capacity(robot))), friction=Uniform(0, friction, shared=True)
+    )
+    return drawn, bp.make_actuators(robot.dof, command_delay=timestep, position_resolution=ENCODER)
+
+
+def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:
+    """Return ``randomization`` with ``seed`` added to its own, for other draws."""
+    return None if randomization is None else replace(randomization, seed=randomization.seed + seed)
+
+
+def at_the_joints(randomization: Randomization | None) -> Randomization | None:
+    """Return ``randomization`` with the fields of actuators that act on PhysX's drives, too: friction and inertia."""
+    if randomization is None:
+        return None
+    fields = {name: each for name, each in randomization.actuators.items() if name in JOINT_SIDE}
+    return replace(randomization, actuators=fields)
+
+
+def payload_capacity(robot: Robot) -> float:
+    """Return the payload [kg] that the robot holds in 95 % of seeded poses with half of the effort it has left."""
+    kinematics, qpos = Kinematics(robot), robot.sample(200, seed=0)
+    own = np.abs(robot.holding_efforts(qpos))
+    per_kg = kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY])
+    per_kg = np.abs(per_kg if robot.coupling is None else robot.coupling.efforts(per_kg))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.design_effort_limit - own) / per_kg, np.inf)
+    return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))

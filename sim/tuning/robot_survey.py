@@ -1,0 +1,270 @@
+"""Survey of robots: each URDF loaded, built and moved under designed gains, in a process to itself.
+
+A robot that crashes the engine ends its own process only, and the survey says in which stage that was. The moves are
+those of :func:`batchpid.sim.tuning.moves.random_moves`, the gains those of :func:`batchpid.design_gains` per mass
+matrix.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree
+
+from batchpid.checks.validate import integer, number
+from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.sim.robot.parts import MOVING_TYPES
+from batchpid.sim.robot.xml import SIZE_LIMIT
+from batchpid.sim.workers.worker import ONE_THREAD
+
+STAGES = ("reading the URDF", "building it in the engine", "checking it", "drawing moves", "moving it")
+"""Stages of a survey of one robot, named in :attr:`RobotReport.error`."""
+_PROGRAM = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from batchpid.sim.tuning.robot_survey import main; main()"
+)
+
+
+@dataclass(frozen=True)
+class RobotReport:
+    """Outcome of a survey for one URDF; None where a stage was not reached.
+
+    Attributes
+    ----------
+    urdf
+        Path of the file.
+    dof
+        Number of joints that move, as far as the file tells if it does not load.
+    loads
+        Whether the engine built the robot.
+    findings
+        Codes of the preflight's findings, repairs included, each once.
+    moves, settled
+        Number of moves that were drawn, and of those that every joint ended: within 2 % of the move for good, and
+        within 1e-3 rad or m of the setpoint over the last tenth of the time.
+    worst_error
+        Largest such error at the end of a move [rad or m].
+    worst_overshoot
+        Largest overshoot, as a fraction of the joint's move.
+    seconds
+        Wall-clock time of the survey of this robot [s].
+    error
+        One sentence; None for a robot that got through all stages.
+    """
+
+    urdf: str
+    dof: int | None = None
+    loads: bool = False
+    findings: tuple[str, ...] = ()
+    moves: int = 0
+    settled: int = 0
+    worst_error: float | None = None
+    worst_overshoot: float | None = None
+    seconds: float = 0.0
+    error: str | None = None
+
+    def asdict(self) -> dict[str, Any]:
+        """Return the fields as JSON takes them."""
+        return asdict(self) | {"findings": list(self.findings)}
+
+
+def find_urdfs(paths: Sequence[Path]) -> list[Path]:
+    """Return the files among ``paths``, and the files ``*.urdf`` in the folders among them and below, each once.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A path does not exist, or there is no URDF at all.
+    """
+    found: dict[Path, None] = {}
+    for path in paths:
+        if path.is_dir():
+            found |= dict.fromkeys(sorted(path.rglob("*.urdf")))
+        elif path.is_file():
+            found[path] = None
+        else:
+            raise InvalidArgumentError("paths", "must be files or folders", value=str(path), remedy="check the path")
+    if not found:
+        raise InvalidArgumentError("paths", "hold no file *.urdf", value=", ".join(map(str, paths)), remedy="add one")
+    return list(found)
+
+
+def survey(
+    urdfs: Sequence[Path],
+    *,
+    moves: int = 8,
+    seed: int = 0,
+    seconds: float = 2.0,
+    bandwidth_hz: float = 2.0,
+    physics: str = "accurate",
+    dissipation: str = "urdf",
+    time_limit: float = 300.0,
+    processes: int = 1,
+) -> Iterator[RobotReport]:
+    """Yield a report for each of ``urdfs``, in their order; ``processes`` robots are surveyed at a time.
+
+    Parameters
+    ----------
+    moves, seed
+        Number of moves of each robot, and their seed.
+    seconds
+        Simulated time of a move [s].
+    bandwidth_hz
+        Of the designed gains [Hz].
+    physics, dissipation
+        Options of :class:`batchpid.sim.Runner` and :meth:`batchpid.sim.Robot.load`.
+    time_limit
+        Seconds after which the process of a robot is ended [s].
+
+    Raises
+    ------
+    InvalidArgumentError
+        A number out of range.
+    """
+    number("time_limit", time_limit, 1.0, 1e6, "s")
+    options = {
+        "moves": integer("moves", moves, 1, 1000),
+        "seed": integer("seed", seed, 0, 2**31 - 1),
+        "seconds": number("seconds", seconds, 0.05, 600.0, "s"),
+        "bandwidth_hz": number("bandwidth_hz", bandwidth_hz, 1e-3, 100.0, "Hz"),
+        "physics": physics,
+        "dissipation": dissipation,
+    }
+    running: set[subprocess.Popen[str]] = set()
+    stop = threading.Event()
+    pool = ThreadPoolExecutor(integer("processes", processes, 1, 1024))
+    try:
+        yield from pool.map(lambda urdf: _in_a_process(urdf, options, time_limit, running, stop), urdfs)
+    finally:
+        stop.set()
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in list(running):
+            child.kill()
+
+
+def _in_a_process(
+    urdf: Path,
+    options: dict[str, Any],
+    time_limit: float,
+    running: set[subprocess.Popen[str]],
+    stop: threading.Event,
+) -> RobotReport:
+    """Return the report on ``urdf`` that a process makes; a process that crashes is an error of its robot."""
+    began, report, stage = time.monotonic(), RobotReport(str(urdf)), STAGES[0]
+    child = subprocess.Popen(
+        [sys.executable, "-P", "-c", _PROGRAM, json.dumps(sys.path), json.dumps([str(urdf), options])],
+        stdin=subprocess.PIPE,  # its end is the parent's
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=os.environ | ONE_THREAD,
+    )
+    running.add(child)
+    if stop.is_set():  # while the process was started
+        child.kill()
+    timer = threading.Timer(time_limit, child.kill)
+    timer.start()
+    try:
+        assert child.stdout is not None
+        for line in child.stdout:
+            fields = json.loads(line)
+            report = replace(report, **{key: fields[key] for key in fields if key != "stage"})
+            stage = fields.get("stage", "surveying it")
+        status = child.wait()
+    finally:
+        timer.cancel()
+        child.kill()
+        child.communicate()
+        running.discard(child)
+    if status:
+        late = time.monotonic() - began >= time_limit
+        ended = f"more than {time_limit:g} s" if late else _exit_text(status)
+        report = replace(report, error=f"{stage}: {ended}")
+    return replace(report, findings=tuple(report.findings), seconds=round(time.monotonic() - began, 2))
+
+
+def _exit_text(status: int) -> str:
+    return f"the process ended by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+
+
+def main() -> None:
+    """Survey the robot named on the command line; print what is known of it, as a line of JSON after each stage."""
+    urdf, options = json.loads(sys.argv[2])
+    out, stage = os.fdopen(os.dup(1), "w"), STAGES[0]
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # SAPIEN prints
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+    def tell(**fields: Any) -> None:
+        print(json.dumps({"stage": stage} | fields), file=out, flush=True)
+
+    tell()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for stage, fields in _stages(Path(urdf), **options):  # noqa: B007
+                tell(**fields)
+    except BatchPIDError as error:
+        tell(error=f"{stage}: {str(error).removeprefix(f'{Path(urdf).absolute()}: ')}")
+    except Exception as error:
+        tell(error=f"{stage}: {type(error).__name__}: {error}")
+    out.flush()
+    os._exit(0)  # freeing a robot that SAPIEN could not build may crash
+
+
+def _stages(
+    urdf: Path, moves: int, seed: int, seconds: float, bandwidth_hz: float, physics: str, dissipation: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield each stage of the survey as it begins, with the fields of the report that the one before found."""
+    import batchpid as bp
+    from batchpid.sim.robot.robot import Robot
+    from batchpid.sim.tuning.evaluation import MAX_ERROR, evaluate_gains
+    from batchpid.sim.tuning.moves import random_moves
+
+    yield STAGES[0], {"dof": _count_joints(urdf)}
+    robot = Robot.load(urdf, dissipation=dissipation)
+    yield STAGES[1], {"dof": robot.dof}
+    robot.dynamics()
+    yield STAGES[2], {"loads": True}
+    findings = robot.check()
+    yield STAGES[3], {"findings": list(dict.fromkeys(finding.code for finding in findings))}
+    drawn = random_moves(robot, moves, seed)
+    yield STAGES[4], {"moves": len(drawn.start)}
+    params = bp.design_gains(robot, bandwidth_hz, gain_units="mass_matrix")
+    metrics = evaluate_gains(robot, params, drawn, seconds=seconds, physics=physics, workers=0).metrics
+    error = np.nan_to_num(metrics.steady_state_error, nan=0.0, posinf=np.inf)
+    done = ((error <= MAX_ERROR) & ~np.isinf(metrics.settling_time)).all(1)
+    finite = np.isfinite(error).all()
+    yield (
+        STAGES[4],
+        {
+            "settled": int(done.sum()),
+            "worst_error": float(error.max()) if finite else None,
+            "worst_overshoot": float(np.nanmax(metrics.overshoot, initial=0.0)) if finite else None,
+            "error": None if finite else f"{STAGES[4]}: it diverged",
+        },
+    )
+
+
+def _count_joints(urdf: Path) -> int | None:
+    """Return the number of moving joints that a file names, readable as a URDF or not; None if it is no XML."""
+    root = etree.fromstring(urdf.read_bytes()[:SIZE_LIMIT], etree.XMLParser(recover=True, resolve_entities=False))
+    if root is None:
+        return None
+    return sum(joint.get("type") in MOVING_TYPES and joint.find("child") is not None for joint in root.iter("joint"))
+
+
+def _end_with_the_parent() -> None:
+    sys.stdin.read()
+    os._exit(1)
