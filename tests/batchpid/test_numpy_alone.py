@@ -36,9 +36,12 @@ def test_the_example_of_the_readme_needs_numpy_alone():
 def test_every_module_but_the_backends_of_jax_can_be_imported_with_numpy_alone():
     run(
         "import importlib, pkgutil, batchpid\n"
-        "for module in pkgutil.iter_modules(batchpid.__path__):\n"
-        "    if module.name not in ('__main__', 'blocks'):\n"
-        "        importlib.import_module(f'batchpid.{module.name}')\n"
+        "def load(package):\n"
+        "    for module in pkgutil.iter_modules(package.__path__):\n"
+        "        if module.name not in ('__main__', 'blocks', 'sim', 'assets', '_program'):\n"
+        "            loaded = importlib.import_module(f'{package.__name__}.{module.name}')\n"
+        "            load(loaded) if module.ispkg else None\n"
+        "load(batchpid)\n"
     )
 
 
