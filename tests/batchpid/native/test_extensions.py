@@ -82,8 +82,8 @@ def test_the_sources_are_all_that_are_included(name):
     while pending:
         file = pending.pop()
         included.add(file)
-        for found in re.findall(r'#include "(.*)"', file.read_text()):
-            pending.append(((ROOT if found.startswith("batchpid/") else file.parent) / found).resolve())
+        found = re.findall(r'#include "(.*)"', file.read_text())
+        pending += [((ROOT if each.startswith("batchpid/") else file.parent) / each).resolve() for each in found]
     assert included == {(ROOT / file).resolve() for file in ALL[name].files}
 
 
