@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from threading import Timer
 from typing import Any
 
 import tyro
@@ -95,7 +96,19 @@ def _run(arguments: list[str]) -> int:
             importlib.import_module(name)
         if signal.getsignal(signal.SIGINT) is exit_at_once:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        return command.run() or 0
+        sys.unraisablehook = _interrupt_again
+        try:
+            return command.run() or 0
+        finally:
+            sys.unraisablehook = sys.__unraisablehook__
+
+
+def _interrupt_again(unraisable: Any) -> None:
+    """Repeat a Ctrl-C that came in a destructor, where Python prints its KeyboardInterrupt and goes on."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def parse(arguments: Sequence[str]) -> Any:

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -136,6 +137,19 @@ def test_a_bug_keeps_its_traceback(stub, monkeypatch):
     monkeypatch.setattr(stub, "failure", ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         cli.main(["stub"])
+
+
+def test_ctrl_c_in_a_destructor_ends_the_command(batchpid, stub, monkeypatch):
+    class Interrupted:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    def run(self):
+        Interrupted()
+        time.sleep(60)
+
+    monkeypatch.setattr(stub, "run", run)
+    assert batchpid("stub") == (130, "", "batchpid: interrupted\n")
 
 
 def test_warnings_are_one_line(batchpid, stub, monkeypatch):
