@@ -30,7 +30,7 @@ startup.prepare()
 __version__ = "0.1.0"
 """Version of the package; pyproject.toml reads it here."""
 
-from batchpid import motors as actuators
+from batchpid import motors
 from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.gains import presets
@@ -57,7 +57,6 @@ __all__ = [
     "PIDParams",
     "PIDState",
     "Terms",
-    "actuators",
     "advance",
     "design_gains",
     "discretise",
@@ -71,6 +70,7 @@ __all__ = [
     "make_actuators",
     "make_guard",
     "make_params",
+    "motors",
     "presets",
     "reset",
     "save_actuators",

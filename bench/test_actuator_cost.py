@@ -75,7 +75,7 @@ def test_all_effects(benchmark, most):
     qpos, qvel, effort = np.random.default_rng(0).uniform(0.1, 1.0, (3, ENVS, JOINTS))
     steps = int(min(STEPS, most.ticks))
     actuators = bp.make_actuators(JOINTS, **EFFECTS)
-    start = bp.actuators.init(actuators, qpos, 1 / 2000)
+    start = bp.motors.init(actuators, qpos, 1 / 2000)
     k = discretise(actuators, start, 1 / 2000, ENVS)
     stages, noise = compiled_stages(k, qpos.shape), NoiseBlocks()
 

@@ -3,9 +3,9 @@
 Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and :func:`measure`::
 
     actuators = bp.make_actuators(joints=7, command_delay=0.005, strength=0.9)
-    state = bp.actuators.init(actuators, qpos, dt)
-    state, measured, rate = bp.actuators.measure(actuators, state, qpos, qvel, dt)
-    state, effort = bp.actuators.deliver(actuators, state, effort, qpos, qvel, dt)
+    state = bp.motors.init(actuators, qpos, dt)
+    state, measured, rate = bp.motors.measure(actuators, state, qpos, qvel, dt)
+    state, effort = bp.motors.deliver(actuators, state, effort, qpos, qvel, dt)
 
 See docs/actuators.md.
 """

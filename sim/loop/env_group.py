@@ -315,7 +315,7 @@ class EnvGroup:
                 holding = layout.coupling.efforts(holding)
             qvel = pack.read_qvel()
             fresh = init_motors(self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding)
-            motors = bp.actuators.reset(state.motors, fresh, mask)
+            motors = bp.motors.reset(state.motors, fresh, mask)
             state = state._replace(motors=motors)
             model = layout.model
             noise = model.noise(self._constants.motors, motors, qpos)

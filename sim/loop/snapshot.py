@@ -274,7 +274,7 @@ def initial_actuators(
     if actuators is None or not (actuators.measures or actuators.delivers):
         return {}
     longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))
-    state = bp.actuators.init(longest, np.zeros((1, dof)), timestep).leaves()
+    state = bp.motors.init(longest, np.zeros((1, dof)), timestep).leaves()
     state[EPISODE] = np.zeros(1, np.int64)
     return {name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()}
 

@@ -79,4 +79,4 @@ def init_motors(
 ) -> ActuatorState:
     """Return the state of actuators that start at ``qpos``: :func:`batchpid.motors.init`."""
     envs = np.arange(pack.first_env, pack.first_env + pack.size)
-    return bp.actuators.init(actuators, qpos, pack.spec.timestep, envs=envs, episode=episode, **since)
+    return bp.motors.init(actuators, qpos, pack.spec.timestep, envs=envs, episode=episode, **since)

@@ -242,7 +242,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     if info.params is not None:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
     if info.actuators is not None:
-        known["actuators"] = bp.actuators.dumps_actuators(info.actuators, info.joint_names, format="json")
+        known["actuators"] = bp.motors.dumps_actuators(info.actuators, info.joint_names, format="json")
     for name in ("versions", "randomization"):
         if name in known:
             known[name] = json.dumps(dict(known[name]))
@@ -271,7 +271,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         "substeps": int,
         **dict.fromkeys(("complete", "merge_fixed", "collisions", "ground"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
-        "actuators": lambda text: bp.actuators.loads_actuators(str(text), names)[0],
+        "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
         **dict.fromkeys(("versions", "randomization"), lambda text: dict(json.loads(str(text)))),
         "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),

@@ -45,10 +45,10 @@ def test_a_neutral_value_is_off():
     assert not actuators.measures
     assert not actuators.delivers
     q = np.zeros((3, 2))
-    state = bp.actuators.init(actuators, q, DT)
+    state = bp.motors.init(actuators, q, DT)
     assert state.leaves() == {}
     effort = np.ones((3, 2))
-    assert bp.actuators.deliver(actuators, state, effort, q, q, DT)[1] is effort
+    assert bp.motors.deliver(actuators, state, effort, q, q, DT)[1] is effort
 
 
 def test_replace_and_parts():
@@ -66,15 +66,15 @@ def test_replace_and_parts():
 def test_a_longer_delay_in_flight_keeps_the_history():
     short, long = (bp.make_actuators(1, command_delay=steps * DT) for steps in (2, 4))
     q = np.zeros((1, 1))
-    state = bp.actuators.init(short, q, DT)
+    state = bp.motors.init(short, q, DT)
     for step in range(6):
-        state, effort = bp.actuators.deliver(short, state, q + step, q, q, DT)
+        state, effort = bp.motors.deliver(short, state, q + step, q, q, DT)
     assert effort == 3.0
-    state = state.matched_to(bp.actuators.init(long, q, DT))
-    state, effort = bp.actuators.deliver(long, state, q + 6, q, q, DT)
+    state = state.matched_to(bp.motors.init(long, q, DT))
+    state, effort = bp.motors.deliver(long, state, q + 6, q, q, DT)
     assert effort == 2.0, "the oldest that is known"
     for step in range(7, 12):
-        state, effort = bp.actuators.deliver(long, state, q + step, q, q, DT)
+        state, effort = bp.motors.deliver(long, state, q + step, q, q, DT)
     assert effort == 7.0
 
 
@@ -82,13 +82,13 @@ def test_a_history_that_is_long_enough_from_the_start_knows_everything():
     short = bp.make_actuators(1, command_delay=2 * DT, max_delay=4 * DT)
     long = short.replace(command_delay=4 * DT)
     q = np.zeros((1, 1))
-    state = bp.actuators.init(short, q, DT)
+    state = bp.motors.init(short, q, DT)
     for step in range(6):
-        state, _ = bp.actuators.deliver(short, state, q + step, q, q, DT)
-    assert bp.actuators.deliver(long, state, q + 6, q, q, DT)[1] == 2.0
+        state, _ = bp.motors.deliver(short, state, q + step, q, q, DT)
+    assert bp.motors.deliver(long, state, q + 6, q, q, DT)[1] == 2.0
     assert float(short.replace(command_delay=0.5, max_delay=None).max_delay[0, 0]) == 0.5
 
 
 def test_a_time_step_far_shorter_than_the_delay_is_refused():
     with pytest.raises(InvalidArgumentError, match="needs 1000002 samples"):
-        bp.actuators.init(bp.make_actuators(1, command_delay=1.0), np.zeros((1, 1)), 1e-6)
+        bp.motors.init(bp.make_actuators(1, command_delay=1.0), np.zeros((1, 1)), 1e-6)

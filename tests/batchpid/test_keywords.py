@@ -17,7 +17,7 @@ ACTUATORS = bp.make_actuators(2, lag=0.01)
         lambda: bp.presets.tutorial(2, efort_limit=3.0),
         lambda: bp.make_actuators(2, efort_limit=3.0),
         lambda: ACTUATORS.replace(efort_limit=3.0),
-        lambda: bp.actuators.presets.remotized(2, [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]], efort_limit=3.0),
+        lambda: bp.motors.presets.remotized(2, [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]], efort_limit=3.0),
     ],
 )
 def test_an_unknown_option_is_named_with_the_nearest(call):

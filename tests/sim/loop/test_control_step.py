@@ -67,7 +67,7 @@ def a_step(control, units, effects, seed, coupled=False):
         motors = bp.make_actuators(
             JOINTS, command_delay=2.5e-3, lag=0.01, strength=0.9, backlash=1e-3, effort_limit=9.0
         )
-        started = bp.actuators.init(motors, qpos, DT)
+        started = bp.motors.init(motors, qpos, DT)
         layout = layout._replace(measures=motors.measures)
         constants = constants._replace(motors=discretise(motors, started, DT, ENVS))
         state = state._replace(motors=started)

@@ -54,7 +54,7 @@ def built(names, rng):
 def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
     rng = np.random.default_rng(seed)
     actuators = built(names, np.random.default_rng(seed))
-    first = bp.actuators.init(actuators, rng.normal(size=SHAPE), DT)
+    first = bp.motors.init(actuators, rng.normal(size=SHAPE), DT)
     k = discretise(actuators, first, DT, SHAPE[0])
     both = {compiled_stages(k, SHAPE): first, STAGES: first}
     for _ in range(12):
@@ -76,7 +76,7 @@ def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
 def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
     qpos = np.zeros(SHAPE)
     many = built(EFFECTS.keys() - {"position_limit"}, np.random.default_rng(0))
-    state = bp.actuators.init(many, qpos, DT)
+    state = bp.motors.init(many, qpos, DT)
     k = discretise(many, state, DT, SHAPE[0])
     for stage, inputs in (("delivered", 4), ("limits", 2), ("play", 3)):
         assert stage_program._program(getattr(STAGES, stage), k, SHAPE, (False,) * inputs) is not None, stage
@@ -88,5 +88,5 @@ def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
 def test_without_the_extension_stages_are_numpys(monkeypatch):
     monkeypatch.setenv(native.SWITCH, "0")
     actuators = bp.make_actuators(SHAPE[1], strength=0.5)
-    k = discretise(actuators, bp.actuators.init(actuators, np.zeros(SHAPE), DT), DT, SHAPE[0])
+    k = discretise(actuators, bp.motors.init(actuators, np.zeros(SHAPE), DT), DT, SHAPE[0])
     assert compiled_stages(k, SHAPE) is STAGES
