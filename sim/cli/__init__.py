@@ -26,6 +26,7 @@ from batchpid.sim.cli.bench import BenchCommand
 from batchpid.sim.cli.compare import CompareCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
+from batchpid.sim.cli.export import ExportCommand
 from batchpid.sim.cli.identify import IdentifyCommand
 from batchpid.sim.cli.inspect import InspectCommand
 from batchpid.sim.cli.plot import PlotCommand
@@ -45,6 +46,7 @@ COMMANDS: dict[str, type[Any]] = {
     "compare": CompareCommand,
     "excite": ExciteCommand,
     "identify": IdentifyCommand,
+    "export": ExportCommand,
     "inspect": InspectCommand,
     "survey": SurveyCommand,
     "plot": PlotCommand,

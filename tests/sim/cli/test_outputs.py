@@ -23,6 +23,7 @@ WORDS = {
     "tune": ("tune", "arm.urdf"),
     "compare": ("compare", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
+    "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.npz"),
     "survey": ("survey", "arm.urdf"),
     "plot": ("plot", "run.npz"),
@@ -30,7 +31,7 @@ WORDS = {
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
-OUT = {"rollout": ".npz", "bench": ".json", "excite": ".csv", "survey": ".md", "render": ".mp4"}
+OUT = {"rollout": ".npz", "bench": ".json", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
 
 
 def output_flags() -> list[tuple[str, str]]:

@@ -1,0 +1,41 @@
+"""``batchpid export``: gains as files for other programs."""
+
+from __future__ import annotations
+
+import pytest
+from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
+
+from batchpid.export import to_c
+from batchpid.sim import Robot
+
+MIMIC = joint("b", "y", "z", "revolute", LIMIT + '<mimic joint="a" multiplier="0.5"/>')
+
+
+def test_the_header_is_that_of_the_function(batchpid, tmp_path):
+    out = tmp_path / "panda.h"
+    words = ("export", "panda", "--gains", "tuned", "--timestep", 0.001, "--limits", "--prefix", "arm", "--out", out)
+    status, said, _ = batchpid(*words)
+    panda = Robot.load("panda")
+    exported = to_c(panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm")
+    assert (status, out.read_text()) == (0, exported.text)
+    assert said == f"written: {out}: tuned gains of 9 joints at 1000 Hz\n"
+
+
+def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
+    names = ("x", "y", "z")
+    path = write(
+        tmp_path, robot(*(link(name, INERTIAL) for name in names), joint("a", "x", "y", "revolute", LIMIT), MIMIC)
+    )
+    status, said, _ = batchpid("export", path, "--out", tmp_path / "arm.h")
+    assert status == 0
+    assert said.startswith("differs: b: followers are joints of their own")
+    status, _, complaint = batchpid("export", path, "--out", tmp_path / "strict.h", "--strict")
+    assert status == 2
+    assert "followers" in complaint
+    assert not (tmp_path / "strict.h").exists()
+
+
+@pytest.mark.parametrize("gains", ["drive", "nobody"])
+def test_gains_without_a_law_are_refused(gains, batchpid, tmp_path):
+    status, _, complaint = batchpid("export", "panda", "--gains", gains, "--out", tmp_path / "a.h")
+    assert (status, complaint.count("\n")) == (2, 1)
