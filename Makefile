@@ -29,6 +29,7 @@ BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
 demo: $(VENV)/.base
 	@$(RUN) -m batchpid demo --picture out/demo.png --force $(ARGS)
+	@echo "the command: . $(VENV)/bin/activate, then batchpid --help"
 
 test: $(VENV)/.dev
 	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal --benchmark-disable $(ARGS)
