@@ -115,3 +115,9 @@ def test_the_oscillation_is_that_of_its_joint():
 def test_an_integral_that_is_too_fast_rings_and_grows():
     ratios = [oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)]
     assert ratios[0] > ratios[1] > 0 > ratios[2]
+
+
+@pytest.mark.parametrize("dt", [0.0, 1e300, float("nan")])
+def test_a_time_step_that_no_loop_has_is_an_error(dt):
+    with pytest.raises(InvalidArgumentError, match="dt"):
+        stability_bound(np.eye(2), 1.0, 0.1, dt)
