@@ -20,7 +20,7 @@ Params say how to control, a state is carried from step to step, and every array
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
   inertia in :mod:`batchpid.law.computed_torque`, errors in :mod:`batchpid.errors`.
 
-NumPy alone is needed; JAX, PyYAML and ruckig are imported by what uses them.
+Requires NumPy alone; JAX, PyYAML and ruckig are imported on first use.
 """
 
 from batchpid import startup

@@ -34,7 +34,7 @@ _NO_WAY = 1e-100  # [rad or m]: below this a quotient by the distance would over
 class Trajectory(NamedTuple):
     """Setpoints by tick: ``time`` (ticks,) [s], the others (ticks, ..., joints) in rad or m, and per s and s^2.
 
-    Row k is for tick k and holds what is to be reached at its end, ``time[k]`` = (k + 1) dt. So
+    Row k is for tick k and holds the target at the end of the tick, ``time[k]`` = (k + 1) dt. So
     ``runner.rollout(t.position, setpoint_rates=t.velocity)`` follows it, and the last row is the target itself.
     """
 
@@ -98,7 +98,7 @@ def minimum_jerk(
         T [s]: a number, (envs, 1) or (envs, joints); a joint that arrives before others holds its target.
     max_velocity, max_acceleration
         Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env takes the shortest T
-        that respects them on all of its joints; an infinite one is none.
+        that respects them on all of its joints; an infinite limit does not apply.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def trapezoidal(
     start, target, dt
         As in :func:`minimum_jerk`, and so the errors.
     max_velocity, max_acceleration
-        Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. An infinite velocity is none.
+        Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. Infinite: no velocity limit.
     synchronise
         All joints of an env start and arrive together, on a straight line; else each goes as fast as it may.
     """
@@ -152,7 +152,7 @@ def trapezoidal(
     v, a = _limits("max_velocity", max_velocity, way, finite=False), _limits("max_acceleration", max_acceleration, way)
     distance = np.abs(way)
     moves = distance > _NO_WAY
-    # Limits of s itself: those of the joints, per metre or radian of the way.
+    # Limits of s itself: the joints' limits, per metre or radian of the way.
     vs = np.divide(v, distance, out=np.full(way.shape, np.inf), where=moves)
     as_ = np.divide(a, distance, out=np.full(way.shape, np.inf), where=moves)
     if synchronise:
@@ -266,5 +266,5 @@ def _ticks(dt: float, total: Float64) -> Float64:
 
 
 def _count(duration: float, dt: float) -> int:
-    """Return how many ticks cover a duration; a last one by rounding alone is none."""
+    """Return how many ticks cover a duration, without a last tick that is due to rounding alone."""
     return max(1, math.ceil(duration / dt * (1 - _ROUNDING)))

@@ -116,7 +116,7 @@ class Row(NamedTuple):
     moved: float
     us: float
     over: float
-    """Speed over that of the tutorial's loop, both in one process."""
+    """Speed relative to the tutorial's loop, both in one process."""
     cost: float | None
     """Time over that without isolation."""
 

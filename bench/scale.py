@@ -73,7 +73,7 @@ class Result(NamedTuple):
     rate: float
     """[env steps/s]"""
     efficiency: float
-    """Over that of the cores alone."""
+    """Speed relative to the cores alone."""
     network: float
     """Share of the time in which the caller's network card receives, or sends, whichever is longer."""
     caller: float

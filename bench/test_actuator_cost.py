@@ -44,7 +44,7 @@ CASES = {
 
 
 def speeds_over_ideal(physics, most, rounds):
-    """Return the speed of each case over that of actuators=None: the median of rounds in which all take turns.
+    """Return the speed of each case relative to actuators=None: the median of rounds in which all take turns.
 
     Processor time of this process, in which the robots are: another program disturbs it less.
     """

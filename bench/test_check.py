@@ -23,7 +23,7 @@ ATTEMPTS = 3
 
 
 class Floor(NamedTuple):
-    """Least ratio of the speeds of two cases, about a tenth below what is measured on an idle machine."""
+    """Least ratio of the speeds of two cases, about a tenth below the ratio on an idle machine."""
 
     case: str
     over: str
@@ -55,7 +55,7 @@ FEW_FLOORS = {
 }
 ACTUATOR_FLOORS = {
     # a runner with these actuators over one with actuators=None
-    "all off": 0.99,  # what is off costs nothing
+    "all off": 0.99,  # disabled effects cost nothing
     "armature": 0.99,  # the engine's
     "strength": 0.97,  # the velocity is read, and the effort processed
     "effort limit": 0.96,  # and limits given to the law

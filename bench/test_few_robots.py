@@ -1,4 +1,4 @@
-"""Few robots in the caller's process, beside the tutorial's own loop: the time of an env step of both, in turn.
+"""Few robots in the caller's process, compared with the tutorial's loop: time of an env step, measured in turn.
 
 Processor time: another program disturbs it less.
 """

@@ -15,12 +15,12 @@ import pytest
 
 from batchpid.sim import Robot, Runner
 
-ENVS = 128  # so many that half of them fill their packs and groups, too
+ENVS = 128  # enough that half of them fill their packs and groups, too
 TICKS, ROUNDS, ATTEMPTS, FLOOR = 10, 3, 3, 1.25
 
 
 def compute(seconds: float) -> None:
-    """Use a core for so many seconds."""
+    """Use a core for ``seconds``."""
     end = perf_counter() + seconds
     while perf_counter() < end:
         pass
@@ -34,7 +34,7 @@ def in_turn(runner: Runner, policy, seconds: float, ticks: int) -> None:
 
 
 def at_once(halves: list[Runner], policy, seconds: float, ticks: int) -> None:
-    """Let the policy compute for one half while the other steps."""
+    """Compute the policy of one half while the other half steps."""
     for half in halves:
         half.send(half.robot.settings.target)
     for tick in range(ticks):

@@ -1,1 +1,1 @@
-"""Arrays of NumPy and JAX alike: elementwise operations, leaves of named tuples, digests, representations."""
+"""Operations on NumPy and JAX arrays: elementwise operations, leaves of named tuples, digests, representations."""

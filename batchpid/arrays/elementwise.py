@@ -1,4 +1,4 @@
-"""Elementwise operations of the law, for NumPy and JAX alike."""
+"""Elementwise operations of the law, for NumPy and JAX arrays."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ Leaves = TypeVar("Leaves", bound=tuple[Any, ...])
 def frozen(leaves: Leaves) -> Leaves:
     """Return a named tuple with read-only NumPy arrays, which later writes by the caller do not change.
 
-    Writeable arrays and views are copied. If there are none, ``leaves`` itself is returned.
+    Writeable arrays and views are copied. If all arrays are read-only, ``leaves`` itself is returned.
     """
     kept = [_read_only(np.array(leaf)) if _can_be_written(leaf) else leaf for leaf in leaves]
     return leaves if all(map(operator.is_, kept, leaves)) else type(leaves)(*kept)
@@ -38,7 +38,7 @@ class LeafBuilder:
     """Builder of the leaves of one :class:`batchpid.PIDParams` or the like, which agree in joints, envs and dtype."""
 
     def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: Any, values: Iterable[Any]) -> None:
-        """Without a ``dtype`` it is that of the traced arrays among ``values``, else float64."""
+        """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else float64."""
         self.joints, self.num_envs = integer("joints", joints, 1, MOST_JOINTS), 1
         self.names = None if joint_names is None else names("joint_names", joint_names, self.joints)
         if dtype is None:
@@ -110,7 +110,7 @@ class LeafBuilder:
         return clamp, conditional, back
 
     def clamped(self, clamp: Any, integral: tuple[Any, Any], effort: tuple[Any, Any]) -> tuple[Any, Any]:
-        """Return the integral's limits: where the strategy is ``clamp`` and there are none, those of the effort."""
+        """Return the integral's limits: for the strategy ``clamp`` without limits, the effort limits."""
         if clamp is None or any(end is not None for end in integral):
             return integral
         if all(end is None for end in effort):
@@ -141,7 +141,7 @@ class LeafBuilder:
         return None if _is_everywhere(time, math.inf) else self.freeze(time)
 
     def choice(self, name: str, chosen: Any) -> Any:
-        """Return what a named choice puts into the params."""
+        """Return the params entry of a named choice."""
         return CHOICES[name][choice(name, chosen, CHOICES[name])]
 
     def freeze(self, array: Any) -> Any:

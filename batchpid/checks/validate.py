@@ -1,7 +1,7 @@
 """Checks of arguments; each error names the argument, the joint or env, the value and the remedy.
 
 Every function takes the argument's name and its value, returns the value in its canonical form, and raises
-:class:`batchpid.InvalidArgumentError` where it is not what is asked for.
+:class:`batchpid.InvalidArgumentError` where the value is invalid.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def integer(argument: str, value: Any, low: int, high: int) -> int:
 
 
 def number(argument: str, value: Any, low: float, high: float, unit: str) -> float:
-    """Return ``value`` as a finite float within [low, high]; an infinite bound is none."""
+    """Return ``value`` as a finite float within [low, high]; an infinite bound does not limit."""
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
         ends = f"from {low:g} to {high:g}" if math.isfinite(high) else f">= {low:g}"
@@ -160,8 +160,8 @@ def array(
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
 
-    A scalar stands for all joints, (dof,) for all envs. All entries must be finite, unless ``finite`` is False.
-    ``names`` holds the name of each column. ``kind`` says what a column is: a joint, or an entry of a command.
+    A scalar applies to all joints, (dof,) to all envs. All entries must be finite, unless ``finite`` is False.
+    ``names`` holds the name of each column. ``kind`` is the type of a column: a joint, or an entry of a command.
     """
     remedy = f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
     result = read_array(argument, value)

@@ -104,8 +104,8 @@ def spectral_radius(
 ) -> Float64:
     """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is stable.
 
-    They are those of the exact one-step matrix of the law, output first, and the plant, on the state
-    (q, q - q', I, d). Arguments are those of :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
+    They are the eigenvalues of the exact one-step matrix of the law, output first, and the plant, on the state
+    (q, q - q', I, d). Arguments are as in :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
     kp. Where ki is 0 its pole at 1 is left out.
     """
     gains = {"kp": kp, "ki": ki, "kd": kd}
@@ -127,7 +127,7 @@ def oscillation(
 ) -> Oscillation:
     """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or longer to fall to 2 %.
 
-    Modes that decay faster are not seen in a motion. The other arguments are those of :func:`spectral_radius`. With the
+    Modes that decay faster are not seen in a motion. The other arguments are as in :func:`spectral_radius`. With the
     eigenvalue z of a mode, its continuous one is s = log(z) / dt, zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
     """
     gains = {"kp": kp, "ki": ki, "kd": kd}

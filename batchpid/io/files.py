@@ -71,7 +71,7 @@ def try_writing(path: str | os.PathLike[str]) -> None:
     Raises
     ------
     OSError
-        The folder cannot be written to, the disk is full, or ``path`` is no regular file or may not be changed.
+        The folder cannot be written to, the disk is full, or ``path`` is not a regular file or may not be changed.
     """
     path = Path(os.path.realpath(path))
     try:

@@ -29,7 +29,7 @@ def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, NDArray[
     Raises
     ------
     Exception
-        The file is no such file: whatever the libraries raise for it, mostly ValueError or ``zipfile.BadZipFile``.
+        The file is not an NPZ file. The libraries raise different types, mostly ValueError or ``zipfile.BadZipFile``.
     """
     tables: dict[str, NDArray[Any]] = {}
     with Path(path).open("rb") as file, zipfile.ZipFile(file) as archive:

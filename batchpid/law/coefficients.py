@@ -1,4 +1,4 @@
-"""Coefficients of the law at one time step: what a loop with constant params computes once."""
+"""Coefficients of the law at one time step: with constant params, a loop computes them once."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
 
-With kp = w^2 and kd = 2 zeta w, all joints of all robots respond alike, in every pose. There are two ways:
+With kp = w^2 and kd = 2 zeta w, all joints of all robots respond in the same way, in every pose. There are two ways:
 
 - "inertia": each gain is multiplied by its joint's M_jj(q), as PhysX's drives do in mode "acceleration". The law is
   otherwise untouched: integral, limits and anti-windup are in effort units.
@@ -59,7 +59,7 @@ def advance_with_mass_matrix(
     mass_matrix
         (envs, joints, joints) at about the present positions [kg m^2 or kg].
     feedforward
-        Effort added to that of the law [N m or N]: passive force and more.
+        Effort added to the effort of the law [N m or N]: passive force and more.
     """
     xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
     low, high = k.effort_min, k.effort_max

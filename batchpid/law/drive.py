@@ -18,12 +18,12 @@ def drive_target(
         target = setpoint + I / kp          so that kp (target - y) - kd dy/dt = P + I + D
 
     The drive (SAPIEN's ``set_drive_property(stiffness=kp, damping=kd)``) integrates P and D implicitly and is as
-    stable as without I. I evolves as in :func:`batchpid.step`, whose effort is what the drive is expected to give:
+    stable as without I. I evolves as in :func:`batchpid.step`, whose effort predicts the drive's effort:
     ``effort_min`` and ``effort_max`` are the drive's force limit, and anti-windup works against it. Where kp is 0 the
     target is the setpoint.
 
     Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
-    the drive's, inside the same limit) are those of :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
+    the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
     state, _, terms = step(params, state, setpoint, measurement, dt, **inputs, terms=True)

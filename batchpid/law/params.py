@@ -67,7 +67,7 @@ class PIDParams(NamedTuple):
 
     @property
     def num_envs(self) -> int:
-        """Number of envs with params of their own; 1 where all envs share them."""
+        """Number of envs with separate params; 1 where all envs share them."""
         return max(leaf.shape[-2] for leaf in self if _is_array(leaf))
 
     @property
@@ -85,7 +85,7 @@ class PIDParams(NamedTuple):
     def options(self) -> dict[str, Any]:
         """Return the options that are on, as arguments of :func:`make_params` that build these params again.
 
-        "clamp" shows as the integral limits it stands for. Where its leaves are traced, anti_windup is left out.
+        "clamp" shows as the integral limits that it sets. Where its leaves are traced, anti_windup is left out.
         """
         options: dict[str, Any] = {}
         for name, leaf in zip(self._fields, self, strict=True):
@@ -230,7 +230,7 @@ def make_params(
     joint_names
         Used in error messages.
     dtype
-        float32 or float64; None: float64, or that of the traced arrays.
+        float32 or float64; None: float64, or the dtype of the traced arrays.
 
     Raises
     ------

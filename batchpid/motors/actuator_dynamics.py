@@ -209,7 +209,7 @@ def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
     """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
 
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
-    difference from the effort asked for they would leak into the integral. None is no limit.
+    difference from the effort asked for they would leak into the integral. None: no limit.
     """
     return limits(k.commands, qpos, qvel)
 
@@ -283,7 +283,7 @@ def advance_measurement(
 def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) -> tuple[Any, Any]:
     """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
 
-    ``key`` is that of the state, and ``like`` an array (envs, joints) of the same dtype.
+    ``key`` is the key of the state, and ``like`` an array (envs, joints) of the same dtype.
     """
     both = noise.normals(key, step, like.shape[1], like.dtype, xp)
     deviations = k.position_noise, k.velocity_noise
@@ -307,5 +307,5 @@ def _twice(delay: Any, xp: Any) -> Any:
 
 
 def _step(resolution: Any, xp: Any) -> Any:
-    """Return the step of a sensor; 2^-60, which is below the last bit that matters, where there is none."""
+    """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a resolution."""
     return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)

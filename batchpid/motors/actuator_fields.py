@@ -1,4 +1,4 @@
-"""Fields of :class:`batchpid.Actuators`, by what they act on."""
+"""Fields of :class:`batchpid.Actuators`, grouped by the quantity that they modify."""
 
 from __future__ import annotations
 

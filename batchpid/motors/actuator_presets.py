@@ -115,7 +115,7 @@ def mujoco_joint(
 ) -> Actuators:
     """Return a joint of MuJoCo with its motor, by the names of its XML.
 
-    ``armature``, ``frictionloss`` and ``damping`` are added to what the robot's description has. ``forcerange`` is
+    ``armature``, ``frictionloss`` and ``damping`` are added to the values of the robot's description. ``forcerange`` is
     symmetric: the largest effort [N m or N]. ``dynprm`` is the time constant [s] of dyntype filterexact with actearly.
     """
     own = {"armature": armature, "coulomb": frictionloss, "viscous": damping, "effort_limit": forcerange, "lag": dynprm}

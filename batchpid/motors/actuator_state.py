@@ -33,7 +33,7 @@ class ActuatorState(NamedTuple):
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped.
 
-        A history that is longer there is continued by its oldest sample. The key is that of ``fresh``.
+        A history that is longer there is continued by its oldest sample. The key is taken from ``fresh``.
         """
         both = zip(self, fresh, strict=True)
         matched = (new if new is None or old is None else _resized(old, new) for old, new in both)

@@ -1,7 +1,7 @@
 """Parameters of actuators and sensors: build, broadcast, validate.
 
 :class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
-that is off is ``None``: it is no leaf and costs nothing.
+that is off is ``None``: it is not a leaf and costs nothing.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Actuators(NamedTuple):
 
     @property
     def num_envs(self) -> int:
-        """Number of envs with actuators of their own; 1 where all envs share them."""
+        """Number of envs with separate actuators; 1 where all envs share them."""
         return max((leaf.shape[0] for leaf in self if leaf is not None), default=1)
 
     @property
@@ -196,13 +196,13 @@ def make_actuators(
         Of the noise, from 0 to 2^64 - 1.
     max_delay
         Length of the histories that delayed signals have [s]; None: the largest delay of all envs. A longer one is
-        needed where delays are to grow in flight: what is older than the history is its oldest sample.
+        needed where delays are to grow in flight: a delay beyond the history returns its oldest sample.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
         Used in error messages.
     dtype
-        float32 or float64; None: float64, or that of the traced arrays.
+        float32 or float64; None: float64, or the dtype of the traced arrays.
 
     Raises
     ------

@@ -125,7 +125,7 @@ class Coupling:
         return np.asarray(figures)[..., (np.cumsum(self.independent) - 1)[self.leader]]
 
     def of_leaders(self, figures: ArrayLike) -> NDArray[Any]:
-        """Return ``figures`` (..., joints) in which followers have those of their leaders."""
+        """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
         return np.asarray(figures)[..., self.leader]
 
     def __repr__(self) -> str:

@@ -97,7 +97,7 @@ def refresh(
 ) -> FrictionState:
     """Return ``state`` with K and w at ``mass_matrix`` (envs, joints, joints) [kg m^2 or kg].
 
-    ``damping`` and ``stiffness`` (envs, joints) or (1, joints) are those of a drive that the simulator integrates
+    ``damping`` and ``stiffness`` (envs, joints) or (1, joints) belong to a drive that the simulator integrates
     implicitly [N m s/rad, N m/rad].
     """
     if friction.coulomb is None:
@@ -120,7 +120,7 @@ def refresh(
 def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any) -> tuple[FrictionState, Any]:
     """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m or N].
 
-    The joints' armature has to be dt B. ``effort`` is that of the motors, at ``velocity``; none is written to.
+    The joints' armature has to be dt B. ``effort`` is the motors' effort at ``velocity``. Inputs are not modified.
     """
     total = effort
     if friction.coulomb is not None:
@@ -140,7 +140,7 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
 def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
     """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') / band in [-1, 1].
 
-    Its sign is that of the wanted motion and not of the velocity, so it cannot chatter: friction, which is at least as
+    It has the sign of the commanded motion, not of the velocity, so it cannot chatter: friction, which is at least as
     large and opposes the velocity, leaves no more than 0 in the direction of motion. A joint that is at rest within
     ``band`` of its setpoint stays there.
 

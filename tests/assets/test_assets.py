@@ -241,7 +241,7 @@ def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -
 
 
 def test_a_folded_arm_touches_itself(tmp_path: Path) -> None:
-    # Control of the test above: the shapes collide where those of a real arm would.
+    # Control of the test above: the shapes collide where the links of a real arm would.
     touching = World(xml("panda"), tmp_path).touching([0, 1.7, 0, -3.0, 0, 0.5, 0, 0, 0])
     assert any("ground" not in pair for pair in touching)
 

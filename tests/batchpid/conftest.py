@@ -13,7 +13,7 @@ import batchpid as bp
 
 @pytest.fixture(autouse=True)
 def strict() -> Any:
-    """Let the pure functions be traced under JAX's strict modes in every test."""
+    """Trace the pure functions under JAX's strict modes in every test."""
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
         yield
 

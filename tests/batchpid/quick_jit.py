@@ -1,4 +1,4 @@
-"""Compilation by JAX in a third of the time, for tests of what a program computes and not of how fast it is."""
+"""Compilation by JAX in a third of the time, for tests of results, not of speed."""
 
 import functools
 

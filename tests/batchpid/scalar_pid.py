@@ -11,7 +11,7 @@ from batchpid.law.params import PIDParams
 
 @dataclass
 class ScalarPID:
-    """One PID loop of one joint; the options are those of :func:`batchpid.make_params`, each a number or a name."""
+    """One PID loop of one joint; the options are as in :func:`batchpid.make_params`, each a number or a name."""
 
     kp: float
     ki: float = 0.0

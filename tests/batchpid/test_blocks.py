@@ -15,7 +15,7 @@ RATES = ("measurement_rate", "setpoint_rate", "feedforward")
 
 
 def compare(params, inputs, rows):
-    """Assert that steps in blocks, each written over the state before last, are those of plain steps."""
+    """Assert that steps in blocks, each written over the state before last, equal plain steps."""
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
     k = bp.discretise(params, DT)
     blocks = jax.jit(lambda out, *given: advance_in_blocks(k, *given, out=out, rows=rows), donate_argnums=0)

@@ -1,4 +1,4 @@
-"""Representations in a notebook: one to three lines, with what is on and the ranges of the values."""
+"""Representations in a notebook: one to three lines, with the enabled options and the ranges of the values."""
 
 import jax
 import numpy as np

@@ -76,7 +76,7 @@ def test_a_joint_at_rest_holds_its_load_and_lets_go_above_its_friction(damping):
 
 
 def test_it_is_the_implicit_step_where_the_load_is_constant():
-    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ is what lies between both ends of Sgn."""
+    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ lies between the solutions for both ends of Sgn."""
     inertia, damping, coulomb, load = 0.02, 3.0, 0.7, 0.2
     mass, model = np.full((1, 1, 1), inertia), Friction(np.full((1, 1), coulomb), np.full((1, 1), damping))
     rng = np.random.default_rng(0)

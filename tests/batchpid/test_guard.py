@@ -15,7 +15,7 @@ DT = 0.01
 
 
 def run(limits, setpoints, start=0.0):
-    """Return guarded setpoints, their rates and what was changed (steps, 1, joints)."""
+    """Return guarded setpoints, their rates and the mask of changed ones (steps, 1, joints)."""
     rows = np.asarray(setpoints, float).reshape(len(setpoints), 1, -1)
     state, seen = guard.init(limits, np.zeros_like(rows[0]) + start), []
     for row in rows:

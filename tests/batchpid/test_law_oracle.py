@@ -23,7 +23,7 @@ def test_step_equals_the_scalar_law_on_some_inputs(options, inputs, given):
 
 
 def compare(backend, options, inputs, given):
-    """Assert that the efforts of a run are those of one scalar controller per env and joint."""
+    """Assert that the efforts of a run equal one scalar controller per env and joint."""
     params = bp.make_params(JOINTS, **options, dtype=backend.dtype)
     params = bp.PIDParams(*(backend.array(x) if isinstance(x, np.ndarray) else x for x in params))
     pids = scalar_pids(params, ENVS)

@@ -24,7 +24,7 @@ def test_scalars_and_vectors_broadcast():
 
 
 def test_params_are_read_only_copies():
-    """Read-only, not views of what was given, and they survive pickle and copy."""
+    """Read-only, not views of the arguments, and they survive pickle and copy."""
     gains = np.ones(3)
     params = bp.make_params(3, gains, anti_windup="conditional", effort_limit=1.0, ki=1.0)
     gains[:] = 9

@@ -1,4 +1,4 @@
-"""Runs of the benchmarks and of the slow tests say what they find."""
+"""Runs of the benchmarks and of the slow tests report their results."""
 
 import re
 import tomllib
@@ -43,6 +43,6 @@ def test_the_slow_tests_print_each_result_as_it_comes():
 
 
 def test_slow_tests_have_no_limits_of_their_own():
-    """The limit of all ends one that hangs, whatever else the machine does."""
+    """The common limit ends a test that hangs, on a busy machine too."""
     own = re.compile(r"mark\.slow\)?\n@pytest\.mark\.timeout|mark\.timeout\(\d+\)\n@pytest\.mark\.slow")
     assert not [path.name for path in (ROOT / "tests").rglob("test_*.py") if own.search(path.read_text())]

@@ -1,4 +1,4 @@
-"""The page on large clusters shows what its simulation prints, and the simulation agrees with simple cases."""
+"""The page on large clusters shows the output of its simulation, and the simulation agrees with simple cases."""
 
 import numpy as np
 import pytest

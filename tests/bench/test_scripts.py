@@ -11,7 +11,7 @@ TESTED = {"accuracy", "cluster", "contact", "draw", "motions", "scale", "view"}
 
 
 def rows(text):
-    """Return the cells of the rows of a Markdown table, without those of its head."""
+    """Return the cells of the rows of a Markdown table, without its header."""
     lines = [line.strip("| ") for line in text.splitlines() if line.startswith("|")]
     return [line.split(" | ") for line in lines[2:]]
 

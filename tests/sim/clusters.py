@@ -32,7 +32,7 @@ class Machines:
         self.nodes = []
 
     def ensure(self, count):
-        """Add nodes until there are so many."""
+        """Add nodes until there are ``count``."""
         while len(self.nodes) < count:
             self.nodes.append(self.cluster.add_node(num_cpus=1, **SMALL))
         return self

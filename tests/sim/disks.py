@@ -39,7 +39,7 @@ def make_read_only(folder: Path) -> None:
 
 @contextmanager
 def limited_file_size(size: int) -> Iterator[None]:
-    """Let this process write files of ``size`` bytes at most."""
+    """Limit the files that this process writes to ``size`` bytes."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
     try:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import psutil
 
 PATIENCE = 200.0
-"""Seconds that a test waits for what has to happen soon: so many that a busy machine does not matter."""
+"""Timeout [s] of events that should happen soon; long enough for a busy machine."""
 
 
 def children() -> set[psutil.Process]:

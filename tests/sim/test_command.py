@@ -53,14 +53,14 @@ class Cartesian:
 
 
 class Shapes(Cartesian):
-    """The same, with so many further numbers in a setpoint that nothing depends on."""
+    """The same, with further, unused numbers in a setpoint."""
 
     def __init__(self, more):
         super().__init__(CommandSpec(tuple(f"number {k}" for k in range(2 + more))))
 
 
 class OfJoints(Cartesian):
-    """PD toward joint positions: a controller without a command of its own."""
+    """PD toward joint positions: a controller without a separate command."""
 
     def __init__(self):
         super().__init__(None)

@@ -107,7 +107,7 @@ class DisturbedRunner(RuleBasedStateMachine):
 
 @contextlib.contextmanager
 def later(seconds, act):
-    """Call ``act`` in a thread after so many seconds."""
+    """Call ``act`` in a thread after ``seconds``."""
 
     def act_if_alive():
         with contextlib.suppress(ProcessLookupError):

@@ -68,7 +68,7 @@ def run(runner, way):
 
 
 def outcome(workers, controller, *, kill=False, way="rollout", **options):
-    """Return the error of a run, and what is left of the runner."""
+    """Return the error of a run, and the remaining state of the runner."""
     with Runner(
         ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, pack_size=1, timeout=20.0, **options
     ) as runner:

@@ -17,7 +17,7 @@ NAMES = ("step", "exchange", "rollout", "set_params", "reset", "snapshot", "rest
 
 
 def call(twin, name, disturb):
-    """Let ``twin`` execute one command."""
+    """Execute one command on ``twin``."""
     arguments = {
         "step": (SETPOINTS[0],),
         "exchange": (SETPOINTS[0],),

@@ -1,4 +1,4 @@
-"""Runner.send and Runner.recv: bit-identical to step, whatever happens between the two."""
+"""Runner.send and Runner.recv: bit-identical to step, for any call between the two."""
 
 import os
 import signal

@@ -19,13 +19,13 @@ NUM_ENVS, TICK = 64, 0.1
 
 
 def memory(runner):
-    """Return the resident bytes of this process and its workers, without what they share."""
+    """Return the resident bytes of this process and its workers, without shared memory."""
     processes = [psutil.Process(), *map(psutil.Process, runner.pids)]
     return sum(process.memory_info().rss - process.memory_info().shared for process in processes)
 
 
 def digest_of_ticks(runner, first, last, after_tick=lambda tick: None):
-    """Run ticks ``first`` to ``last`` of one long program, with resets and changes of gains; hash what is observed."""
+    """Run ticks ``first`` to ``last`` of one long program, with resets and changes of gains; hash the observations."""
     digest, robot = hashlib.sha256(), runner.robot
     middle, reach = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 4
     phase = np.linspace(0, 2 * np.pi, NUM_ENVS)[:, None] + np.arange(robot.dof)

@@ -1,4 +1,4 @@
-"""A runner that is disturbed, and its model, an undisturbed one in this process, which does what the first has done."""
+"""A runner that is disturbed, and its model, an undisturbed one in this process, which repeats its commands."""
 
 from __future__ import annotations
 

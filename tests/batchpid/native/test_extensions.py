@@ -31,7 +31,7 @@ PERMUTED = (*OPERATIONS[:4], *OPERATIONS[5:3:-1], *OPERATIONS[6:])
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    """Let the extension be loaded and judged anew, in the test and after it."""
+    """Reload and recheck the extension, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE", raising=False)
     caches = load, array_program.interpreter, availability._judged
     for each in caches:

@@ -1,4 +1,4 @@
-"""Output files: no command replaces one without --force, and default names say what they show."""
+"""Output files: no command replaces one without --force, and default names describe the content."""
 
 from __future__ import annotations
 

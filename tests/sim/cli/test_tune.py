@@ -24,7 +24,7 @@ SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--work
 
 @pytest.fixture(autouse=True)
 def few_moves(monkeypatch):
-    """Let the final of a search and the table of the commands have two random moves."""
+    """Use two random moves in the final of a search and in the commands' table."""
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 2)
     monkeypatch.setattr(
         "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 2), seed)
@@ -98,7 +98,7 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
 
 
 def test_settings_keep_the_types_of_options(batchpid, tmp_path):
-    """Flags are no text in the file: "False" would be true to any program that reads it."""
+    """Flags are not text in the file: "False" would be true to any program that reads it."""
     urdf = write(tmp_path, one_joint(), "arm.urdf")
     out = tmp_path / "gains.yaml"
     status, _, error = batchpid("tune", urdf, *SHORT, "--no-collisions", "--out", out)

@@ -1,4 +1,4 @@
-"""Contact prediction: which robots get a PhysX system to themselves, and what they keep."""
+"""Contact prediction: which robots get a PhysX system to themselves, and the state they keep."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_pair_in_contact_predicts_contact():
 @pytest.mark.parametrize(
     ("links", "reach"),
     [
-        ((2, 3), (0.0, 1.0, 1.0, 0.0)),  # the joint above both moves them alike
+        ((2, 3), (0.0, 1.0, 1.0, 0.0)),  # the joint above both moves both equally
         ((2, WORLD), (0.3 + 0.05 - 0.2, 1.0, 0.0, 0.0)),
         ((1, 4), (0.0, 0.0, 0.0, 0.04)),
         ((0, 1), (0.2, 0.0, 0.0, 0.0)),
@@ -107,7 +107,7 @@ def test_prediction_has_no_order_and_more_speed_predicts_no_less(pairs, qvel, ra
 
 
 def reach_between(predictor: ContactPredictor, first: int, second: int) -> np.ndarray:
-    """Return how fast two links close per unit of each joint's speed: a joint above both moves them alike."""
+    """Return how fast two links close per unit of each joint's speed: a joint above both moves both equally."""
     a, b = predictor.reach[first], predictor.reach[second]
     return np.where((a > 0) != (b > 0), a + b, 0.0)
 
@@ -304,7 +304,7 @@ def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
 
 
 def test_isolation_before_contact_does_not_change_the_path(panda, packs, monkeypatch):
-    """A robot that is rebuilt in contact would lose what the engine remembers of it."""
+    """A robot that is rebuilt in contact would lose the engine's contact cache."""
     moves, runs = contact_moves(panda, 2), []
     for isolated in (2, 0):
         with Runner(panda, 2, workers=0, params=panda.tuned(), physics="fast", pack_size=2) as runner:

@@ -142,4 +142,4 @@ def test_the_self_test_runs_once_for_a_pair_of_libraries(monkeypatch, tmp_path):
     assert len(list((tmp_path / "cache").iterdir())) == 1
     assert native.verify(tmp_path / "cache", "raise SystemExit('not run again')").active
     (tmp_path / "file").touch()
-    assert native.verify(tmp_path / "file").active  # a cache that cannot be written is none
+    assert native.verify(tmp_path / "file").active  # an unwritable cache is not used

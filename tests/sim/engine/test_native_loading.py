@@ -40,7 +40,7 @@ USERS = {
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    """Let extensions be loaded and judged anew, in the test and after it."""
+    """Reload and recheck extensions, in the test and after it."""
     monkeypatch.delenv("BATCHPID_NATIVE_VERIFIED", raising=False)
     monkeypatch.setattr(verdict, "_verdict", None)
     extensions.load.cache_clear()

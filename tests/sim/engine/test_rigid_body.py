@@ -1,4 +1,4 @@
-"""The mass matrix in programs of JAX: that of Pinocchio, for any tree of joints."""
+"""The mass matrix in JAX programs equals Pinocchio's, for any tree of joints."""
 
 from __future__ import annotations
 

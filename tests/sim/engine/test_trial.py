@@ -1,4 +1,4 @@
-"""Trials: results and errors come from a child process, whose end is told and harms no one."""
+"""Trials: results and errors come from a child process, whose crash is reported and harms no other process."""
 
 import os
 import signal

@@ -97,7 +97,7 @@ def test_mass_matrix_and_gravity_are_proportional_to_the_masses(name):
 @pytest.mark.parametrize("fixed_base", [True, False])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_centers_of_mass_are_displaced_along_the_axes_of_their_links(name, fixed_base):
-    """As those of a robot whose URDF has them there."""
+    """Equal to a robot whose URDF has them there."""
     robot, rng = load_bundled(name), np.random.default_rng(0)
     moved = rng.uniform(-0.05, 0.05, (len(robot.links), 3))
     urdf = ElementTree.fromstring(robot.urdf)

@@ -59,7 +59,7 @@ def test_any_packing_and_workers_are_bit_identical(units, panda):
 
 
 def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
-    """In the first sim step the effort is that of gains per effort, multiplied by hand."""
+    """In the first sim step the effort equals the one with gains per effort, multiplied by hand."""
     robot = jaco2
     diagonal = robot.mass_matrix(robot.start)[0].diagonal()
     efforts = []

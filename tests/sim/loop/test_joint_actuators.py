@@ -234,7 +234,7 @@ def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
 
 
 def test_the_controller_knows_the_actuators_of_its_robot(panda):
-    """Their armature, damping and friction are compensated; those of the runner alone are not."""
+    """Their armature, damping and friction are compensated; actuators of the runner alone are not."""
     worn = bp.make_actuators(9, armature=0.2, viscous=3.0, coulomb=[1.0] * 7 + [0.0] * 2)
     known = dataclasses.replace(panda, actuators=worn)
     errors = []

@@ -1,4 +1,4 @@
-"""The law as a native program is bit-identical to the law in NumPy, whatever its options and inputs."""
+"""The law as a native program is bit-identical to the law in NumPy, for all options and inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sim steps of a tick in one native call: the same motion as in NumPy, whatever the other envs of a group do."""
+"""Sim steps of a tick in one native call: the same motion as in NumPy, independent of the other envs of a group."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures show what was measured, of any run."""
+"""Figures show the measured values of any run."""
 
 from __future__ import annotations
 

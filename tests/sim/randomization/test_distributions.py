@@ -1,4 +1,4 @@
-"""Distributions: moments, bounds, and what they are in a file."""
+"""Distributions: moments, bounds, and their form in a file."""
 
 import math
 

@@ -346,7 +346,7 @@ def kill_after(seconds, path, number=signal.SIGKILL, pause=-1):
 def read_count(path):
     try:
         return len(read_recording(path).time)
-    except RecordingError:  # there is none yet
+    except RecordingError:  # no recording yet
         return 0
 
 

@@ -1,6 +1,6 @@
 """Designed gains, untuned, on robots of many makers: stable, and settled within two seconds.
 
-The robots are the bundled ones and, where it is installed, those of the package ``example-robot-data`` (extra
+The robots are the bundled ones and, where it is installed, the robots of the package ``example-robot-data`` (extra
 "robots"). Joint friction is set to 0: these files give a torque, PhysX takes a dimensionless coefficient.
 """
 

@@ -177,7 +177,7 @@ def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path)
 
 
 def test_a_mesh_that_changed_since_it_was_simulated_is_refused(tmp_path):
-    """SAPIEN keeps what it read first: the new shape would be simulated as the old one, without a word."""
+    """SAPIEN caches the first shape: without an error, it would simulate the old shape for the new one."""
     arm = '<collision><geometry><mesh filename="m.stl"/></geometry></collision>'
     path, mesh = write(tmp_path, one_joint(arm=arm)), tmp_path / "m.stl"
     mesh.write_bytes(stl())

@@ -1,4 +1,4 @@
-"""Faults of published URDFs that are repaired: each is told, refused by strict=True, and the robot runs."""
+"""Faults of published URDFs that are repaired: each is reported, refused by strict=True, and the robot runs."""
 
 from __future__ import annotations
 

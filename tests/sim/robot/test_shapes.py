@@ -55,7 +55,7 @@ def test_primitives_are_closed_face_out_and_have_their_size(geometry, size, expe
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     assert (edges[:, 0] != edges[:, 1]).all()
     forth, back = set(map(tuple, edges.tolist())), set(map(tuple, edges[:, ::-1].tolist()))
-    assert len(forth) == len(edges)  # every edge once in each direction: closed, and wound alike
+    assert len(forth) == len(edges)  # every edge once in each direction: closed, and wound consistently
     assert forth == back
     assert len(points) > 7
 

@@ -1,4 +1,4 @@
-"""A history is that of the same inputs and intact, or an error names what is wrong with it."""
+"""A history matches the inputs and is intact, or an error names the fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The survey: one report for each file, whatever becomes of the robot."""
+"""The survey: one report for each file, for every outcome."""
 
 from __future__ import annotations
 

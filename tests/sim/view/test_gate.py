@@ -67,7 +67,7 @@ BAD_VALUES = [
 
 
 class Page:
-    """Page without a browser: a web socket, the controls by label, and what was said to be refused."""
+    """Page without a browser: a web socket, the controls by label, and the reported refusals."""
 
     def __init__(self, view):
         self.address = view.url.replace("http", "ws")

@@ -62,7 +62,7 @@ def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, 
 
 
 def test_gain_sets_in_other_units_are_applied_without_a_bump(panda):
-    live = LiveSimulation(panda, 1, workers=0, spread=0.0, physics="fast")  # so that the setpoint weight is no matter
+    live = LiveSimulation(panda, 1, workers=0, spread=0.0, physics="fast")  # so that the setpoint weight has no effect
     live.payload = 1.0
     before, _ = run(live, 4.0)
     for name in ("tutorial", "designed"):

@@ -1,4 +1,4 @@
-"""Runners on a Ray cluster of several nodes on this machine: bit-identical to a local one, whatever is lost."""
+"""Runners on a Ray cluster of several nodes on this machine: bit-identical to a local one, after any loss."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def machines():
 
 
 class Tape:
-    """Recorder that keeps what it is given."""
+    """Recorder that keeps its inputs."""
 
     def __init__(self):
         self.ticks = []

@@ -42,7 +42,7 @@ def undisturbed():
 
 
 def disturbed_rollout(machines, disturb, tick):
-    """Return a rollout on two machines, before this ``tick`` of which ``disturb`` is called; and what was lost."""
+    """Return a rollout on two machines, before this ``tick`` of which ``disturb`` is called; and the losses."""
 
     def progress(ticks):
         for number in ticks:

@@ -1,4 +1,4 @@
-"""A worker that dies or gets stuck is replaced, and the results are bit-identical to those of an undisturbed run."""
+"""A worker that dies or gets stuck is replaced, and the results are bit-identical to an undisturbed run."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def at_tick(tick, act):
 
 @contextlib.contextmanager
 def later(seconds, act):
-    """Call ``act`` in a thread after so many seconds."""
+    """Call ``act`` in a thread after ``seconds``."""
     timer = threading.Timer(seconds, act)
     timer.start()
     try:

@@ -1,4 +1,4 @@
-"""No worker process and no shared memory remains when a program ends, whatever ends it."""
+"""No worker process and no shared memory remains when a program ends, for any cause."""
 
 from __future__ import annotations
 

@@ -306,7 +306,7 @@ def test_datasets_that_are_no_columns_are_named(panda, tmp_path, columns, name, 
 TABLE = st.text('time,qpos:setpanda_joint2 ;\t\n#0123456789.-+eEnaif"\r\x00é', max_size=400)
 
 
-@example(",\r:,", False)  # text beside an empty cell
+@example(",\r:,", False)  # text next to an empty cell
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(TABLE, st.booleans())
 def test_whatever_a_file_holds_the_error_is_one_of_ours(panda, tmp_path, content, with_header):

@@ -1,4 +1,4 @@
-"""Plants that simulate windows are never those of another robot, of other joints or of another drive."""
+"""Plants that simulate windows never belong to another robot, other joints or another drive."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_threads_do_not_share_plants(arm):
 
 @pytest.mark.parametrize("phase", [0.0, 0.5, 1.2])
 def test_a_stretch_begins_with_the_velocity_that_its_rows_show(phase):
-    """At rest as most logs do, or amid a motion, where a gap ended."""
+    """At rest, as in most logs, or during a motion, where a gap ended."""
     time = np.arange(1000) / 1000
     noise = 5e-4 * np.random.default_rng(0).standard_normal((1000, 1))
     qpos = 0.5 * (1 - np.cos(3 * time + phase))[:, None]
