@@ -3,7 +3,7 @@
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
 which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``gains.yaml`` and
 ``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
-within the text.
+within the text. C blocks compile beside the files that the commands of their page write.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import importlib.util
 import re
 import shlex
 import shutil
+import subprocess
 import warnings
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def missing(match: re.Match) -> list[str]:
 def test_every_block_is_of_a_kind_that_is_run():
     for page in PAGES:
         for match in BLOCK.finditer(page.read_text()):
-            assert match["language"] in ("python", "sh", "text"), f"{page.name}: {match[0][:60]}"
+            assert match["language"] in ("python", "sh", "c", "text"), f"{page.name}: {match[0][:60]}"
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=name)
@@ -117,6 +118,20 @@ def test_commands_run(page, tmp_path, monkeypatch, capsys):
             words = shlex.split(line, comments=True)
             if words:
                 run(words)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "c")], ids=name)
+def test_c_blocks_compile_with_the_files_that_the_commands_write(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for match in blocks(page, "sh", "c"):
+        if match["language"] == "sh":
+            for line in match["code"].splitlines():
+                run(shlex.split(line, comments=True))
+        else:
+            (tmp_path / "block.c").write_text(match["code"])
+            flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-fsyntax-only"]
+            subprocess.run(["cc", *flags, "block.c"], check=True)
 
 
 def run(words: list[str]) -> None:
