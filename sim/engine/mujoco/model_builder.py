@@ -36,6 +36,8 @@ ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
 """Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""
 _FRICTION = 0.3
 """Coefficient of sliding friction of every shape, that of SAPIEN's default material."""
+LARGEST_FORCE = 1e10
+"""Limit of a drive without a limit [N m or N]."""
 _NARROWEST = 1e-9
 """Smallest range of a limited joint [rad or m]: MuJoCo requires a positive one."""
 _FARTHEST = 1e10
@@ -57,8 +59,8 @@ class RobotMj:
 
 
 @lru_cache(maxsize=8)
-def robot_model(spec: SceneSpec) -> RobotMj:
-    """Return the model of ``spec``, the same object for equal specs.
+def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
+    """Return the model of ``spec``, with a drive of every joint if asked; the same object for equal arguments.
 
     Raises
     ------
@@ -71,6 +73,8 @@ def robot_model(spec: SceneSpec) -> RobotMj:
     names = _add_links(scene, spec, inertias)
     if spec.collisions:
         _add_shapes(scene, spec, names)
+    if drives:
+        _add_drives(scene, spec)
     try:
         model = scene.compile()
     except ValueError as error:
@@ -186,6 +190,16 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
             _add_shape(scene, scene.body(_part(shape.owner) if link in split else names[link]), shape, meshes, spec)
     if spec.ground:
         scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
+
+
+def _add_drives(scene: Any, spec: SceneSpec) -> None:
+    """Add an actuator for each joint, in their order: effort = ctrl + bias (1, q, q'), between its limits."""
+    scene.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    scene.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for joint in spec.joints:
+        actuator = scene.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
 
 
 def _part(owner: str) -> str:

@@ -24,7 +24,7 @@ class MujocoEngine:
     """MuJoCo on the CPU. The methods are those of the protocol."""
 
     name = "mujoco"
-    capabilities: frozenset[Capability] = frozenset({"missed_contacts"})
+    capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
     shares_systems = False

@@ -11,12 +11,13 @@ import mujoco.batch
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.elementwise import TURN
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.batch_model import FLOATING, INERTIAL, BatchModel, expand_inertias, set_inertia
-from batchpid.sim.engine.mujoco.model_builder import robot_model
+from batchpid.sim.engine.mujoco.model_builder import LARGEST_FORCE, RobotMj, robot_model
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
@@ -47,34 +48,39 @@ class MujocoPack(SingleOwner):
         links: Sequence[str] = (),
     ) -> None:
         self.spec, self.size, self.first_env = spec, size, first_env
-        self._robot = robot_model(spec)
         self.dof, self._variation = len(spec.joints), variation or Variation()
-        self._batch = mujoco.batch.Batch(self._robot.model, size, nthread=1, persistent=True)
-        self._state = [self._batch.bind(name) for name in _STATE]
-        self._qpos, self._qvel, _ = self._state
-        self._applied, self._bias = self._batch.bind("qfrc_applied"), self._batch.bind("qfrc_bias")
-        self._at, self._moves = _columns(self._robot.qpos), _columns(self._robot.qvel)
-        self.qf = np.zeros((size, self.dof))
-        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         varied = self._variation
         self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))
-        self._bodies = {}
-        if self._masses_vary:
-            varies_links = varied.link_mass is not None or varied.center_of_mass is not None
-            self._bodies = varied_bodies(spec, carrier, links if varies_links else [])
-            expand_inertias(self._batch)
-            self._change_masses(range(size))
+        varies_links = varied.link_mass is not None or varied.center_of_mass is not None
+        self._bodies = varied_bodies(spec, carrier, links if varies_links else []) if self._masses_vary else {}
+        self.qf = np.zeros((size, self.dof))
+        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
         self.armature = self._motors = np.zeros((1, self.dof)) if varied.armature is None else varied.armature
         self._implicit = spec.timestep * np.array([[joint.damping for joint in spec.joints]])
         coupling = coupling_of(spec.joints)
+        self._continuous = np.array([joint.continuous for joint in spec.joints])
         self._constraint = None
         if coupling is not None:
-            continuous = np.array([joint.continuous for joint in spec.joints])
-            self._constraint = ConstraintEfforts(coupling, continuous, spec.timestep)
+            self._constraint = ConstraintEfforts(coupling, self._continuous, spec.timestep)
+        self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
+        self._actuators: Actuators | None = None
+        self._make_batch(robot_model(spec))
         if variation is not None:
             self.write_joints(None)
         self._batch.forward(stage=_STAGE)
+
+    def _make_batch(self, robot: RobotMj) -> None:
+        """Make the simulations, of ``robot``, with their masses."""
+        self._robot = robot
+        self._batch = mujoco.batch.Batch(robot.model, self.size, nthread=1, persistent=True)
+        self._state = [self._batch.bind(name) for name in _STATE]
+        self._qpos, self._qvel, _ = self._state
+        self._applied, self._bias = self._batch.bind("qfrc_applied"), self._batch.bind("qfrc_bias")
+        self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
+        if self._masses_vary:
+            expand_inertias(self._batch)
+            self._change_masses(range(self.size))
 
     @cached_property
     def _model(self) -> BatchModel:
@@ -163,6 +169,7 @@ class MujocoPack(SingleOwner):
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
+        self._actuators = actuators
         self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
         added = None if actuators is None else actuators.armature
         self.armature = self._motors + (0.0 if added is None else added)
@@ -173,6 +180,36 @@ class MujocoPack(SingleOwner):
         self._batch.expand("dof_armature")[changed[:, None], self._robot.qvel] = values[changed]
         self._batch.set_const(changed)
         self._batch.forward(changed, stage=_STAGE)
+
+    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+        """Set the drive of every joint; each argument broadcasts to (M, dof).
+
+        They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity v+ after it, the
+        effort kp (r - q - dt v+) + kd (r' - v+) is that of stiffness kp and implicit damping kd + dt kp.
+        """
+        if self._robot.model.nu == 0:
+            state, applied = self.read_state(), self._applied.copy()
+            self._make_batch(robot_model(self.spec, drives=True))
+            self.write_joints(self._actuators)
+            self.write_state_rows(state)
+            self._applied[...] = applied
+            suspended, self._suspended = self._suspended, np.zeros(self.size, bool)
+            self.suspend(suspended)
+        limit = np.minimum(force_limit, LARGEST_FORCE)
+        shape = self.qf.shape
+        self._stiffness, self._rate_gain = (np.broadcast_to(table, shape).copy() for table in (stiffness, damping))
+        bias, bounds = self._batch.expand("actuator_biasprm"), self._batch.expand("actuator_forcerange")
+        bias[:, :, 1] = -self._stiffness
+        bias[:, :, 2] = -self._rate_gain - self.spec.timestep * self._stiffness
+        bounds[:, :, 0], bounds[:, :, 1] = -limit, limit
+
+    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
+        error = position - self.read_qpos()
+        position = np.where(self._continuous, position - TURN * np.rint(error / TURN), position)
+        if velocity is not None:
+            self._target_rate = velocity
+        self._batch.bind("ctrl")[...] = self._stiffness * position + self._rate_gain * self._target_rate
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Change the robots ``rows`` to ``variation``, one row for each of them."""

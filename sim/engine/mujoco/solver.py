@@ -19,7 +19,7 @@ class MujocoSolver:
     elliptic: bool = True
     """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
     limit_time: float = 0.002
-    """Time constant of joint limits [s], at least two sim steps; with the default of MuJoCo, 0.02, joints pass by 0.01."""
+    """Time constant of joint limits [s], at least two sim steps. MuJoCo's default of 0.02 lets joints pass by 0.01."""
     contact_time: float = 0.005
     """Time constant of contacts [s], at least two sim steps."""
 
