@@ -40,6 +40,8 @@ LARGEST_FORCE = 1e10
 """Limit of a drive without a limit [N m or N]."""
 _NARROWEST = 1e-9
 """Smallest range of a limited joint [rad or m]: MuJoCo requires a positive one."""
+_HARD = (0.99, 0.999, 1e-4, 0.5, 2.0)
+"""Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit is cancelled."""
 _FARTHEST = 1e10
 """Limit in place of an infinite one on one side [rad or m]."""
 
@@ -149,7 +151,8 @@ def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia])
                 axis=axis / np.linalg.norm(axis),
                 limited=limited,
                 range=[lower, max(upper, lower + _NARROWEST)],
-                solref_limit=[spec.physics.limit_time, 1.0],
+                solref_limit=[max(spec.physics.limit_time, 2 * spec.timestep), 1.0],
+                solimp_limit=_HARD,
                 armature=spec.timestep * damping[name],
             )
         added[link] = body

@@ -18,8 +18,8 @@ class MujocoSolver:
     """Relative improvement of the cost at which it ends."""
     elliptic: bool = True
     """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
-    limit_time: float = 0.002
-    """Time constant of joint limits [s], at least two sim steps. MuJoCo's default of 0.02 lets joints pass by 0.01."""
+    limit_time: float = 0.0
+    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that MuJoCo simulates."""
     contact_time: float = 0.005
     """Time constant of contacts [s], at least two sim steps."""
 

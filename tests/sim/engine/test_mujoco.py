@@ -1,0 +1,363 @@
+"""MuJoCo as an engine: the model that is built, the same motion as in SAPIEN, and the promises of a runner."""
+
+import dataclasses
+import os
+import signal
+import sys
+
+import numpy as np
+import pytest
+
+mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("mujoco.batch")
+
+from identical import assert_identical  # noqa: E402
+from processes import children  # noqa: E402
+from robots import RUBBING, load_bundled  # noqa: E402
+from tiny_urdf import INERTIAL, joint, link, one_joint, random_tree, robot, write  # noqa: E402
+
+import batchpid as bp  # noqa: E402
+from batchpid.errors import InvalidArgumentError, MissingDependencyError  # noqa: E402
+from batchpid.sim import (  # noqa: E402
+    FaultWarning,
+    MujocoSolver,
+    Physics,
+    Randomization,
+    RecoveryWarning,
+    Robot,
+    Runner,
+    Uniform,
+)
+from batchpid.sim.engine import engines  # noqa: E402
+from batchpid.sim.engine.engines import load_engine  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
+from batchpid.sim.observation import OBSERVED  # noqa: E402
+
+SCALE = Uniform(0.8, 1.2, operation="scale")
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
+
+
+def spec_of(of: Robot, engine: str = "mujoco", **changes) -> SceneSpec:
+    physics = load_engine(engine).physics["accurate"]
+    spec = SceneSpec(of.urdf, of.ignored_pairs, of.joints, 5e-4, physics, fixed_base=of.fixed_base, engine=engine)
+    return dataclasses.replace(spec, **changes)
+
+
+def run(engine="mujoco", name="panda", num_envs=6, ticks=20, rows=slice(None), **options):
+    """Run to setpoints that depend on the env; return the last observation."""
+    arm = load_bundled(name) if isinstance(name, str) else name
+    setpoints = arm.start + 0.2 * np.sin(np.arange(arm.dof) + np.arange(6)[:, None])
+    setpoints = np.clip(setpoints, arm.lower, arm.upper)[rows]
+    with Runner(arm, num_envs, engine=engine, **options) as runner:
+        runner.reset()
+        for _ in range(ticks):
+            obs = runner.step(setpoints)
+    assert np.abs(obs.qpos - arm.start).max() > 0.01
+    return obs
+
+
+def assert_same_env(alone, among, env):
+    for name in OBSERVED:
+        np.testing.assert_array_equal(getattr(alone, name)[0], getattr(among, name)[env], name)
+
+
+# -- the model ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dynamics_are_those_of_mujocos_own_reading_of_the_urdf(tmp_path, seed):
+    path = write(tmp_path, robot(*random_tree(np.random.default_rng(seed), 12)))
+    arm = Robot.load(path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    qpos, qvel, qacc = rng.normal(size=(3, 20, arm.dof))
+    ours = load_engine("mujoco").scene_dynamics(spec_of(arm))
+    order = [model.joint(name).dofadr[0] for name in arm.joint_names]
+    for row in range(20):
+        data.qpos[order], data.qvel[order], data.qacc[order] = qpos[row], qvel[row], qacc[row]
+        mujoco.mj_inverse(model, data)
+        full = np.empty((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        one = slice(row, row + 1)
+        scale = np.abs(full).max()
+        np.testing.assert_allclose(ours.joint_mass_matrix(qpos[one])[0], full[np.ix_(order, order)], atol=1e-12 * scale)
+        expected = data.qfrc_inverse[order]
+        effort = ours.inverse_dynamics(qpos[one], qvel[one], qacc[one])
+        np.testing.assert_allclose(effort[0], expected, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(ours.forward_dynamics(qpos[one], qvel[one], effort)[0], qacc[row], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize("fixed_base", [True, False])
+def test_dynamics_are_those_of_sapien_up_to_single_precision(name, fixed_base):
+    arm = Robot.load(name, fixed_base=fixed_base)
+    mine, other = (load_engine(engine).scene_dynamics(spec_of(arm, engine)) for engine in ("mujoco", "sapien"))
+    qpos, qvel = arm.sample(20, seed=1), np.random.default_rng(0).normal(size=(20, arm.dof))
+    expected = other.joint_mass_matrix(qpos)
+    np.testing.assert_allclose(mine.joint_mass_matrix(qpos), expected, atol=2e-5 * np.abs(expected).max())
+    if fixed_base:
+        for gravity, coriolis in ((True, True), (True, False), (False, True)):
+            force = other.passive_force(qpos, qvel, gravity, coriolis)
+            ours = mine.passive_force(qpos, qvel, gravity, coriolis)
+            np.testing.assert_allclose(ours, force, atol=2e-5 * np.abs(force).max())
+
+
+def test_the_native_mass_matrix_is_that_of_the_model(tmp_path):
+    from batchpid.sim.engine.native_mass_matrix import NativeMassMatrix
+
+    tree = Robot.load(write(tmp_path, robot(*random_tree(np.random.default_rng(5), 12))))
+    for arm in (load_bundled("panda"), load_bundled("jaco2"), tree):
+        spec, qpos = spec_of(arm), arm.sample(20, seed=1)
+        expected = load_engine("mujoco").scene_dynamics(spec).mass_matrix(qpos)
+        np.testing.assert_allclose(NativeMassMatrix(spec)(qpos), expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_pairs_that_are_ignored_do_not_collide_and_the_others_do(tmp_path):
+    box = INERTIAL + '<collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision>'
+    fixed = '<joint name="weld" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0 0 0.3"/></joint>'
+    parts = [link("base", box), link("arm", box), link("tip", box), fixed, link("side", box)]
+    parts += [joint("hinge", "base", "arm"), joint("other", "base", "side", origin="0 0 1.2")]
+    arm = Robot.load(write(tmp_path, robot(*parts)), self_collision="urdf")
+
+    def touching(*ignored):
+        model = robot_model(spec_of(arm, ignored=ignored, ground=False)).model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return data.ncon > 0
+
+    pairs = ("arm", "side"), ("tip", "side")  # arm and tip are one body
+    assert touching()
+    assert touching(pairs[0])
+    assert touching(pairs[1])
+    assert not touching(*pairs)
+
+
+def test_a_link_named_world_and_a_floating_base(tmp_path):
+    text = one_joint().replace('"base"', '"world"')
+    for fixed_base in (True, False):
+        model = robot_model(spec_of(Robot.load(write(tmp_path, text), fixed_base=fixed_base))).model
+        assert model.nv == (1 if fixed_base else 7)
+
+
+# -- the motion --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "tolerance"),
+    [
+        ("panda", {}, 1e-5),
+        ("panda", {"compensate": "gravity"}, 1e-4),
+        ("panda", {"control": "drive"}, 1e-5),
+        ("jaco2", {}, 2e-4),
+        (RUBBING, {}, 1e-4),
+        ("panda", {"actuators": {"command_delay": 0.002, "armature": 0.1}}, 1e-4),
+        ("panda", {"randomization": Randomization(payload=Uniform(0.0, 2.0), link_mass=SCALE)}, 1e-4),
+        ("panda", {"randomization": Randomization(center_of_mass=Uniform(-0.02, 0.02))}, 1e-4),
+        ("panda", {"randomization": Randomization(damping=Uniform(0.0, 2.0), armature=Uniform(0.0, 0.1))}, 1e-4),
+    ],
+)
+def test_a_robot_moves_as_in_sapien(name, options, tolerance):
+    if isinstance(given := options.get("actuators"), dict):
+        options = {"actuators": bp.make_actuators(load_bundled(name).dof, **given)}
+    both = [run(engine, name, workers=0, physics="fast", ticks=40, **options) for engine in ("sapien", "mujoco")]
+    np.testing.assert_allclose(both[0].qpos, both[1].qpos, atol=tolerance)
+    assert all(obs.ok.all() for obs in both)
+
+
+def test_coupled_joints_move_as_in_sapien(tmp_path):
+    mimic = (
+        '<limit lower="-1" upper="1" effort="10" velocity="2"/><mimic joint="hinge" multiplier="-0.5" offset="0.1"/>'
+    )
+    parts = [link("base"), link("arm"), link("finger"), joint("hinge", "base", "arm")]
+    arm = Robot.load(write(tmp_path, robot(*parts, joint("tip", "arm", "finger", inner=mimic))))
+    both = []
+    for engine in ("sapien", "mujoco"):
+        with Runner(arm, 2, engine=engine, workers=0, ground=False) as runner:
+            runner.reset()
+            for _ in range(50):
+                obs = runner.step([0.3, -0.05])
+            both.append(obs.qpos)
+    np.testing.assert_allclose(both[1][:, 1], 0.1 - 0.5 * both[1][:, 0], atol=1e-6)
+    np.testing.assert_allclose(both[0], both[1], atol=1e-4)
+
+
+@pytest.mark.parametrize("compensate", ["none", "gravity", "gravity+coriolis"])
+@pytest.mark.parametrize("fixed_base", [True, False])
+def test_a_branched_robot_moves_as_in_sapien(tmp_path, compensate, fixed_base):
+    tree = robot(*random_tree(np.random.default_rng(2), 12))
+    arm, both = Robot.load(write(tmp_path, tree), fixed_base=fixed_base), []
+    for engine in ("sapien", "mujoco"):
+        options = {"engine": engine, "workers": 0, "control": "effort", "ground": False, "compensate": compensate}
+        with Runner(arm, 2, **options) as runner:
+            runner.reset(np.full((2, arm.dof), 0.1), qvel=np.full((2, arm.dof), 0.3))
+            for _ in range(10):
+                obs = runner.step(np.full((2, arm.dof), 0.5))
+            both.append(obs.qpos)
+    np.testing.assert_allclose(both[0], both[1], atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.SetpointWarning")
+def test_joints_stop_at_their_limits(panda):
+    """Within the travel of one sim step, and within 1e-4 rad where they rest under load."""
+    with Runner(panda, 1, engine="mujoco", workers=0, substeps=1, compensate="none") as runner:
+        runner.reset()
+        for _ in range(1500):
+            speed = 0.0 if runner.time == 0 else np.abs(obs.qvel).max()  # noqa: F821
+            obs = runner.step(panda.upper + 0.5)
+            beyond = np.maximum(panda.lower - obs.qpos, obs.qpos - panda.upper).max()
+            assert beyond < 1e-4 + speed * runner.timestep
+    assert beyond < 1e-4
+    assert (obs.qpos[0, [0, 2, 4, 6]] > panda.upper[[0, 2, 4, 6]] - 1e-3).any()
+
+
+def test_the_ground_holds_a_robot_that_falls_on_it(tmp_path):
+    box = INERTIAL + '<collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision>'
+    text = robot(link("base", box), link("arm"), joint("hinge", "base", "arm", origin="0 0 0"))
+    arm = Robot.load(write(tmp_path, text), fixed_base=False)
+    with Runner(arm, 1, engine="mujoco", workers=0, ground=True) as runner:
+        runner.reset()  # the box begins half within the ground
+        for _ in range(50):
+            obs = runner.step(np.zeros((1, 1)))
+    assert obs.ok.all()
+    assert abs(obs.qpos[0, 0]) < 0.05
+
+
+# -- promises ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_any_number_of_workers(workers):
+    assert_identical(run(workers=workers), run(workers=0))
+
+
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_an_env_alone(control):
+    among = run(workers=0, control=control)
+    for env in range(6):
+        alone = run(num_envs=1, rows=slice(env, env + 1), workers=0, control=control)
+        assert_same_env(alone, among, env)
+
+
+def test_contact_does_not_depend_on_the_company(panda):
+    """The grippers close with full effort, and the arms push against themselves or the ground."""
+    setpoints = panda.sample(6, seed=3)
+
+    def push(rows):
+        with Runner(panda, len(setpoints[rows]), engine="mujoco", workers=0) as runner:
+            runner.reset()
+            for _ in range(60):
+                obs = runner.step(setpoints[rows])
+            return obs
+
+    among = push(slice(None))
+    assert (np.abs(among.qpos - setpoints).max(1) > 0.05).any()  # something is in the way
+    for env in (0, 3, 5):
+        assert_same_env(push(slice(env, env + 1)), among, env)
+
+
+def test_a_snapshot_continues_elsewhere(panda):
+    setpoints = panda.sample(4, seed=3)
+    options = {"engine": "mujoco", "randomization": Randomization(payload=Uniform(0.0, 1.0))}
+    with Runner(panda, 4, workers=0, **options) as one, Runner(panda, 4, workers=2, **options) as other:
+        one.reset()
+        one.rollout(np.broadcast_to(setpoints, (20, 4, panda.dof)))
+        other.restore(one.snapshot())
+        for _ in range(20):
+            first, second = one.step(setpoints), other.step(setpoints)
+    assert_identical(second, first)
+
+
+def test_a_snapshot_of_the_other_engine_is_refused(panda):
+    with Runner(panda, 1, workers=0) as one:
+        snapshot = one.snapshot()
+    with Runner(panda, 1, workers=0, engine="mujoco") as other, pytest.raises(InvalidArgumentError, match="engine"):
+        other.restore(snapshot)
+
+
+def test_a_killed_worker_changes_nothing(panda):
+    setpoints = panda.sample(4, seed=3)
+
+    def obs(kill):
+        with Runner(panda, 4, workers=2, engine="mujoco") as runner:
+            runner.reset()
+            for tick in range(12):
+                if kill and tick == 6:
+                    os.kill(runner.pids[0], signal.SIGKILL)
+                last = runner.step(setpoints)
+            return last
+
+    with pytest.warns(RecoveryWarning):
+        assert_identical(obs(True), obs(False))
+    assert not children()
+
+
+@pytest.mark.parametrize("on_fault", ["hold", "reset"])
+def test_an_env_that_fails_stays_alone(panda, on_fault):
+    setpoints = panda.sample(4, seed=3)
+
+    def last(bad):
+        options = {"on_fault": on_fault, "on_invalid_input": "contain"}
+        with Runner(panda, 4, workers=0, engine="mujoco", **options) as runner:
+            runner.reset()
+            for tick in range(12):
+                rows = setpoints.copy()
+                rows[1] = np.where(bad and tick == 5, np.nan, rows[1])
+                obs = runner.step(rows)
+            return obs
+
+    with pytest.warns(FaultWarning):
+        with_fault = last(True)
+    expected = last(False)
+    for env in (0, 2, 3):
+        np.testing.assert_array_equal(with_fault.qpos[env], expected.qpos[env])
+    assert np.isfinite(with_fault.qpos).all()
+
+
+def test_a_state_that_is_not_finite_is_contained(panda):
+    with Runner(panda, 3, workers=0, engine="mujoco", control="effort", compensate="none") as runner:
+        runner.reset()
+        pack = next(iter(runner._pool._slots)).worker._loop.groups[0].pack
+        pack._qvel[1] = np.nan
+        with pytest.warns(FaultWarning):
+            obs = runner.step(np.zeros((3, panda.dof)))
+        assert list(obs.ok) == [True, False, True]
+        obs = runner.reset(mask=np.array([False, True, False]))
+        obs = runner.step(np.zeros((3, panda.dof)))
+        assert obs.ok.all()
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"physics": Physics("PGS", 4)}, "physics.*'accurate'"),
+        ({"pack_size": 4}, "pack_size.*leave it out"),
+        ({"build": lambda scene, env: None}, "build.*'sapien'"),
+        ({"engine": "mujocoo"}, "engine.*'mujoco'"),
+    ],
+)
+def test_options_without_meaning_are_refused(panda, options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Runner(panda, 1, **{"engine": "mujoco", "workers": 0} | options)
+
+
+def test_the_solver_of_mujoco_is_refused_by_sapien(panda):
+    with pytest.raises(InvalidArgumentError, match="physics"):
+        Runner(panda, 1, workers=0, physics=MujocoSolver())
+    with Runner(panda, 1, workers=0, engine="mujoco", physics=MujocoSolver(iterations=7)) as runner:
+        assert runner.options.solver.iterations == 7
+
+
+def test_sapiens_own_friction_is_refused():
+    with pytest.raises(InvalidArgumentError, match="sapien_dissipation"):
+        Runner(Robot.load("panda", dissipation="sapien"), 1, workers=0, engine="mujoco")
+
+
+def test_without_mujoco_the_message_names_the_extra(panda, monkeypatch):
+    monkeypatch.delitem(sys.modules, engines.MODULES["mujoco"], raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco.batch", None)
+    with pytest.raises(MissingDependencyError, match=r"batchpid\[mujoco\]"):
+        load_engine("mujoco")
