@@ -29,6 +29,7 @@ from batchpid.sim.cli.excite import ExciteCommand
 from batchpid.sim.cli.export import ExportCommand
 from batchpid.sim.cli.identify import IdentifyCommand
 from batchpid.sim.cli.inspect import InspectCommand
+from batchpid.sim.cli.parity import ParityCommand
 from batchpid.sim.cli.plot import PlotCommand
 from batchpid.sim.cli.progress import close_bars
 from batchpid.sim.cli.render import RenderCommand
@@ -48,6 +49,7 @@ COMMANDS: dict[str, type[Any]] = {
     "identify": IdentifyCommand,
     "export": ExportCommand,
     "inspect": InspectCommand,
+    "parity": ParityCommand,
     "survey": SurveyCommand,
     "plot": PlotCommand,
     "view": ViewCommand,

@@ -80,8 +80,7 @@ class MujocoDynamics:
 
     @cached_property
     def _shapes(self) -> RobotModel:
-        sapien = load_engine("sapien")
-        return sapien.scene_dynamics(replace(self._spec, engine="sapien", physics=sapien.physics["fast"]))
+        return load_engine("sapien").scene_dynamics(in_sapien(self._spec))
 
     def link_poses(self, qpos: NDArray[Any]) -> Float64:
         """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
@@ -98,6 +97,11 @@ class MujocoDynamics:
     def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,)."""
         return self._shapes.height(qpos, base_too)
+
+
+def in_sapien(spec: SceneSpec) -> SceneSpec:
+    """Return ``spec`` for SAPIEN, for questions about contact at a pose."""
+    return replace(spec, engine="sapien", physics=load_engine("sapien").physics["fast"])
 
 
 def bodies_of(spec: SceneSpec) -> RigidBodies:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.mujoco.mujoco_dynamics import MujocoDynamics, scene_dynamics
+from batchpid.sim.engine.mujoco.mujoco_dynamics import MujocoDynamics, in_sapien, scene_dynamics
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
 from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine, RobotModel
@@ -60,7 +60,7 @@ class MujocoEngine:
 
     def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
         """Return the record of contacts of robots without shapes, by SAPIEN."""
-        return load_engine("sapien").missed_contacts(spec, size, ground)
+        return load_engine("sapien").missed_contacts(in_sapien(spec), size, ground)
 
     def self_contact(self, robot: RobotDescription) -> SelfContact:
         """Return the pairs of links that do not collide, by SAPIEN."""

@@ -28,6 +28,7 @@ RUNS = {
     "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --force --out out/a.json",
     "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --force --out out/a.yaml",
     "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --force --picture out/a.png",
+    "parity": "parity arm.urdf --moves 1 --seconds 0.3 --workers 0 --force --json out/a.json --picture out/a.png",
     "excite": "excite arm.urdf --duration 1 --force --out out/a.csv",
     "export": "export arm.urdf --force --out out/a.h",
     "identify": "identify arm.urdf log.npz --params gains.yaml --evaluations 1 --no-payload --workers 0 --force "

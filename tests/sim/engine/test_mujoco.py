@@ -149,6 +149,7 @@ def test_a_link_named_world_and_a_floating_base(tmp_path):
         ("panda", {}, 1e-5),
         ("panda", {"compensate": "gravity"}, 1e-4),
         ("panda", {"control": "drive"}, 1e-5),
+        ("panda", {"collisions": False}, 1e-5),
         ("jaco2", {}, 2e-4),
         (RUBBING, {}, 1e-4),
         ("panda", {"actuators": {"command_delay": 0.002, "armature": 0.1}}, 1e-4),

@@ -1,0 +1,105 @@
+"""MuJoCo as an engine: speed over SAPIEN's, and over MuJoCo alone, in one process in turn; memory and build time.
+
+Processor time: another program disturbs it less.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+pytest.importorskip("mujoco")
+mujoco_batch = pytest.importorskip("mujoco.batch")
+
+from batchpid.sim import Robot, Runner  # noqa: E402
+from batchpid.sim.benchmark.workload import Workload  # noqa: E402
+from batchpid.sim.options import default_params  # noqa: E402
+
+TICKS, ROUNDS, SUBSTEPS = 20, 5, 20
+GAINS = ("tutorial", "tuned")
+
+
+def seconds_per_env_step(runner: Runner, workload: Workload, ticks: int) -> float:
+    """Return the processor time of an env step; the robots begin at their start."""
+    runner.reset(workload.start)
+    setpoints = np.broadcast_to(workload.target, (ticks, *workload.target.shape))
+    began = time.process_time()
+    qpos = runner.rollout(setpoints).qpos[-1]
+    seconds = time.process_time() - began
+    assert np.abs(qpos - workload.start)[:, workload.moving].max() > 0.05, "the robots did not move"
+    return seconds / (ticks * SUBSTEPS * runner.num_envs)
+
+
+def bare_engine(runner: Runner, ticks: int) -> float:
+    """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under fixed efforts."""
+    pack: Any = runner._pool._slots[0].worker._loop.groups[0].pack
+    batch = mujoco_batch.Batch(pack._robot.model, runner.num_envs, nthread=1, persistent=True)
+    qpos = batch.bind("qpos")
+    qpos[:, pack._robot.qpos] = pack.read_qpos()
+    before = qpos.copy()
+    batch.bind("qfrc_applied")[...] = 0.1
+    began = time.process_time()
+    for _ in range(ticks * SUBSTEPS):
+        batch.step()
+    seconds = time.process_time() - began
+    assert np.abs(qpos - before).max() > 1e-3, "the robots did not move"
+    return seconds / (ticks * SUBSTEPS * runner.num_envs)
+
+
+@pytest.mark.parametrize("gains", GAINS)
+@pytest.mark.parametrize("num_envs", [1, 64])
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_speed_over_sapien(benchmark, report, compare, most, name, num_envs, gains):
+    benchmark.group = "MuJoCo, in one process"
+    robot, num_envs = Robot.load(name), min(num_envs, most.envs)
+    params = robot.params() if gains == "tutorial" else default_params(robot)
+    ticks, rounds = min(TICKS, most.ticks), min(ROUNDS, most.rounds)
+    workload = Workload(robot, num_envs, workers=0, ticks=ticks)
+
+    def measure():
+        options: dict[str, Any] = {"params": params, "workers": 0, "substeps": SUBSTEPS}
+        with (
+            Runner(robot, num_envs, physics="accurate", **options) as accurate,
+            Runner(robot, num_envs, physics="fast", **options) as fast,
+            Runner(robot, num_envs, engine="mujoco", **options) as mujoco,
+        ):
+            runners = accurate, fast, mujoco
+            rows = []
+            for _ in range(rounds + 1):
+                row = [seconds_per_env_step(runner, workload, ticks) for runner in runners]
+                rows.append([*row, bare_engine(mujoco, ticks)])
+        return rows[1:]
+
+    rows = benchmark.pedantic(measure, rounds=1)
+    report([row[2] for row in rows])
+    for column, other in ((0, "SAPIEN accurate"), (1, "SAPIEN fast"), (3, "mujoco.batch without control")):
+        ratio = statistics.median(row[column] / row[2] for row in rows)
+        benchmark.extra_info[f"over {other}"] = round(ratio, 3)
+        compare(f"{name}, {gains} gains", f"MuJoCo, {num_envs} envs", other, ratio)
+
+
+def test_thousands_of_envs(benchmark, report, most):
+    """Build 8,192 pandas in this process, and step them once: time, and memory of each."""
+    benchmark.group = "MuJoCo, in one process"
+    robot, num_envs = Robot.load("panda"), min(8192, 100 * most.envs)
+    with Runner(robot, 1, engine="mujoco", workers=0) as runner:
+        runner.reset()  # the model is compiled once
+    process = psutil.Process()
+
+    def build():
+        before, began = process.memory_info().rss, time.perf_counter()
+        with Runner(robot, num_envs, engine="mujoco", workers=0, checkpoint_steps=None, substeps=1) as runner:
+            seconds = time.perf_counter() - began
+            start = runner.reset().qpos
+            assert np.abs(runner.step(robot.settings.target).qpos - start).max() > 0
+            return seconds, (process.memory_info().rss - before) / num_envs
+
+    seconds, memory = benchmark.pedantic(build, rounds=1)
+    report([seconds])
+    benchmark.extra_info |= {"build_seconds": round(seconds, 3), "kB_per_env": round(memory / 1e3, 2)}
+    print(f"\n{num_envs} pandas: built in {seconds:.2f} s, {memory / 1e3:.1f} kB for each")

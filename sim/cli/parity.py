@@ -1,0 +1,93 @@
+"""``batchpid parity``: one robot in both physics engines, how far they differ, and what that means."""
+
+from __future__ import annotations
+
+import json as json_text
+from dataclasses import dataclass
+
+import numpy as np
+
+from batchpid.io.files import write_atomically
+from batchpid.sim import Robot
+from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.tuning.gain_sets import gain_set
+
+
+@dataclass(frozen=True)
+class ParityCommand:
+    """Compare SAPIEN and MuJoCo on one robot: dynamics, motion under equal efforts and gains, contact."""
+
+    robot: flags.RobotName = "panda"
+    gains: flags.Gains = None
+    moves: int = 8
+    """Number of random moves under the gains."""
+    seed: int = 0
+    """Seed of states, efforts and moves."""
+    seconds: flags.Seconds = 2.0
+    workers: flags.Workers = None
+    actuators: flags.Actuators = None
+    missing_meshes: flags.MissingMeshes = "skip"
+    picture: flags.OptionalPath = None
+    """Differences over time, to draw: .png or .svg."""
+    json: flags.OptionalPath = None
+    """Figures, as a .json file."""
+    force: flags.Force = False
+
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
+
+    def run(self) -> None:
+        """Run the command."""
+        from batchpid.sim import plots
+        from batchpid.sim.cli.report import table
+        from batchpid.sim.plots.parity_figure import engine_differences
+        from batchpid.sim.tuning.engine_parity import compare_engines
+
+        outputs = Outputs(force=self.force)
+        picture = outputs.path("picture", self.picture, plots.FORMATS)
+        json_path = outputs.path("json", self.json, (".json",))
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        gains = gain_set(robot, self.gains)
+        found = compare_engines(
+            robot, gains.params, moves=self.moves, seconds=self.seconds, seed=self.seed, workers=self.workers
+        )
+        worst, settling = float(found.closed_loop.max()), np.median(found.settling, axis=1)
+        rows = [
+            ["mass matrix, 100 random states", f"{found.mass_matrix:.1e}", "relative"],
+            ["gravity and Coriolis efforts", f"{found.bias:.1e}", "relative"],
+            ["velocity after 5 sim steps", f"{found.first_tick:.1e}", "relative"],
+            [f"equal efforts for {found.time[-1]:g} s", f"{found.open_loop[-1]:.1e}", "rad or m"],
+            ["  two starts one bit apart, in SAPIEN", f"{found.chaos[-1]:.1e}", "rad or m"],
+            [f"equal gains ({gains.name}), {len(found.closed_loop)} moves", f"{worst:.1e}", "rad or m"],
+            ["  settling time, median", " / ".join(f"{each:.2f}" for each in settling), "s, sapien / mujoco"],
+            ["  moves that settled", " / ".join(map(str, found.settled)), "sapien / mujoco"],
+        ]
+        if found.push is not None:
+            rows.append([f"{len(found.push)} pushes on the ground", f"{found.push.max():.1e}", "rad or m"])
+        print(f"{robot.name}: MuJoCo compared with SAPIEN\n")
+        print(table(rows, ["comparison", "difference", "unit"], "lrl"))
+        print()
+        print("\n".join(found.verdict()))
+        if json_path is not None:
+            figures = {name: getattr(found, name) for name in ("mass_matrix", "bias", "first_tick")}
+            arrays = {name: getattr(found, name) for name in ("time", "open_loop", "chaos", "closed_loop", "settling")}
+            figures |= {name: _plain(array) for name, array in arrays.items()}
+            figures |= {"push": _plain(found.push), "settled": found.settled, "verdict": found.verdict()}
+            json_path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(json_path, json_text.dumps(figures, indent=1) + "\n")
+            print(f"\nfigures: {json_path}")
+        if picture is not None:
+            first, second = (each.rollout for each in found.moves)
+            apart = np.abs(first.qpos - second.qpos).max(2)
+            title = f"{robot.name}: MuJoCo compared with SAPIEN"
+            figure = engine_differences(found.time, found.open_loop, found.chaos, first.time, apart, title)
+            print(f"\npicture: {plots.save(figure, picture)}")
+
+
+def _plain(array: object) -> object:
+    """Return an array as lists, with None in place of numbers that JSON lacks."""
+    if array is None:
+        return None
+    rows = np.asarray(array, float)
+    finite: object = np.where(np.isfinite(rows), rows.astype(object), np.array(None)).tolist()
+    return finite

@@ -1,0 +1,36 @@
+"""Comparison of the engines: different where one simulates another robot. The command is in tests/sim/cli."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("mujoco.batch")
+
+from batchpid.sim.engine.mujoco import model_builder, mujoco_dynamics
+from batchpid.sim.tuning.engine_parity import compare_engines
+
+
+def forget():
+    """Drop the models that were built."""
+    model_builder.robot_model.cache_clear()
+    mujoco_dynamics.scene_dynamics.cache_clear()
+
+
+def test_another_mass_is_found(panda, monkeypatch):
+    inertias = model_builder.body_inertias
+
+    def heavier(spec):
+        return {name: each._replace(mass=1.2 * each.mass) for name, each in inertias(spec).items()}
+
+    monkeypatch.setattr(model_builder, "body_inertias", heavier)
+    forget()
+    try:
+        found = compare_engines(panda, moves=1, seconds=1.0, workers=0)
+    finally:
+        forget()
+    assert found.mass_matrix > 0.1
+    said = " ".join(found.verdict())
+    assert "do NOT simulate the same robot" in said
+    assert "more than rounding explains" in said
+    # The gains cope with it, since each engine's control knows its own robot.
+    assert np.isfinite(found.closed_loop).all()
