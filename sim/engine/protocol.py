@@ -169,12 +169,12 @@ class CompiledPack(EnginePack, Protocol):
     ----------
     steps_natively
         Whether :meth:`compiled_step` can be used.
-    steps_read_force
-        Whether a compiled step reads the passive force; otherwise call :meth:`passive_force`.
     """
 
     steps_natively: bool
-    steps_read_force: bool
+
+    def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
+        """Return whether a compiled step reads this part of the passive force; otherwise call :meth:`passive_force`."""
 
     @property
     def calls(self) -> object:

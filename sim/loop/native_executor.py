@@ -53,8 +53,8 @@ class NativeExecutor(NumPyExecutor):
         self._step: CompiledStep | None = None
         self._bound: object = None
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
-        self._steps_read_force = pack.steps_read_force
-        reads_all = pack.steps_read_force or not self._reads_force
+        self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
+        reads_all = self._steps_read_force or not self._reads_force
         self._compiles = reads_all and is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:

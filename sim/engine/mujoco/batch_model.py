@@ -10,6 +10,7 @@ so that efforts h keep the joints from accelerating while the base falls freely.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -21,21 +22,18 @@ from batchpid.sim.engine.mujoco.model_builder import RobotMj, principal_inertia
 from batchpid.sim.robot.spatial_inertia import SpatialInertia
 
 Float64 = NDArray[np.float64]
-INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
-"""Fields of MuJoCo's model with the inertias of the bodies."""
 FLOATING = 6
 """Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
 
 
 class BatchModel:
-    """Dynamics of ``size`` robots, which may differ in their masses. Arrays are (size, dof), in the joints' order."""
+    """Dynamics of ``size`` robots, of ``models`` that differ in their masses. Arrays are (size, dof)."""
 
-    def __init__(self, robot: RobotMj, size: int) -> None:
-        model = copy.copy(robot.model)
-        off = mujoco.mjtDisableBit
-        model.opt.disableflags |= off.mjDSBL_CONTACT | off.mjDSBL_CONSTRAINT
-        model.dof_armature[:] = 0.0
+    def __init__(self, robot: RobotMj, size: int, models: Sequence[Any] | None = None) -> None:
+        model = _free(robot.model)
         self.batch = mujoco.batch.Batch(model, size, nthread=1)
+        if models is not None:
+            self.batch.set_models([_free(each) for each in models])
         self._robot, self._floats = robot, model.nv > len(robot.qvel)
         self._qpos, self._qvel, self._bias = (self.batch.bind(name) for name in ("qpos", "qvel", "qfrc_bias"))
         self._sparse = self.batch.bind("M")  # lower triangle, by rows
@@ -51,21 +49,28 @@ class BatchModel:
             self._qpos[:, : FLOATING + 1], self._qvel[:, :FLOATING] = origin if base is None else base
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
+    def mass_matrix(self) -> Float64:
+        """Return the mass matrices of the joints (size, dof, dof) [kg m^2 or kg], with the base held."""
+        return self._full()[:, self._robot.qvel[:, None], self._robot.qvel]
+
+    def bias(self) -> Float64:
+        """Return gravity, Coriolis and centrifugal efforts (size, dof) [N m or N], with the base held."""
+        return self._bias[:, self._robot.qvel]
+
     def joint_mass_matrix(self) -> Float64:
         """Return the mass matrices that the joints show (size, dof, dof) [kg m^2 or kg]."""
+        if not self._floats:
+            return self.mass_matrix()
         full, joints = self._full(), self._robot.qvel
         own = full[:, joints[:, None], joints]
-        if not self._floats:
-            return own
         couples = full[:, :FLOATING, joints]
         return own - couples.transpose(0, 2, 1) @ np.linalg.solve(full[:, :FLOATING, :FLOATING], couples)
 
     def joint_bias(self) -> Float64:
         """Return gravity, Coriolis and centrifugal efforts that the joints show (size, dof) [N m or N]."""
-        joints = self._robot.qvel
         if not self._floats:
-            return self._bias[:, joints]
-        full = self._full()
+            return self.bias()
+        full, joints = self._full(), self._robot.qvel
         falling = np.linalg.solve(full[:, :FLOATING, :FLOATING], self._bias[:, :FLOATING, None])
         return self._bias[:, joints] - (full[:, joints, :FLOATING] @ falling)[..., 0]
 
@@ -75,20 +80,19 @@ class BatchModel:
         return full
 
 
-def set_inertia(batch: Any, row: int, body: int, inertia: SpatialInertia) -> None:
-    """Give a body of simulation ``row`` of ``mujoco.batch.Batch`` this inertia, in the frame of the body.
+def _free(model: Any) -> Any:
+    """Return a copy of ``model`` without contact, constraints and motors."""
+    free = copy.copy(model)
+    free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    free.dof_armature[:] = 0.0
+    return free
 
-    The fields were expanded by :func:`expand_inertias`.
-    """
+
+def set_inertia(model: Any, body: int, inertia: SpatialInertia) -> None:
+    """Give a body of a ``mujoco.MjModel`` this inertia, in the frame of the body; ``mj_setConst`` comes next."""
     moments, wxyz = principal_inertia(inertia)
-    for name, value in zip(INERTIAL, (inertia.mass, inertia.center, wxyz, moments), strict=True):
-        batch.expand(name)[row, body] = value
-
-
-def expand_inertias(batch: Any) -> None:
-    """Give each simulation of a batch masses and inertias of its own."""
-    for name in INERTIAL:
-        batch.expand(name)
-    # The compiler's shortcuts for centers of mass in the body's frame, and bodies that are moved by one joint.
-    for name in ("body_sameframe", "body_simple", "dof_simplenum"):
-        batch.expand(name)[...] = 0
+    model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
+    model.body_iquat[body], model.body_inertia[body] = wxyz, moments
+    # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are moved by one joint.
+    model.body_sameframe[body], model.body_simple[body] = 0, 0
+    model.dof_simplenum[:] = 0

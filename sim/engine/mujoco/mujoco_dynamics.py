@@ -39,7 +39,8 @@ class MujocoDynamics:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
         if not isinstance(qpos, np.ndarray) and hasattr(qpos, "__array_namespace__"):
             return mass_matrix(self.bodies, qpos)
-        return self.joint_mass_matrix(qpos)
+        with self._lock:
+            return self._computed(qpos, 0.0).mass_matrix()
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices (n, dof, dof) that the joints show, on a floating base where there is one."""
@@ -50,19 +51,19 @@ class MujocoDynamics:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         with self._lock:
             batch = self._computed(qpos, qvel)
-            return batch.joint_bias() + (batch.joint_mass_matrix() @ np.asarray(qacc, float)[..., None])[..., 0]
+            return batch.bias() + (batch.mass_matrix() @ np.asarray(qacc, float)[..., None])[..., 0]
 
     def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
         with self._lock:
-            force = self._computed(qpos, qvel if coriolis else 0.0).joint_bias()
-            return force if gravity else force - self._computed(qpos, 0.0).joint_bias()
+            force = self._computed(qpos, qvel if coriolis else 0.0).bias()
+            return force if gravity else force - self._computed(qpos, 0.0).bias()
 
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
         """Return the accelerations (n, dof) under ``effort``; followers keep to their leaders."""
         with self._lock:
             batch = self._computed(qpos, qvel)
-            acting, matrix = np.asarray(effort) - batch.joint_bias(), batch.joint_mass_matrix()
+            acting, matrix = np.asarray(effort) - batch.bias(), batch.mass_matrix()
         if (coupling := self._coupling) is None:
             free = np.linalg.solve(matrix, acting[..., None])
             return np.asarray(free[..., 0], np.float64)

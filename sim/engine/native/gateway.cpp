@@ -142,8 +142,7 @@ PyObject *contacts(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[0]));
   if (group == nullptr) return nullptr;
-  auto const dof = group->gateway->dof;
-  auto const rows = static_cast<Py_ssize_t>(group->gateway->robots.size());
+  auto const dof = static_cast<Py_ssize_t>(group->dof), rows = static_cast<Py_ssize_t>(group->robots);
   Buffer arrays[4];
   for (int i = 0; i < 4; ++i) {
     int const flags = PyBUF_C_CONTIGUOUS | (i == 0 ? 0 : PyBUF_WRITABLE);
@@ -151,7 +150,7 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   }
   std::int32_t status = 0;
   PyObject *done = without_gil([&] {
-    status = sim_step(*group, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
+    status = try_sim_step(*group, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
                       arrays[3].as<double>());
   });
   if (done == nullptr) return nullptr;
@@ -202,8 +201,8 @@ PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
   if (bound == nullptr || arrays == nullptr || group == nullptr) return nullptr;
-  if (bound->program->rows != static_cast<Index>(group->gateway->robots.size()) ||
-      bound->program->columns != group->gateway->dof || arrays->dof != group->gateway->dof) {
+  if (bound->program->rows != static_cast<Index>(group->robots) ||
+      bound->program->columns != static_cast<Index>(group->dof) || arrays->dof != group->dof) {
     return misfit();
   }
   std::int64_t step = PyLong_AsLongLong(arguments[3]);

@@ -39,6 +39,9 @@ class Group(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "system_of", "contacts", "watched")),
         *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
         *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
+        ("mujoco", ctypes.c_void_p),
+        ("robots", ctypes.c_int64),
+        ("dof", ctypes.c_int64),
         ("pairs", ctypes.c_int64),
         ("bodies_size", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
@@ -46,6 +49,15 @@ class Group(ctypes.Structure):
         ("velocities", ctypes.c_int32),
         ("unused", ctypes.c_int32),
         ("message", ctypes.c_char * 256),
+    ]
+
+
+class Mujoco(ctypes.Structure):
+    """Robots in MuJoCo, as Mujoco in mujoco_step.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "models", "data")),
+        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
     ]
 
 
@@ -74,7 +86,16 @@ def _files(*names: str) -> tuple[str, ...]:
 
 
 def _gateway_tables() -> tuple[Any, ...]:
-    return SYMBOLS, STATUS, FARTHEST, _layout(Group), _layout(Tick), list(BODY.items()), PROGRAM.tables()
+    return (
+        SYMBOLS,
+        STATUS,
+        FARTHEST,
+        _layout(Group),
+        _layout(Mujoco),
+        _layout(Tick),
+        list(BODY.items()),
+        PROGRAM.tables(),
+    )
 
 
 def _batch_dynamics_tables() -> tuple[Any, ...]:
@@ -85,7 +106,16 @@ EXTENSIONS = {
     "_gateway": Extension(
         "batchpid.sim.engine.native._gateway",
         (
-            *_files("gateway.cpp", "buffer.h", "gateway.h", "rigid_body.h", "sim_step.h", "tick.h", "xla_call.h"),
+            *_files(
+                "gateway.cpp",
+                "buffer.h",
+                "gateway.h",
+                "mujoco_step.h",
+                "rigid_body.h",
+                "sim_step.h",
+                "tick.h",
+                "xla_call.h",
+            ),
             *HEADERS,
         ),
         (*ROUNDED, "-pthread"),

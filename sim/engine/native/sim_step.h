@@ -3,6 +3,7 @@
 #pragma once
 
 #include "gateway.h"
+#include "mujoco_step.h"
 
 #include <algorithm>
 #include <cmath>
@@ -39,10 +40,12 @@ struct Group {
   double *used;                      // (pairs,): work space
   char *outside;                     // (robots,): robots that have left their region, an output
   double const *speed_limit;         // (dof,), or null
+  Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway, and nothing to watch
+  std::int64_t robots, dof;
   std::int64_t pairs, bodies_size;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
   std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
-  char message[256];                 // of an exception of SAPIEN
+  char message[256];                 // of an exception of the engine
 };
 
 // Return whether a system lists a contact of a robot that shares it and has no region.
@@ -130,9 +133,43 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
   return status;
 }
 
-// The same for callers that take no exceptions.
+// The same in MuJoCo; the arrays are those of the robots and of the rows beyond them.
+template <class T>
+std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+  Mujoco const &mujoco = *group.mujoco;
+  std::int64_t const dof = group.dof;
+  std::int32_t status = 0;
+  LogHandler const before = mujoco.set_log_handler(Messages::handle);
+  if (before != Messages::handle) Messages::previous = before;
+  for (std::int64_t row = 0; row < group.robots && status != FAILED; ++row) {
+    std::int64_t const at = row * dof;
+    for (std::int64_t joint = 0; joint < dof; ++joint) {
+      mujoco.qf[at + joint] = static_cast<double>(effort[at + joint]);
+      if (!group.skip[row]) mujoco.applied[row][mujoco.qvel_at[joint]] = mujoco.qf[at + joint];
+    }
+    if (!group.skip[row] && !advance(mujoco, row, dof, FARTHEST, group.message)) status = FAILED;
+    for (std::int64_t joint = 0; joint < dof; ++joint) {
+      std::int64_t const place = mujoco.qvel_at[joint];
+      double const q = mujoco.qpos[row][mujoco.qpos_at[joint]], v = mujoco.qvel[row][place];
+      qpos[at + joint] = static_cast<T>(q);
+      qvel[at + joint] = static_cast<T>(v);
+      passive[at + joint] = static_cast<T>(group.gravity ? mujoco.bias[row][place] : 0.0);
+      if (!(std::fabs(q) <= FARTHEST)) status |= NOT_FINITE;
+      if (group.speed_limit && !(std::fabs(v) <= group.speed_limit[joint])) status |= TOO_FAST;
+    }
+  }
+  mujoco.set_log_handler(before);
+  auto const size = static_cast<std::size_t>(dof) * sizeof(T);
+  for (std::int64_t row = group.robots; row < rows; ++row) {
+    for (T *table : {qpos, qvel, passive}) std::memcpy(table + row * dof, table, size);
+  }
+  return status;
+}
+
+// The same for callers that take no exceptions, in the engine of the group.
 template <class T>
 std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+  if (group.mujoco != nullptr) return mujoco_step(group, rows, effort, qpos, qvel, passive);
   char const *message = "SAPIEN raised an exception";
   std::size_t const last = sizeof(group.message) - 1;
   try {

@@ -68,7 +68,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
 // Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
 inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group &group, std::int64_t &step,
                              std::int64_t until, std::int64_t end) {
-  auto const robots = static_cast<std::int64_t>(group.gateway->robots.size());
+  auto const robots = group.robots;
   auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
   std::int32_t status = 0;
   while (step < until && status == 0) {

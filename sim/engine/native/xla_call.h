@@ -112,10 +112,10 @@ extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
   static_assert(sizeof(group) == 2 * sizeof(std::uint32_t));
   if (in[0]->dtype != U32 || in[0]->rank != 1 || in[0]->dims[0] != 2) return invalid(frame->api, "no address");
   std::memcpy(&group, in[0]->data, sizeof(group));
-  auto const robots = static_cast<std::int64_t>(group->gateway->robots.size());
+  auto const robots = group->robots;
   for (Array const *array : {in[2], out[0], out[1], out[2]}) {
     if (array->dtype != in[2]->dtype || array->rank != 2 || array->dims[0] != in[2]->dims[0] ||
-        array->dims[1] != group->gateway->dof || array->dims[0] < robots || robots == 0) {
+        array->dims[1] != group->dof || array->dims[0] < robots || robots == 0) {
       return invalid(frame->api, "an array has a wrong shape or type");
     }
   }

@@ -64,11 +64,7 @@ class Pack(SingleOwner):
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
     steps_natively
         Whether the calls into the engine are native.
-    steps_read_force
-        Whether :meth:`compiled_step` reads the force of :meth:`passive_force`.
     """
-
-    steps_read_force = True
 
     def __init__(
         self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
@@ -151,6 +147,10 @@ class Pack(SingleOwner):
     def calls(self) -> EngineCalls:
         """Calls into the engine, other ones since robots or systems were replaced."""
         return self._calls
+
+    def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
+        """Return whether :meth:`compiled_step` reads this part of the force of :meth:`passive_force`."""
+        return True
 
     def compiled_step(
         self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None

@@ -79,6 +79,8 @@ class NativeStep:
         } | ({} if limit is None else {"speed_limit": limit})
         self._group = Group(
             gateway=gateway_address(calls.gateway),
+            robots=count,
+            dof=calls.qf.shape[1],
             pairs=pairs,
             bodies_size=len(bodies),
             gravity=gravity,

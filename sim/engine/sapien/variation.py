@@ -97,9 +97,8 @@ class VariedPack(Pack):
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         return scene_dynamics(self.spec).joint_mass_matrix(qpos, self._added)
 
-    @property
-    def steps_read_force(self) -> bool:  # type: ignore[override]
-        """Whether compiled steps read the force of the model: not where a mass differs from it."""
+    def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
+        """Return whether compiled steps read the force of the model: not where a mass differs from it."""
         return not self._bodies
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:

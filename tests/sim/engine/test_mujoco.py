@@ -319,7 +319,7 @@ def test_a_state_that_is_not_finite_is_contained(panda):
     with Runner(panda, 3, workers=0, engine="mujoco", control="effort", compensate="none") as runner:
         runner.reset()
         pack = next(iter(runner._pool._slots)).worker._loop.groups[0].pack
-        pack._qvel[1] = np.nan
+        pack._data[1].qvel[:] = np.nan
         with pytest.warns(FaultWarning):
             obs = runner.step(np.zeros((3, panda.dof)))
         assert list(obs.ok) == [True, False, True]

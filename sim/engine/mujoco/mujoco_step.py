@@ -1,0 +1,110 @@
+"""Sim step of robots in MuJoCo as one native call, of the same kind as SAPIEN's.
+
+Robots are stepped by MuJoCo's public functions ``mj_step2`` (from velocities to the next state) and ``mj_step1`` (all
+that follows from that state alone, so also gravity and Coriolis forces).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.engine import native
+from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.native.interface import Group, Mujoco
+
+FUNCTIONS = {"step1": "mj_step1", "step2": "mj_step2", "set_log_handler": "mju_setLogHandler"}
+"""Functions of MuJoCo's library, by field of :class:`batchpid.sim.engine.native.interface.Mujoco`."""
+FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias"}
+"""Arrays of ``mujoco.MjData``, by field."""
+
+
+@cache
+def functions() -> dict[str, int] | None:
+    """Return the addresses of the functions by field; None if this version of MuJoCo lacks one of them."""
+    try:
+        (path,) = Path(mujoco.__file__).parent.glob("libmujoco.so*")
+        library = ctypes.CDLL(str(path))
+        found = {field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for field, name in FUNCTIONS.items()}
+        data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+        has_addresses = bool(data._address and data.model._address)
+    except (ValueError, OSError, AttributeError):
+        return None
+    return {field: address or 0 for field, address in found.items()} if has_addresses else None
+
+
+class MujocoStep:
+    """Sim step of robots in MuJoCo; the methods are those of :class:`batchpid.sim.engine.protocol.CompiledStep`.
+
+    Parameters
+    ----------
+    robot
+        Places of the joints in MuJoCo's arrays.
+    models, data
+        Of each robot.
+    qf, skip
+        Efforts last applied (robots, dof), and the robots that are not stepped (robots,).
+    reads_force
+        Whether to read the forces of gravity and Coriolis; otherwise they are zero.
+    speed_limit
+        Joint speed beyond which the status says so (dof,), or None.
+    """
+
+    def __init__(
+        self,
+        robot: RobotMj,
+        models: Sequence[Any],
+        data: Sequence[Any],
+        qf: NDArray[np.float64],
+        skip: NDArray[np.bool_],
+        reads_force: bool,
+        speed_limit: NDArray[np.float64] | None,
+    ) -> None:
+        addresses = functions()
+        assert addresses is not None
+        self._native = native.extension("_gateway")
+        tables = {
+            "models": [model._address for model in models],
+            "data": [each._address for each in data],
+            **{field: [getattr(each, name).ctypes.data for each in data] for field, name in FIELDS.items()},
+        }
+        arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
+        arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
+        robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
+        limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)
+        self._group = Group(
+            mujoco=ctypes.addressof(robots),
+            robots=len(data),
+            dof=qf.shape[1],
+            skip=skip.ctypes.data,
+            gravity=reads_force,
+            coriolis=reads_force,
+            velocities=True,
+            speed_limit=None if limit is None else limit.ctypes.data,
+        )
+        self._kept = models, data, arrays, robots, skip, limit
+
+    def prepare(self) -> int:
+        """Return the address of the group, for a call of the extension or of XLA."""
+        return ctypes.addressof(self._group)
+
+    def left(self) -> list[int]:
+        """Return an empty list: nothing is watched."""
+        return []
+
+    def __call__(self, *arrays: NDArray[np.float64]) -> int:
+        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
+        status: int = self._native.sim_step(self.prepare(), *arrays)
+        return status
+
+    @property
+    def message(self) -> str:
+        """Message of MuJoCo's error, after the status FAILED."""
+        return self._group.message.decode(errors="replace")

@@ -1,0 +1,80 @@
+// One sim step of robots in MuJoCo. Functions and pointers come from Python (sim/engine/mujoco/mujoco_step.py), so that
+// nothing of MuJoCo is needed to compile this file.
+
+#pragma once
+
+#include <atomic>
+#include <csetjmp>
+#include <cstdint>
+#include <cstring>
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+// Beginning of mjLogMessage (mjtype.h).
+struct LogMessage {
+  int level, topic;
+  char subject[1024];
+};
+constexpr int LOG_ERROR = 3;
+
+using LogHandler = void (*)(LogMessage const *);
+using MujocoStage = void (*)(void const *model, void *data);
+
+// Robots in MuJoCo; Python fills in the fields (Mujoco in interface.py) and owns what they point to.
+struct Mujoco {
+  MujocoStage step1, step2;                 // mj_step1, mj_step2
+  LogHandler (*set_log_handler)(LogHandler);  // mju_setLogHandler
+  void const *const *models;                // (robots,)
+  void *const *data;                        // (robots,)
+  double *const *qpos, *const *qvel;        // (robots,): arrays of their mjData
+  double *const *applied, *const *bias;
+  std::int64_t const *qpos_at, *qvel_at;    // (dof,): places of the joints in these arrays
+  double *qf;                               // (robots, dof): efforts last applied
+};
+
+// Handler of MuJoCo's messages while this thread steps: an error, which would end the process, leaves the step.
+struct Messages {
+  static inline thread_local std::jmp_buf *frame = nullptr;
+  static inline thread_local char *text = nullptr;  // (256,)
+  static inline std::atomic<LogHandler> previous{nullptr};
+
+  static void handle(LogMessage const *message) {
+    if (frame == nullptr) {
+      LogHandler const other = previous;
+      if (other != nullptr) other(message);
+      return;
+    }
+    if (message->level < LOG_ERROR) return;  // the loop finds states that are not finite
+    std::size_t const size = strnlen(message->subject, 255);
+    std::memcpy(text, message->subject, size);
+    text[size] = '\0';
+    std::longjmp(*frame, 1);
+  }
+};
+
+// Advance one robot: from velocities to the next velocities. The state of a robot that diverges stays as it is then.
+// Return false after an error of MuJoCo, with its message.
+inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, double farthest, char *message) {
+  std::jmp_buf frame;
+  Messages::text = message;
+  Messages::frame = &frame;
+  if (setjmp(frame) != 0) {
+    Messages::frame = nullptr;
+    return false;
+  }
+  mujoco.step2(mujoco.models[row], mujoco.data[row]);
+  bool finite = true;
+  for (std::int64_t joint = 0; joint < dof; ++joint) {
+    double const q = mujoco.qpos[row][mujoco.qpos_at[joint]];
+    finite = finite && q <= farthest && q >= -farthest;
+  }
+  if (finite) mujoco.step1(mujoco.models[row], mujoco.data[row]);
+  Messages::frame = nullptr;
+  return true;
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop
