@@ -14,12 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.digest import digest
+from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
+from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
@@ -102,6 +104,9 @@ class RobotDescription(Urdf):
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
+
+    def _repr_html_(self) -> str:
+        return html_table(repr(self).partition("\n")[0].rstrip(",") + ")", HEADERS, joint_rows(self.joints))
 
     @property
     def dof(self) -> int:

@@ -18,7 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES
-from batchpid.sim.robot.findings import SEVERITIES, Finding
+from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
 from batchpid.sim.robot.loop_stability import slow_oscillation, stability_report
@@ -37,7 +37,7 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
-) -> list[Finding]:
+) -> Findings:
     """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the arguments."""
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
@@ -64,7 +64,7 @@ def check(
         findings += _params(robot, params, control)
         if control == "pid":
             findings += _stability(robot, params, start, timestep)
-    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 def _links(robot: RobotDescription) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
 from batchpid.sim.robot.parts import Joint, Settings
@@ -139,7 +139,7 @@ class Robot(RobotDescription):
         setpoint: ArrayLike | None = None,
         timestep: float = 1 / 2000,
         control: str = "pid",
-    ) -> list[Finding]:
+    ) -> Findings:
         """Return the findings of the preflight, most severe first: oddities of this robot and of running it this way.
 
         Parameters
