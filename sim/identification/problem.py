@@ -60,7 +60,7 @@ class Evaluation(NamedTuple):
     residual: Float64
     """Measured less simulated positions (rows, joints) [rad or m]."""
     white: Float64
-    """Those of the fitted rows without wander (rows, joints)."""
+    """Residuals of the fitted rows without wander (rows, joints)."""
     jacobian: Float64
     """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
     determinant: Float64
@@ -123,7 +123,8 @@ class Problem:
     def residuals(self, points: Float64) -> list[Float64]:
         """Return the residuals (points, rows, joints) of each window, without noise that is not known.
 
-        What initial states explain is left out of those of windows that shoot, with their effect at the first point.
+        In windows with free initial states, the part that these explain is removed, with their effect at the first
+        point.
         """
         joints = len(self.joints)
         states = np.eye(2 * joints).reshape(-1, 2, joints) if self.shoots else np.zeros((0, 2, joints))
@@ -182,8 +183,8 @@ class Problem:
     def _simulate(self, points: Float64, draws: NDArray[np.intp], states: Float64) -> list[tuple[Float64, Float64]]:
         """Return for each window the positions (points, rows, joints), and the effect of its initial state.
 
-        ``draws`` (points,) are the numbers of the noise. The effect, at the first point, is that of changes ``states``
-        (states, 2, joints) of positions and velocities, over the change (rows, joints, states).
+        ``draws`` (points,) are the numbers of the noise. The effect is taken at the first point, per unit of the
+        changes ``states`` (states, 2, joints) of positions and velocities (rows, joints, states).
         """
         count = len(points)
         numbers = np.r_[np.arange(count), np.zeros(len(states), int)]
