@@ -74,11 +74,11 @@ def register_engine(load: Callable[[], RobotFunctions]) -> None:
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
-    among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
-    that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are
-    its motors and sensors, None for ideal ones.
+    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``; ``coupling`` couples the mimic joints
+    among them to their leaders, and is None without mimic joints. ``bodies`` is the placement of every link, by name,
+    in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is False.
+    ``settings`` is None unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up
+    first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -277,7 +277,7 @@ class RobotDescription(Urdf):
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default: unless the base is fixed so low that links dip into it at rest."""
+        """True if scenes have a ground by default; False if the base is fixed so low that links dip into it at rest."""
         return not self.self_contact.reaches_ground
 
     def about(self) -> dict[str, Any]:

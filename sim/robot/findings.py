@@ -13,7 +13,7 @@ from batchpid.arrays.display import html_table
 from batchpid.errors import RobotError
 
 MOST_LISTED = 50  # repairs in an error
-SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
+SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Preflight: oddities of a robot, and of the way it is to be run, reported before the first step.
 
-SAPIEN silently accepts most of what is listed here. ``Robot.load`` raises an error for what SAPIEN cannot run at all; a
-:class:`batchpid.sim.Finding` is something that runs otherwise than the URDF, or the user, means.
+SAPIEN silently accepts most of these oddities. ``Robot.load`` raises an error if SAPIEN cannot run the file at all. A
+:class:`batchpid.sim.Finding` reports a robot that runs, but differently than the URDF or the user intends.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
     bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
     solid = {bodies[link.name] for link in robot.links if link.inertial or link.collisions}
-    loaded = set(solid)  # bodies with mass in them or in what they carry
+    loaded = set(solid)  # bodies with mass in them or in the links that they carry
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])

@@ -16,7 +16,7 @@ from batchpid.sim.robot.parts import Joint
 
 
 class GuardedRobot(Protocol):
-    """Robot as far as the guard needs it; arrays are (dof,)."""
+    """Part of a robot that the guard needs; arrays are (dof,)."""
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -56,7 +56,7 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
 
 
 def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bool | bp.Guard:
-    """Return the guard that an option of a runner stands for, False for none.
+    """Return the guard for the option of a runner, False for none.
 
     Raises
     ------
