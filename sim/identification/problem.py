@@ -6,14 +6,13 @@ likelihood is, over the number of rows and joints::
 
     mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
 
-f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or
-later than it did, the size is large, and the stretch counts little.
+f is twice the noise of the sensor. Where the model fails, for example where a joint slips a little sooner or later in
+the simulation, the size is large and the stretch has little weight.
 
-What moves the robot besides and is not known, as the sensors' noise between the rows, is taken out of residuals and
-Jacobian (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean of several draws of it.
+Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
+(:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
 
-Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
-change.
+Column i of the Jacobian is a finite difference: the change of the simulated motion over a small change of unknown i.
 
 Under the PID law a whole log is one simulation. A log of efforts is cut into short windows, because an error of an
 uncontrolled arm grows: multiple shooting (H. G. Bock, "Recent advances in parameter identification techniques for
@@ -62,7 +61,7 @@ class Evaluation(NamedTuple):
     white: Float64
     """Residuals of the fitted rows without wander (rows, joints)."""
     jacobian: Float64
-    """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
+    """Change of the simulated positions with the unknowns, also without wander (rows, joints, unknowns)."""
     determinant: Float64
     """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
 
@@ -112,7 +111,7 @@ class Problem:
 
     @property
     def draws(self) -> int:
-        """Number of draws of noise that the law is given, or of jitter of the efforts; 0 if it is known."""
+        """Number of draws of the law's noise or of the efforts' jitter; 0 if these are known."""
         return min(len(window.errors) for window in self.windows) if self.shoots or self.drive.noisy else 0
 
     @property
@@ -121,7 +120,7 @@ class Problem:
         return self.drive.params is None
 
     def residuals(self, points: Float64) -> list[Float64]:
-        """Return the residuals (points, rows, joints) of each window, without noise that is not known.
+        """Return the residuals (points, rows, joints) of each window, without unknown noise.
 
         In windows with free initial states, the part that these explain is removed, with their effect at the first
         point.

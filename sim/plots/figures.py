@@ -52,8 +52,8 @@ def step_responses(
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
 
-    Setpoints that are not one number for each joint have axes of their own, one for each entry of the command.
-    Not-finite samples are gaps; so is everything of an env from where ``ok`` is False.
+    Setpoints that are not one number for each joint have separate axes, one for each entry of the command. Not-finite
+    samples are gaps; so is everything of an env from where ``ok`` is False.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _png(figure: Figure, dpi: int) -> bytes:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    # A palette of 256 colours cannot be told from the original, and takes a third of the bytes.
+    # A palette of 256 colours looks the same, and takes a third of the bytes.
     image = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     file = io.BytesIO()
     image.save(file, "PNG", optimize=True, dpi=(dpi, dpi))
@@ -178,7 +178,7 @@ def _png(figure: Figure, dpi: int) -> bytes:
 
 
 def _blank_failed(rollout: Rollout) -> Rollout:
-    """Return the rollout with NaN where an env has failed, and for setpoints that are no positions."""
+    """Return the rollout with NaN where an env has failed, and for setpoints that are not positions."""
     alive, seen = rollout.ok[..., None], rollout.observation
     blank = seen._replace(qpos=np.where(alive, seen.qpos, np.nan), effort=np.where(alive, seen.effort, np.nan))
     setpoint = np.full(seen.qpos.shape, np.nan)
