@@ -56,7 +56,7 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
 
 
 def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bool | bp.Guard:
-    """Return the guard for the option of a runner, False for none.
+    """Return the guard that an option of a runner stands for, False for none.
 
     Raises
     ------

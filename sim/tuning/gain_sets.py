@@ -25,9 +25,9 @@ class GainSet(NamedTuple):
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
 
-    "tuned": gains that ship with the robot; "designed": :meth:`batchpid.sim.Robot.designed`; "tutorial": gains of
-    SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING": PhysX's internal drive. Other names
-    are params files. Raises InvalidArgumentError for an unknown name or file, or if the robot has no such gains.
+    "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
+    SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names
+    are params files. Raises InvalidArgumentError where there is no such name or file, or the robot has no gains of it.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
     named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}
