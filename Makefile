@@ -7,6 +7,7 @@
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
 # make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
 # make soak     the minutes-long tests, each result as it comes (an hour)
+# make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
 # Each builds .venv if it is missing or older than pyproject.toml, and the extensions if they are older than their
 # sources. Another Python: make PYTHON=/path/to/python3.12
@@ -24,7 +25,7 @@ NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py s
 	$(foreach room,batchpid/native sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
-.PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak clean
+.PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak wheel clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
@@ -87,6 +88,18 @@ accuracy: $(VENV)/.dev
 
 soak: $(VENV)/.dev
 	@$(RUN) -u -m pytest -m slow -vv --durations 20 $(ARGS)
+
+# The wheel is built from the sdist, so that a file which the sdist lacks is an error; so is a missing extension.
+WHEEL := out/wheel
+wheel: | $(RUN)
+	@rm -rf $(WHEEL) dist
+	@$(RUN) -m venv $(WHEEL)
+	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check build
+	@BATCHPID_REQUIRE_NATIVE=1 $(WHEEL)/bin/python -m build --outdir dist .
+	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	@cd $(WHEEL) && bin/batchpid inspect panda --engine | grep "native calls into SAPIEN"
+	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 0.1 > demo.txt
+	@ls dist
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

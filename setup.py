@@ -1,12 +1,19 @@
-"""Build of the optional extensions; everything else about the package stands in pyproject.toml."""
+"""Build of the extensions, which are optional unless BATCHPID_REQUIRE_NATIVE=1; all else is in pyproject.toml."""
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.errors import BaseError, CCompilerError
 
 ROOT = Path(__file__).parent
+REQUIRED = os.environ.get("BATCHPID_REQUIRE_NATIVE", "0")
+"""Environment variable: "1" makes an extension that cannot be built an error, as for wheels that are published."""
+if REQUIRED not in ("0", "1"):
+    sys.exit(f"batchpid: BATCHPID_REQUIRE_NATIVE is {REQUIRED!r}; set it to 1, or to 0 for a build without a compiler")
 MODULES = ("batchpid.native.extensions", "batchpid.native.operations", "batchpid.sim.engine.native.interface")
 """Definitions of the extensions, each after those that it imports."""
 
@@ -32,12 +39,27 @@ def built(extension):
         language="c++",
         define_macros=[("Py_LIMITED_API", "0x030B0000"), *macros.items()],
         py_limited_api=True,
-        optional=True,  # without a compiler batchpid works as well, only slower
+        optional=REQUIRED == "0",  # without a compiler batchpid works as well, only slower
     )
+
+
+class Build(build_ext):
+    """Build that names the extension which fails, and the remedy, if extensions are required."""
+
+    def build_extension(self, ext):
+        """Compile and link one extension."""
+        try:
+            super().build_extension(ext)
+        except (BaseError, CCompilerError, OSError) as error:
+            if REQUIRED == "0":
+                raise
+            remedy = "install a C++17 compiler, or unset BATCHPID_REQUIRE_NATIVE to build without native code"
+            sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
 modules = [load(name) for name in MODULES]
 setup(
+    cmdclass={"build_ext": Build},
     ext_modules=[built(extension) for module in modules[1:] for extension in module.EXTENSIONS.values()],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

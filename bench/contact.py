@@ -2,9 +2,9 @@
 
     python bench/contact.py
 
-64 robots, four to a PhysX system, against the same robots with a system each: once with the prediction of contacts
-(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which gives a robot a system of its own before something touches
-it, and once without. Prints the table of docs/reliability.md.
+64 robots, four in each PhysX system, are compared with the same robots in separate systems: once with the prediction of
+contacts (:mod:`batchpid.sim.engine.sapien.contact_prediction`), which moves a robot to a separate system before
+anything touches it, and once without. Prints the table of docs/reliability.md.
 """
 
 from __future__ import annotations

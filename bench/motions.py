@@ -2,11 +2,11 @@
 
     python bench/motions.py [--no-isolation] [--json FILE]
 
-The speed depends on the motion: the engine steps shapes that are near each other slower, such as those of a closed
-gripper, and the loop has to look at their contacts. Everything runs in this process, in interleaved rounds: the
-tutorial's loop, the closed loop, and the closed loop without isolation of robots that are about to be touched
-(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which shows what the isolation costs. Times are processor times,
-which another program disturbs less.
+The speed depends on the motion: if shapes are near each other, as in a closed gripper, the engine is slower, and the
+loop must check their contacts. Everything runs in this process, in interleaved rounds: the tutorial's loop, the closed
+loop, and the closed loop without isolation of robots that are about to be touched
+(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which shows the cost of the isolation. Times are processor
+times, which another program disturbs less.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def motions(robot: Robot, count: int) -> Moves:
 class Options:
     """Time the closed loop over several motions.
 
-    Prints what a joint moved by [rad or m], the time of an env step [us], and two ratios, per process: the speed over
-    that of the tutorial's loop, and the time over that without isolation.
+    Prints the distance that a joint moved [rad or m], the time of an env step [us], and two ratios, per process: the
+    speed relative to the tutorial's loop, and the time relative to the loop without isolation.
     """
 
     robots: tuple[str, ...] = ("panda", "jaco2")

@@ -2,13 +2,13 @@
 
 The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32. The necessary bytes of a step
 are each input read once and each output written once: setpoint, measurement, feedforward, integral, last measurement
-and filtered rate in; effort, integral, measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is that
-over the best time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays of the same
-size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy on the GPU where JAX has one.
-Compilation is never timed. "native", "numpy" and "jax" are :class:`batchpid.BatchPID`, the first two with and without
-the extension; efforts of "native" are written into kept arrays (``out=``). "jax in blocks" is
-:func:`batchpid.law.blocks.advance_in_blocks` under shard_map with a device for each core, whose efforts are written
-over those of the step before last.
+and filtered rate in; effort, integral, measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is
+their size over the best time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays
+of the same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy on the GPU where
+JAX has one. Compilation is never timed. "native", "numpy" and "jax" are :class:`batchpid.BatchPID`, the first two with
+and without the extension; efforts of "native" are written into kept arrays (``out=``). "jax in blocks" is
+:func:`batchpid.law.blocks.advance_in_blocks` under shard_map with a device for each core, whose efforts overwrite the
+efforts of the step before last.
 """
 
 import os
@@ -152,7 +152,7 @@ def jax_step(num_envs):
 
 
 def jax_step_in_blocks(num_envs):
-    """Return a call with a share of the envs on each device; outputs are written over those of the call before last."""
+    """Return a call with a share of the envs on each device; outputs overwrite the outputs of the call before last."""
     mesh = jax.make_mesh((jax.device_count(),), ("envs",), axis_types=(jax.sharding.AxisType.Auto,))
     by_env = jax.P("envs")
     r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(num_envs))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if __name__ == "sim":  # the folder of a checkout, under the name that it had before
@@ -29,7 +30,7 @@ from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo
+from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
 from batchpid.sim.options import Controller, RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
@@ -101,4 +102,11 @@ def _engine() -> RobotFunctions:
     return load_engine()
 
 
+def _plot() -> Callable[..., Any]:
+    from batchpid.sim.plots import step_responses
+
+    return step_responses
+
+
 register_engine(_engine)
+register_plot(_plot)

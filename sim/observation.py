@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.display import html_table, span
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
 from batchpid.sim.command import CommandSpec, joint_command
@@ -16,6 +17,14 @@ from batchpid.sim.command import CommandSpec, joint_command
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+
+_load_plot: list[Callable[[], Callable[..., Any]]] = []
+
+
+def register_plot(load: Callable[[], Callable[..., Any]]) -> None:
+    """Set the function that returns the drawing of rollouts, which is a floor above: :mod:`batchpid.sim` calls it."""
+    _load_plot[:] = [load]
 
 
 class Quantity(NamedTuple):
@@ -243,6 +252,36 @@ class Rollout:
         ticks, envs, dof = self.qpos.shape
         end = f"up to {self.time[-1]:g} s" if ticks else "empty"
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_failed_envs(self.ok)})"
+
+    def _repr_html_(self) -> str:
+        if not self.qpos.size:
+            return html_table(repr(self), (), ())
+        command, joints, units = self.info.command, self.info.joint_names, self.info.units
+        last = [f"{span(self.setpoint[-1, :, j])} {unit}" for j, unit in enumerate(command.units)]
+        per_joint = command.names == joints
+        columns = {
+            "joint": joints,
+            "after the first tick": self._spans(self.qpos[0], units),
+            "after the last tick": self._spans(self.qpos[-1], units),
+            "last setpoint": last if per_joint else [],
+            "absolute effort": self._spans(np.abs(self.effort), self.info.units_of("effort")),
+            "saturated": [f"{share:.0%}" for share in self.saturated.mean((0, 1))],
+        }
+        shown = {header: cells for header, cells in columns.items() if cells}
+        own = "" if per_joint else f"\nlast setpoint: {', '.join(map(' '.join, zip(command.names, last, strict=True)))}"
+        return html_table(f"{self!r}{own}", list(shown), zip(*shown.values(), strict=True))
+
+    @staticmethod
+    def _spans(values: NDArray[Any], units: Sequence[str]) -> list[str]:
+        """Return the range of values (..., joints) of each joint, with its unit."""
+        return [f"{span(values[..., joint])} {unit}" for joint, unit in enumerate(units)]
+
+    def plot(self, **options: Any) -> Any:
+        """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts for each joint.
+
+        ``options`` are those of :func:`batchpid.sim.plots.step_responses`: joints, band, mark, title.
+        """
+        return _load_plot[0]()(self, **options)
 
 
 def _failed_envs(ok: Bool) -> str:

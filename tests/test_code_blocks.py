@@ -3,7 +3,7 @@
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
 which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``gains.yaml`` and
 ``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
-within the text. C blocks compile beside the files that the commands of their page write.
+within the text. C blocks compile next to the files that the commands of their page write.
 """
 
 from __future__ import annotations

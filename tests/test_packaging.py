@@ -11,12 +11,14 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from setuptools import find_packages
 from setuptools.config.expand import read_attr
 
 import batchpid
 
 ROOT = Path(__file__).parents[1]
+LIMITED_API = "cp311"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -82,6 +84,34 @@ else:
     raise AssertionError("sim.observation would be a second copy")
 """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+@pytest.mark.parametrize(
+    ("required", "status", "message"),
+    [
+        ("0", 0, ""),
+        ("1", 1, "the extension batchpid.native._program cannot be built"),
+        ("yes", 1, "BATCHPID_REQUIRE_NATIVE is 'yes'; set it to 1"),
+    ],
+)
+def test_a_failed_extension_ends_a_build_that_requires_it(required, status, message, tmp_path):
+    folders = ["--build-lib", str(tmp_path / "lib"), "--build-temp", str(tmp_path / "temp")]
+    build = [sys.executable, "-W", "ignore", "setup.py", "--quiet", "build_ext", *folders]
+    compilers = {"CC": "/bin/false", "CXX": "/bin/false", "BATCHPID_REQUIRE_NATIVE": required}
+    done = subprocess.run(build, cwd=ROOT, env=os.environ | compilers, capture_output=True, text=True)
+    assert done.returncode == status
+    assert message in done.stderr
+    assert not list(tmp_path.rglob("*.so"))
+
+
+def test_published_wheels_have_native_code_and_the_tag_of_the_limited_api():
+    workflow = yaml.safe_load((ROOT / ".github/workflows/wheels.yml").read_text())
+    variables = workflow["env"]
+    assert "BATCHPID_REQUIRE_NATIVE=1" in variables["CIBW_ENVIRONMENT"]
+    assert variables["CIBW_BUILD"] == f"{LIMITED_API}-manylinux_x86_64"
+    assert f'"py_limited_api": "{LIMITED_API}"' in (ROOT / "setup.py").read_text()
+    oldest = PROJECT["project"]["requires-python"].removeprefix(">=3.")
+    assert f"cp3{oldest}" == LIMITED_API
 
 
 @pytest.mark.slow

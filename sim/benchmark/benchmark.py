@@ -1,8 +1,8 @@
 """Speed of the runner and of its baselines in one run: ``batchpid bench`` and ``bench/`` are made of this.
 
 Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and with SAPIEN's own friction
-and damping, so that the cases differ in the way of stepping and not in the motion. Baselines run in worker processes of
-their own, as many as the runner has.
+and damping, so that the cases differ in the way of stepping and not in the motion. Baselines run in separate worker
+processes, as many as the runner has.
 """
 
 from __future__ import annotations
@@ -163,10 +163,10 @@ def measure_rates(
 def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
-    Measured in this process with a worker's share of the envs, and in NumPy, with native calls into the engine where
-    there are such: in a native tick the phases cannot be told apart. "control" is everything but calls on the engine.
-    The time of the clock calls is included: about one percent. "waiting" is the mean time of a tick of
-    :meth:`Runner.step` beyond the work of a worker.
+    Measured in this process with a worker's share of the envs, and in NumPy, with native calls into the engine if
+    available: in a native tick the phases cannot be separated. "control" is everything but calls on the engine. The
+    time of the clock calls is included: about one percent. "waiting" is the mean time of a tick of :meth:`Runner.step`
+    beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = Robot.load(workload.robot.path, dissipation="sapien")

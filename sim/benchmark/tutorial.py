@@ -1,7 +1,7 @@
 """SAPIEN's tutorial "Drive Robot with PID Controller", as written: oracle of the tests, baseline of the benchmark.
 
-One robot in one scene, one Python object per joint, one call after another. Only what needs a display is left out. The
-objects are SAPIEN's own, with its default settings; the Runner uses none of this.
+One robot in one scene, one Python object per joint, one call after another. Only the parts that need a display are left
+out. The objects are SAPIEN's, with its default settings; the Runner uses none of this.
 """
 
 from __future__ import annotations

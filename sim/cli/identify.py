@@ -39,15 +39,15 @@ class IdentifyCommand:
     timestep: float = 1 / 2000
     """Time step of the control that drove the robot [s]."""
     sim_steps: int = 1
-    """Sim steps of each: 4 or so for a real robot under control at 500 Hz, otherwise its hold is taken for delay."""
+    """Sim steps in each control step: about 4 for a robot under control at 500 Hz, or its hold counts as delay."""
     hold: flags.Switch = False
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
     no_payload: flags.Switch = False
     """There is no payload at the tool."""
     evaluations: int = 25
-    """Most evaluations of the fit; each simulates the robot, and a changed one for each unknown."""
+    """Largest number of evaluations of the fit; each simulates the robot and, for each unknown, a perturbed one."""
     seed: int = 0
-    """Seed of CMA-ES, which finds where the fit begins. The result does not depend on the number of workers."""
+    """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
     missing_meshes: flags.MissingMeshes = "skip"
     resume: flags.Switch = False

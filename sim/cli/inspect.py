@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
@@ -13,10 +12,9 @@ from batchpid.sim import Finding, Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.tuning.gain_sets import gain_set
 
-HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
 SOURCES = {
     "inertial": "<inertial>",
     "repaired": "<inertial>, repaired",
@@ -75,25 +73,8 @@ def joint_table(robot: Robot, *, fixed_too: bool) -> str:
     """Return a table of the moving joints, numbered as in qpos, and the fixed ones."""
     from batchpid.sim.cli.report import table
 
-    rows = [
-        [
-            str(index),
-            joint.name,
-            joint.type,
-            _range(joint),
-            _bound(joint.effort_limit, f" {joint.effort_unit}"),
-            _bound(joint.velocity_limit, f" {joint.unit}/s"),
-            f"{joint.damping:g}",
-            f"{joint.friction:g}",
-            f"{joint.parent_link} > {joint.child_link}",
-        ]
-        for index, joint in enumerate(robot.joints)
-    ]
-    rows += [
-        ["-", joint.name, joint.type, *"-----", f"{joint.parent_link} > {joint.child_link}"]
-        for joint in robot.all_joints
-        if fixed_too and not joint.moves
-    ]
+    fixed = [joint for joint in robot.all_joints if fixed_too and not joint.moves]
+    rows = list(joint_rows([*robot.joints, *fixed]))
     return table(rows, HEADERS, "lllrrrrrl")
 
 
@@ -148,12 +129,3 @@ def _fill(text: str) -> str:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _range(joint: Joint) -> str:
-    limits = joint.lower, joint.upper
-    return f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}" if any(map(math.isfinite, limits)) else "none"
-
-
-def _bound(value: float, unit: str = "") -> str:
-    return f"{value:.5g}{unit}" if math.isfinite(value) else "none"

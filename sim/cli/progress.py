@@ -31,6 +31,6 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
 
 
 def close_bars() -> None:
-    """Remove all bars, so that a message stands on a line of its own; an error may have left some."""
+    """Remove all bars, so that a message gets a separate line; an error may have left some."""
     for each in list(_bars):
         each.close()

@@ -1,4 +1,4 @@
-"""Reports printed at the end of a run: its speed, a table of the joints, and what went wrong."""
+"""Reports printed at the end of a run: its speed, a table of the joints, and problems."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
 
 
 def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
-    """Yield a line on envs that diverged, one on joints that did not settle, and those of :func:`limit_lines`."""
+    """Yield a line on envs that diverged, one on joints that did not settle, and the lines of :func:`limit_lines`."""
     seconds, num_envs = rollout.tick * len(rollout.time), rollout.num_envs
     diverged = np.flatnonzero(~rollout.ok.all(0))
     if diverged.size:

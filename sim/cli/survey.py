@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SurveyCommand:
-    """Load, build and move many robots, each in a process to itself, and list how far each gets.
+    """Load, build and move many robots, each in a separate process, and list how far each gets.
 
     Gains are designed per mass matrix. A move has settled if every joint stays within 2 % of it and ends within 1e-3
     rad (or m) of the setpoint.

@@ -35,7 +35,8 @@ class TuneCommand:
     search_seconds: float = 1.5
     """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
-    """Gains per mass matrix (all joints respond alike), per joint inertia, or as efforts (for any controller)."""
+    """Gains per mass matrix (all joints respond equally fast), per joint inertia, or as efforts (for any
+    controller)."""
     per_joint: flags.Switch = False
     """Search for a factor of each joint too; needs more generations."""
     weights: Annotated[Weights, tyro.conf.arg(name="")] = field(default_factory=Weights)

@@ -7,7 +7,7 @@ Joint j sweeps its frequency exponentially from f0 to f1, on a wave of slowly ch
     A_j(f)^-4 = A_max^-4 + (v_max / (2 pi f))^-4 + (a_max / (2 pi f)^2)^-4
 
 so that it is limited by the joint's range at low frequencies, by velocity and by effort at higher ones. s_j runs from 0
-to 1 and back as a cosine, shifted by the joint's share of the time, so that no two joints move alike. The window w
+to 1 and back as a cosine, shifted by the joint's share of the time, so that all joints move differently. The window w
 rises from 0 and falls back within a tenth of the time: the motion begins and ends at rest at c. Low frequencies show
 friction, gravity and strength, high ones inertia and delay.
 """
@@ -60,7 +60,7 @@ def excite(
     lowest, highest
         Frequencies of the sweep [Hz].
     seed
-        Of the phases, and of the center where the robot's start pose is too near to contact.
+        Seed of the phases, and of the center if the robot's start pose is too near to contact.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def is_feasible(robot: Robot, motion: Trajectory) -> bool:
 
 
 def _centers(robot: Robot, rng: np.random.Generator) -> list[Float64]:
-    """Return poses to move about: the start pose, away from the joints' limits, and random ones."""
+    """Return candidates for the center: the start pose, moved away from joint limits, and random poses."""
     low, high = np.maximum(robot.lower, robot.start - np.pi), np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
     poses = [robot.start, *robot.sample(_DRAWS, seed=int(rng.integers(2**31)))]
@@ -126,7 +126,7 @@ def _chirp(
     left = robot.design_effort_limit - np.abs(motion_effort(robot, center[None], still, still)[0]) - robot.friction
     inertia = np.abs(robot.mass_matrix(center)[0]).sum(1)
     acceleration = EFFORT_SHARE * np.maximum(left, 0.05 * robot.design_effort_limit) / inertia
-    shift = np.argsort(np.argsort(phase)) / dof  # each joint enters the sweep elsewhere
+    shift = np.argsort(np.argsort(phase)) / dof  # each joint begins at another point of the sweep
     sweep = (1 - np.cos(2 * np.pi * (time[:, None] / total + shift))) / 2
     omega = 2 * np.pi * lowest * (highest / lowest) ** sweep
     limits = np.stack(np.broadcast_arrays(reach, velocity / omega, acceleration / omega**2))

@@ -1,7 +1,7 @@
 r"""Fit of simulated motions to logs: maximum likelihood by nonlinear least squares.
 
-The negative logarithm of the likelihood (:mod:`batchpid.sim.identification.problem`) is that of the sizes sigma of the
-residuals r. Since log(x) <= x - 1, it falls where the weighted sum of squares does::
+The negative logarithm of the likelihood (:mod:`batchpid.sim.identification.problem`) depends on the sizes sigma of the
+residuals r. Since log(x) <= x - 1, it decreases whenever the weighted sum of squares does::
 
     sum over rows and joints of (r / sigma)^2 + sum over unknowns of ((theta - m) / s)^2
 
@@ -10,8 +10,8 @@ with the sizes before the step and a weak prior of means m and standard deviatio
 subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems", SIAM Journal
 on Scientific Computing 21, 1999), alternate with new sizes.
 
-Residuals and Jacobian of a joint in a stretch, [J r], have many rows. Their triangular QR factor has the same sums of
-products, which is all that the steps depend on: they are given that.
+Residuals and Jacobian of a joint in a stretch, [J r], have many rows. The steps depend on its products of columns only,
+so the triangular QR factor of [J r], which has the same products, takes its place.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Solution(NamedTuple):
     """Sizes of the residuals (stretches, joints) [rad or m]."""
     windows: list[Evaluation]
     promised: float
-    """Further decrease of the cost that linear residuals would allow; what is not small was not reached."""
+    """Further decrease of the cost that linear residuals would allow; not small if the fit stopped before an
+    optimum."""
 
 
 def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = lambda *_: None) -> Solution:
@@ -106,7 +107,7 @@ def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = l
             found = -factors.at(x * scale)[..., :-1] / sizes[..., None, None]
             return np.vstack([found.reshape(-1, len(x)), np.diag(scale / spread)])
 
-        # One evaluation is that of x, which is known.
+        # One evaluation is of x itself, whose value is known.
         most = min(TRIES, factors.left) + 1
         options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
         last = x
@@ -135,7 +136,7 @@ def _promised(factors: Float64) -> float:
 
 
 class _Factors:
-    """Triangular factors of [J r] by point; the Jacobian is that of unknowns over their typical sizes."""
+    """Triangular factors of [J r] by point, with J in units of the unknowns' typical sizes."""
 
     def __init__(self, problem: Problem, left: int) -> None:
         self.left = left
@@ -151,7 +152,7 @@ class _Factors:
         return self._all(theta)[1]
 
     def keep(self, theta: Float64) -> None:
-        """Forget all points but ``theta``."""
+        """Discard all points except ``theta``."""
         self._known = {theta.tobytes(): self._all(theta)}
 
     def windows(self, theta: Float64) -> list[Evaluation]:
@@ -161,7 +162,7 @@ class _Factors:
     def _all(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
         key = theta.tobytes()
         if key not in self._known:
-            self.left -= bool(self._known)  # that of the start does not count, so that a fit may resume there
+            self.left -= bool(self._known)  # the one at the start does not count, so that a fit may resume there
             self._known[key] = self._evaluate(theta)
         return self._known[key]
 

@@ -1,7 +1,8 @@
-"""Fits of all variants of the drive, and of other delays; of those, the likeliest is the result.
+"""Fits of all variants of the drive, and of other delays; the one with the highest likelihood is the result.
 
-Efforts that jump from step to step are smoothed by a delay of a broken number of steps, and not by a whole one. So the
-likelihood may have a maximum in each step, and a fit finds the next one: it is repeated a step before and after.
+Efforts that jump from step to step are smoothed by a delay of a fractional number of steps, but not by a whole number.
+So the likelihood may have a maximum between any two steps, and a fit finds the nearest. It is repeated one step earlier
+and later.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Progress:
         self._steps, self._shown = iter(self._bar), 0
 
     def __call__(self, done: int, left: int, cost: float) -> None:
-        """Advance the bar to so many ``done`` fits and evaluations ``left``, and show the typical error."""
+        """Advance the bar to the number of ``done`` fits and of evaluations ``left``, and show the typical error."""
         while self._shown < (done + 1) * self._evaluations - left and next(self._steps, None) is not None:
             self._shown += 1
         if hasattr(self._bar, "set_postfix"):
@@ -40,7 +41,7 @@ class Progress:
 def search(
     problems: list[Problem], state: State, evaluations: int, record: History, progress: Progress
 ) -> tuple[Problem, Solution]:
-    """Return the likeliest solution from ``state`` on, and its problem, one of ``problems``.
+    """Return the likeliest solution of the search from ``state`` on, and its problem, one of ``problems``.
 
     Each is begun with the solution of the one before, with ``evaluations`` at most.
     """
@@ -85,7 +86,7 @@ def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluation
 
 
 def _delayed(problem: Problem, theta: Float64, steps: int) -> Float64 | None:
-    """Return ``theta`` with a delay of so many more ``steps``, None if that is out of bounds."""
+    """Return ``theta`` with the delay increased by ``steps``, None if that is out of bounds."""
     delay = problem.unknowns.names.index(("delay", None))
     later = theta.copy()
     later[delay] += steps * problem.drive.timestep

@@ -1,4 +1,4 @@
-"""Identification of motors from logs: regression, fit, uncertainty, and the error on the part that was kept."""
+"""Identification of motors from logs: regression, fit, uncertainty, and the error on the held-out part."""
 
 from __future__ import annotations
 
@@ -67,22 +67,24 @@ def identify(
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
     compensate
-        What the robot compensates by itself, "none" for nothing. Whether that passes through its motors is found. A
-        log of efforts that holds them in full has "none"; where the log tells, this is found, too.
+        Forces that the robot compensates by itself, or "none". The fit determines whether the compensation passes
+        through the motors. For a log of the complete efforts, compensation included, use "none"; where the log shows
+        it, the fit determines this, too.
     timestep
         Time step of the control that drove the robot [s].
     sim_steps
-        Sim steps of each. More than one where the robot, or its simulator, moved in smaller steps than its control:
-        a real robot under control at 500 Hz or less. Otherwise half the difference is taken for delay.
+        Number of sim steps in each. Use more than one if the robot, or its simulator, moved in smaller steps than its
+        control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
+        delay.
     payload
         Find a payload at the tool, too.
     hold
         Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
     evaluations
-        Most evaluations of each fit, with and without noise in the law; one simulates the robot, and a changed one for
-        each unknown.
+        Largest number of evaluations of each fit, with and without noise in the law. An evaluation simulates the robot
+        and, for each unknown, a perturbed robot.
     seed
-        Of CMA-ES, which finds where the fit begins.
+        Seed of CMA-ES, which finds the start of the fit.
     workers
         Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
     history
@@ -170,9 +172,9 @@ def identify(
 
 
 def _variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
-    """Return ways in which the law may measure: with the sensors' noise or without, rates or differences of positions.
+    """Return the possible measurements of the law: with or without sensor noise, rates or differences of positions.
 
-    Without noise, positions and rates are those of the simulation.
+    Without noise, the law gets the simulated positions and rates.
     """
     if drive.params is None:
         return [drive]
@@ -235,14 +237,14 @@ def _unknowns(
 
 
 def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
-    """Return the motors of the robot as its description says."""
+    """Return the motors according to the robot's description."""
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
 
 
 def _held_out(problem: Problem, residuals: list[Float64]) -> float:
-    """Return the root mean square of the residuals on the rows that were kept."""
+    """Return the root mean square of the residuals on the held-out rows."""
     kept = [r[~w.fitted] for r, w in zip(residuals, problem.windows, strict=True)]
     with np.errstate(invalid="ignore", over="ignore"):
         error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))

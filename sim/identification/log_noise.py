@@ -1,4 +1,4 @@
-"""Noise of a log's columns: told from the motion by its frequency, known about at the rows, unknown between them."""
+"""Noise of a log's columns, found by its frequency: roughly known at the rows, unknown between them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 CUTOFF = 60.0
-"""Frequency [Hz] above which what was measured counts as noise."""
+"""Frequency [Hz] above which a measured signal counts as noise."""
 DRAWS = 16
-"""Number of draws of what is not known."""
+"""Number of draws of the unknown noise."""
 _MOST = 4.0
-"""Largest noise, over its standard deviation; what is beyond is motion."""
+"""Largest noise, over its standard deviation; larger deviations count as motion."""
 
 
 class Noise(NamedTuple):
@@ -24,7 +24,7 @@ class Noise(NamedTuple):
     errors: Float64
     """Draws of the true noise less ``values`` (draws, steps, columns)."""
     size: Float64
-    """Standard deviations (columns,), 0 if the rows are too far apart to tell them."""
+    """Standard deviations (columns,), 0 if the rows are too far apart to determine them."""
 
 
 def split(time: Float64, table: Float64, grid: Float64, given: bool = False) -> tuple[Float64, Noise]:
@@ -39,8 +39,8 @@ def split(time: Float64, table: Float64, grid: Float64, given: bool = False) -> 
     grid
         Times at which both are returned (steps,) [s], equidistant.
     given
-        True if the errors are those of the sum of both, which is exact at the rows; False if they are those of the
-        noise, whose part below the cutoff is taken for motion.
+        True if the errors are errors of the sum of both, which is exact at the rows; False if they are errors of the
+        noise, whose part below the cutoff counts as motion.
     """
     from scipy.interpolate import make_interp_spline
 
@@ -52,7 +52,7 @@ def split(time: Float64, table: Float64, grid: Float64, given: bool = False) -> 
         return between, Noise(values, np.zeros((0, *values.shape)), np.zeros(columns))
     slow = _smooth(make_interp_spline(time, table)(grid), timestep)
     found = table - slow[step]
-    size = 1.4826 * np.median(np.abs(found), axis=0) / np.sqrt(share)  # the median is blind to jerks of the joint
+    size = 1.4826 * np.median(np.abs(found), axis=0) / np.sqrt(share)  # jerks of the joint do not affect the median
     values[step] = np.clip(found, -_MOST * size, _MOST * size)
     jerks = np.stack([np.interp(grid, time, column) for column in (found - values[step]).T], axis=1)
     draws = size * np.random.default_rng(0).standard_normal((DRAWS, *values.shape))

@@ -26,11 +26,11 @@ class Drive:
     through: bool = False
     """True if the compensation passes through the motors, with their strength and delay."""
     knows_payload: bool = False
-    """True if the compensation is that of the robot with its payload."""
+    """True if the compensation includes the payload."""
     noisy: bool = False
-    """True if the law is given the positions of the log, with their noise, False if it is given those without."""
+    """True if the law is given the logged positions with their noise, False if without."""
     substeps: int = 1
-    """Sim steps of a step of the law, whose effort holds meanwhile."""
+    """Sim steps in one step of the law, during which its effort is constant."""
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
 

@@ -4,7 +4,7 @@ A CSV file has a header and one row per sample, in SI units::
 
     time, setpoint:JOINT or effort:JOINT ..., qpos:JOINT ..., optionally qvel:JOINT ...
 
-An HDF5 file has one dataset per column, of the same names. In a row stand the position measured at ``time`` and the
+An HDF5 file has one dataset per column, of the same names. A row holds the position measured at ``time`` and the
 command computed from it, which acts from then on. Columns may have any order, joints may be missing, and times need not
 be equidistant. Columns of other quantities are ignored.
 

@@ -1,19 +1,19 @@
 r"""Robot with motors, many candidates at once: the model whose motion is fitted to logs.
 
-The rigid-body dynamics are those of the model that SAPIEN derives (:mod:`batchpid.sim.engine.batch_dynamics`), in steps
-of dt as SAPIEN and MuJoCo take them (semi-implicit Euler), with armature A, viscous damping B and Coulomb friction F of
-the joints, strength s, bias b and delay d of their motors, and a payload at the tool::
+The rigid-body dynamics follow the model that SAPIEN derives (:mod:`batchpid.sim.engine.batch_dynamics`), in steps of dt
+by semi-implicit Euler as in SAPIEN and MuJoCo, with armature A, viscous damping B and Coulomb friction F of the joints,
+strength s, bias b and delay d of their motors, and a payload at the tool::
 
     (M + A + dt B) (v+ - v) = dt (s u(t - d) + b + c - h - B v - f),     f in F Sgn(v+),     q+ = q + dt v+
 
-u is the logged effort, or that of the PID law under the logged setpoints; h gravity and Coriolis forces, and c what the
-robot compensates of them, by a model with or without the payload. A robot that sends c through its motors adds it to u.
+u is the logged effort, or the effort of the PID law under the logged setpoints; h gravity and Coriolis forces; c the
+robot's compensation of h, by a model with or without the payload. A robot that sends c through its motors adds it to u.
 Friction stops a joint within the time T ("stopping"), not at once, because real joints and MuJoCo's yield near rest; in
 steps of dt, with r = (1 / 9) (M^-1)_jj at the pose 0::
 
     v+ - dt r f = (1 - dt / T) v     while |f_j| < F_j
 
-Joints that are in no log rest where the robot starts; followers move with their leaders.
+Unlogged joints rest at the robot's start pose; followers move with their leaders.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Plant:
         return found.force + found.payload_force
 
     def compensation(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64 | None:
-        """Return what the robot compensates (n, joints), None for nothing; it may know its ``payload``."""
+        """Return the robot's compensation (n, joints), None for none; ``payload`` is included if the robot knows it."""
         return self._compensation(qpos, self._dynamics.at(qpos, qvel, payload), payload)
 
     def _compensation(self, qpos: Float64, found: Passive, payload: Float64) -> Float64 | None:
@@ -100,7 +100,7 @@ class Plant:
     def simulate(self, motors: Motors, segments: list[Segment], past: int) -> Float64:
         """Return the positions (n, steps + 1, joints) of candidate i in segment i, the start included.
 
-        All segments have the same number of steps. What diverges ends at inf.
+        All segments have the same number of steps. A simulation that diverges ends at inf.
         """
         dt, drive = self.drive.timestep, self.drive
         q = np.array([segment.qpos for segment in segments])

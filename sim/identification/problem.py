@@ -6,14 +6,13 @@ likelihood is, over the number of rows and joints::
 
     mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
 
-f is twice the noise of the sensor. In a stretch where the model fails, as where a joint would slip a little sooner or
-later than it did, the size is large, and the stretch counts little.
+f is twice the noise of the sensor. Where the model fails, for example where a joint slips a little sooner or later in
+the simulation, the size is large and the stretch has little weight.
 
-What moves the robot besides and is not known, as the sensors' noise between the rows, is taken out of residuals and
-Jacobian (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean of several draws of it.
+Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
+(:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
 
-Column i of the Jacobian is the simulated motion with unknown i changed a little, less the motion without, over the
-change.
+Column i of the Jacobian is a finite difference: the change of the simulated motion over a small change of unknown i.
 
 Under the PID law a whole log is one simulation. A log of efforts is cut into short windows, because an error of an
 uncontrolled arm grows: multiple shooting (H. G. Bock, "Recent advances in parameter identification techniques for
@@ -60,9 +59,9 @@ class Evaluation(NamedTuple):
     residual: Float64
     """Measured less simulated positions (rows, joints) [rad or m]."""
     white: Float64
-    """Those of the fitted rows without wander (rows, joints)."""
+    """Residuals of the fitted rows without wander (rows, joints)."""
     jacobian: Float64
-    """Change of the simulated positions with the unknowns, without wander likewise (rows, joints, unknowns)."""
+    """Change of the simulated positions with the unknowns, also without wander (rows, joints, unknowns)."""
     determinant: Float64
     """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
 
@@ -112,7 +111,7 @@ class Problem:
 
     @property
     def draws(self) -> int:
-        """Number of draws of noise that the law is given, or of jitter of the efforts; 0 if it is known."""
+        """Number of draws of the law's noise or of the efforts' jitter; 0 if these are known."""
         return min(len(window.errors) for window in self.windows) if self.shoots or self.drive.noisy else 0
 
     @property
@@ -121,9 +120,10 @@ class Problem:
         return self.drive.params is None
 
     def residuals(self, points: Float64) -> list[Float64]:
-        """Return the residuals (points, rows, joints) of each window, without noise that is not known.
+        """Return the residuals (points, rows, joints) of each window, without unknown noise.
 
-        What initial states explain is left out of those of windows that shoot, with their effect at the first point.
+        In windows with free initial states, the part that these explain is removed, with their effect at the first
+        point.
         """
         joints = len(self.joints)
         states = np.eye(2 * joints).reshape(-1, 2, joints) if self.shoots else np.zeros((0, 2, joints))
@@ -182,8 +182,8 @@ class Problem:
     def _simulate(self, points: Float64, draws: NDArray[np.intp], states: Float64) -> list[tuple[Float64, Float64]]:
         """Return for each window the positions (points, rows, joints), and the effect of its initial state.
 
-        ``draws`` (points,) are the numbers of the noise. The effect, at the first point, is that of changes ``states``
-        (states, 2, joints) of positions and velocities, over the change (rows, joints, states).
+        ``draws`` (points,) are the numbers of the noise. The effect is taken at the first point, per unit of the
+        changes ``states`` (states, 2, joints) of positions and velocities (rows, joints, states).
         """
         count = len(points)
         numbers = np.r_[np.arange(count), np.zeros(len(states), int)]

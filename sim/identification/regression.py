@@ -1,13 +1,14 @@
 r"""Start of the fit: inverse-dynamics regression, linear in all unknowns at a given delay.
 
-With the measured motion filtered without phase lag, and the effort u filtered alike, each joint obeys::
+With the measured motion filtered without phase lag, and the effort u filtered in the same way, each joint obeys::
 
     s u(t - d) + b + c - h - (M q'')_j = A q''_j + B q'_j + F sgn(q'_j)
 
 which is solved by least squares with A, B, F >= 0, for each delay d of a grid, where the joint moves fast enough not to
 stick (J. Swevers, W. Verdonck and J. De Schutter, "Dynamic model identification for industrial robots", IEEE Control
 Systems Magazine 27(5), 2007; M. Gautier, "Dynamic identification of robots with power model", ICRA 1997). Under the PID
-law u is computed from the filtered positions. A weak prior keeps what the log does not show at strength 1.
+law u is computed from the filtered positions. A weak prior at strength 1 determines the parameters that the log does
+not show.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ DELAY_STEP = 5e-4
 DELAYS = np.arange(0.0, 0.03, DELAY_STEP)
 """Delays that are tried [s]."""
 MOVES, LEAST_ROWS = 0.4, 50
-"""Speed, over its root mean square, below which a joint may stick, and the fewest rows that are left without those."""
+"""Speed, over its root mean square, below which a joint may stick, and the least number of rows above it."""
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 STOPPING = 5e-3
@@ -56,7 +57,7 @@ class Motion(NamedTuple):
     sensor: Noise
     """Noise of the measured positions."""
     jitter: Noise | None
-    """That of the efforts of a log of efforts that change between its rows; None where the commands are known."""
+    """Noise of logged efforts that change between the rows; None where the commands are known."""
 
 
 class Start(NamedTuple):
@@ -87,7 +88,7 @@ def smooth(log: Log, timestep: float) -> Motion:
 
 
 class Regression:
-    """Efforts that the motions took and those that were commanded, filtered alike, for regressions at any delay."""
+    """Efforts that the motions required and commanded efforts, with the same filter, for regressions at any delay."""
 
     def __init__(self, plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> None:
         from scipy.signal import butter, sosfiltfilt
@@ -106,7 +107,7 @@ class Regression:
             unloaded = np.zeros((len(motion.qpos), 1))
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
-            if drive.params is None:  # the law's efforts are of filtered positions already
+            if drive.params is None:  # the law's efforts are computed from filtered positions
                 effort = sosfiltfilt(sections, effort, axis=0)
             time = np.arange(len(effort)) * dt
             late.append(
@@ -158,7 +159,7 @@ class Regression:
 
 
 def explains_better(special: Start, plain: Start) -> bool:
-    """Return whether ``special`` explains the efforts so much better than ``plain`` that it is not by chance."""
+    """Return whether ``special`` explains the efforts significantly better than ``plain``."""
     return plain.cost - special.cost > EVIDENCE * plain.motors.armature.shape[1]
 
 
@@ -181,7 +182,7 @@ def _law_efforts(drive: Drive, plant: Plant, motion: Motion) -> Float64:
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
-    """Return the efforts that a motion takes beyond what the robot compensates apart from its motors."""
+    """Return the efforts that a motion requires, less the compensation that does not pass through the motors."""
     q, v, a = (table[rows] for table in motion[:3])
     kg = np.full((len(q), 1), payload)
     effort = (plant.mass_matrix(q, kg) @ a[..., None])[..., 0] + plant.passive(q, v, kg)
@@ -212,9 +213,9 @@ def _solve_joint(required: Float64, motion: list[Float64], strength_prior: float
 
 
 def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
-    """Return the ways in which the robot may compensate: outside its motors, knowing its payload or not, or through.
+    """Return the possible compensations: outside the motors, with the payload or without, or through the motors.
 
-    The logged efforts may also hold the compensation.
+    The logged efforts may also include the compensation.
     """
     if drive.compensate == "none":
         return [drive]

@@ -27,11 +27,11 @@ class Fit(NamedTuple):
     time: Float64
     """Times (rows,) [s]."""
     fitted: NDArray[np.bool_]
-    """Rows that were fitted; the others were kept to judge (rows,)."""
+    """Fitted rows; the others were held out (rows,)."""
     before: Float64
-    """Of the robot as its description says (rows, joints)."""
+    """Errors of the robot as described (rows, joints)."""
     after: Float64
-    """Of the robot as identified."""
+    """Errors of the robot as identified."""
 
 
 class Identification(NamedTuple):
@@ -45,8 +45,8 @@ class Identification(NamedTuple):
     """Point that was found (unknowns,)."""
     uncertainty: Uncertainty
     held_out_error: tuple[float, float]
-    """Root mean square of the position error [rad or m] on the part of the logs that was kept, of the robot as its
-    description says and as identified; inf if the simulation diverges."""
+    """Root mean square of the position error [rad or m] on the held-out part of the logs, of the robot as described and
+    as identified; inf if the simulation diverges."""
     noise: Float64
     """Root mean square of the residuals (joints,) [rad or m]."""
     drive: Drive
@@ -111,7 +111,7 @@ class Identification(NamedTuple):
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
 
     def document(self) -> dict[str, Any]:
-        """Return the result as plain values; what is not identified is [None, None, None]."""
+        """Return the result as plain values; an unidentified value is [None, None, None]."""
 
         def row(kind: str, joint: int | None = None) -> list[float | None]:
             return list(self.interval(kind, joint) or (None, None, None))
@@ -135,9 +135,9 @@ class Identification(NamedTuple):
         }
 
     def actuators(self) -> bp.Actuators:
-        """Return the identified actuators of all joints; what was not identified, and other joints, are ideal.
+        """Return the identified actuators of all joints; unidentified values and unlogged joints are ideal.
 
-        Friction is that in addition to the robot's description, where that has less.
+        Friction is the excess over the friction in the robot's description, at least 0.
         """
         robot = self.robot
         columns = {kind: np.zeros(robot.dof) for kind in PER_JOINT}

@@ -1,8 +1,8 @@
 """Start of a fit: regressions at the delay, the payload and the stopping time under which the robot moves as logged.
 
-Filtered efforts hardly tell a short delay, but the simulated motion does: it is simulated for a grid of delays, and
-then for the candidates of a search over what all joints share, by CMA-ES (N. Hansen, "The CMA evolution strategy: a
-tutorial", arXiv:1604.00772). Each candidate has the motors that the regression gives for it.
+Filtered efforts hardly show a short delay, but the simulated motion does. The motion is simulated for a grid of delays,
+and then for the candidates of a search over the unknowns that all joints share, by CMA-ES (N. Hansen, "The CMA
+evolution strategy: a tutorial", arXiv:1604.00772). Each candidate has the motors that the regression gives for it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPREAD = np.array([5e-4, 0.3, 0.05])
 
 
 def begin(problem: Problem, regression: Regression, ideal: Motors, seed: int) -> Float64:
-    """Return the point (unknowns,) at which a fit begins: of those tried, that with the highest likelihood."""
+    """Return the point (unknowns,) at which a fit begins: the candidate with the highest likelihood."""
     from cmaes import CMA
 
     unknowns = problem.unknowns
@@ -33,7 +33,7 @@ def begin(problem: Problem, regression: Regression, ideal: Motors, seed: int) ->
         points = np.array([unknowns.clip(unknowns.point(motors)) for motors in candidates])
         return problem.costs(problem.sizes(problem.residuals(points)))
 
-    # Each joint has the prior that suits it: the strong one where the log hardly shows the strength.
+    # Each joint has its prior: the strong one where the log hardly shows the strength.
     kg, priors = regression.best.motors.payload[0, 0], np.array([WEAK, STRONG])
     grid = costs([regression.at(delay, kg, prior).motors for prior in priors for delay in GRID])
     both = grid.reshape(len(priors), len(GRID), -1)

@@ -1,4 +1,4 @@
-r"""Uncertainty of a fit: covariance, intervals, and what the logs do not identify.
+r"""Uncertainty of a fit: covariance, intervals, and unidentified unknowns.
 
 The residuals of a fit are not white: the feedback loop filters the sensors' noise, and no model is exact. With weighted
 residuals r and Jacobian J of the N rows of each joint, the covariance of the estimates for coloured residuals is::
@@ -7,7 +7,8 @@ residuals r and Jacobian J of the N rows of each joint, the covariance of the es
 
 c is the autocovariance of the joint's residuals, tapered (E. A. Morelli and V. Klein, "Accuracy of aerodynamic model
 parameters estimated from flight test data", Journal of Guidance, Control, and Dynamics 20(1), 1997). For white
-residuals it is H^-1. The singular values of J in units of typical sizes tell which combinations a log does not show.
+residuals it is H^-1. Small singular values of J, in units of typical sizes, mark combinations of unknowns that a log
+does not show.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ MODEL_ERROR = 2.0
 """Factor of the standard deviations that allows for errors of the model, such as friction near rest under a law that
 sees noise. Without it 30 % of the intervals missed the truth on logs of a two-joint arm in MuJoCo."""
 LEAST_DEVIATION, LEAST_OF_BIAS = 5e-3, 2e-2
-"""Least standard deviation of an unknown, over its estimate, and of a bias: no model is better."""
+"""Least standard deviation of an unknown, over its estimate, and of a bias: no model is more exact."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED, DELAY_RESOLVED = 0.05, 0.1
@@ -36,7 +37,7 @@ RESOLVED, DELAY_RESOLVED = 0.05, 0.1
 LEAST_MOTION = 30.0
 """Least standard deviation of a joint's positions, over their noise, of a joint that is moved and not only shaken."""
 UNFINISHED = 3e-3
-"""Decrease of the cost that a fit may leave unreached; beyond, it did not find an optimum, and nothing is known."""
+"""Largest remaining decrease of the cost; a fit with more has not found an optimum, and identifies nothing."""
 
 
 class Uncertainty(NamedTuple):
@@ -46,7 +47,7 @@ class Uncertainty(NamedTuple):
     """Standard deviations."""
     identified: NDArray[np.bool_]
     singular_values: Float64
-    """Of the Jacobian in units of typical sizes, over the largest, descending."""
+    """Singular values of the Jacobian in units of typical sizes, over the largest, descending."""
 
 
 def uncertainty(problem: Problem, point: Solution) -> Uncertainty:

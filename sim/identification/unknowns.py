@@ -1,4 +1,4 @@
-"""Unknowns of a fit: their names, units, scales, bounds and weak priors, and the motors that a point stands for."""
+"""Unknowns of a fit: their names, units, scales, bounds and weak priors, and the motors at a point."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Unknowns:
 
     @property
     def spread(self) -> Float64:
-        """Standard deviations of the prior, which decide only about what the log does not show."""
+        """Standard deviations of the prior, which matter only for unknowns that the log does not show."""
         return np.array([_SPREAD[kind] for kind, _ in self.names]) * self.scale
 
     @property
@@ -97,8 +97,9 @@ class Unknowns:
     def changes(self, theta: Float64) -> Float64:
         """Return the changes (changes, unknowns) for finite differences at ``theta``.
 
-        A motor that is stronger moves its joint alike if inertia, damping, friction and bias grow with it: all but what
-        couples the joints. So each strength is changed with those, to find the little that is left.
+        If inertia, damping, friction and bias grow with the strength of a motor, its joint moves in the same way, apart
+        from the coupling of joints. So each strength is changed together with them, and the difference shows the
+        coupling.
         """
         steps = np.maximum(_STEP * np.abs(theta), 0.5 * _STEP * self.scale)
         table, n = np.diag(steps), self.joints
@@ -123,7 +124,7 @@ class Unknowns:
         return np.array([*values, motors.payload[0, 0]] if len(self.names) > len(values) else values)
 
     def motors(self, points: Float64) -> Motors:
-        """Return the candidates that ``points`` (n, unknowns) stand for."""
+        """Return the candidates at ``points`` (n, unknowns)."""
         n, own = self.joints, len(PER_JOINT) * self.joints
         columns = {kind: points[:, k * n : (k + 1) * n] for k, kind in enumerate(PER_JOINT)}
         payload = points[:, own + 2 :] if points.shape[1] > own + 2 else np.zeros((len(points), 1))

@@ -1,15 +1,15 @@
-r"""Wander: motion by what a log does not tell, and residuals without it.
+r"""Wander: motion by unlogged disturbances (noise between rows, initial velocity), and residuals without it.
 
-A law that is given the noise n of the sensors moves the robot by it. Between the rows of a log that noise is not known.
-It is drawn several times; the deviations of the simulated motions from their mean, over the root of their number less
-1, are columns of W. So is the motion by a standard deviation of an unknown initial velocity. Residuals r of white noise
-of size sigma and of wander have the covariance::
+The law reacts to the noise n of the sensors and thereby moves the robot. Between the rows of a log that noise is
+unknown, so it is drawn several times. The deviations of the simulated motions from their mean, over the root of their
+number less 1, are columns of W. A further column is the motion due to one standard deviation of an unknown initial
+velocity. Residuals r of white noise of size sigma and of wander have the covariance::
 
     C = sigma^2 (I + W W^T / n^2),     r_white = (I + W W^T / n^2)^(-1/2) r
 
-r_white takes the place of r, and its Jacobian that of the Jacobian; half the logarithm of det(I + W W^T / n^2) is added
-to the negative logarithm of the likelihood (generalized least squares; L. Ljung, System Identification, 2nd edition,
-Prentice Hall, 1999, section 7.2).
+r_white and its Jacobian replace r and J; half the logarithm of det(I + W W^T / n^2) is added to the negative logarithm
+of the likelihood (generalized least squares; L. Ljung, System Identification, 2nd edition, Prentice Hall, 1999, section
+7.2).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ START, RESTS = 0.03, 0.05
 MOVES = 4.0
 """Initial speed from which a joint counts as moving, over the combined standard deviations of estimate and prior."""
 HELD_OUT = 0.25
-"""Share of each log, at its end, that is kept to judge."""
+"""Share of each log, at its end, that is held out."""
 
 
 class Window(NamedTuple):
@@ -44,7 +44,7 @@ class Window(NamedTuple):
     first: int
     """Number of its first row in the log."""
     fitted: Any
-    """Rows that are fitted; the others are kept to judge (rows,) bool."""
+    """Fitted rows; the others are held out (rows,) bool."""
     errors: Float64
     """Draws of the error of the segment's noise, or of logged efforts (draws, past + steps, joints)."""
     speed_error: Float64
@@ -114,7 +114,7 @@ def simulate(
 
 
 def project(basis: Float64, residual: Float64, columns: Float64) -> tuple[Float64, Float64]:
-    """Return residual (rows, joints) and ``columns`` (rows, joints, n) without what ``basis`` explains.
+    """Return residual (rows, joints) and ``columns`` (rows, joints, n) without the part that ``basis`` explains.
 
     ``basis`` is (rows, joints, states).
     """
@@ -176,13 +176,13 @@ def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
 
 
 def whole(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:
-    """Return one window of all the log."""
+    """Return one window that covers the log."""
     settle = min(SETTLE, 0.2 * log.seconds)
     return [_window(number, log, motion, dt, 0, len(motion.qpos) - 1, 0, settle)]
 
 
 def cut(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:
-    """Return windows of WINDOW seconds; one that would lie across the kept part begins there."""
+    """Return windows of WINDOW seconds; a window begins where the held-out part begins."""
     total, past, edge = len(motion.qpos) - 1, round(0.1 / dt), round(0.05 / dt)
     split = int((1 - HELD_OUT) * total)
     length = min(round(WINDOW / dt), total - split - 2)

@@ -5,6 +5,7 @@ Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,6 +30,15 @@ from batchpid.sim.plots import drawing
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""
+
+
+class Picture(Figure):
+    """Figure that a notebook shows as PNG, without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        return _png(self, dpi=90)
+
+
 Joints: TypeAlias = Sequence[int | str] | None
 """Joints to draw, by index or name; None or empty for all."""
 _MEDIAN = Line2D([], [], color=drawing.MEDIAN, lw=1.6, label="median")
@@ -42,8 +52,8 @@ def step_responses(
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
 
-    Setpoints that are not one number for each joint have axes of their own, one for each entry of the command.
-    Not-finite samples are gaps; so is everything of an env from where ``ok`` is False.
+    Setpoints that are not one number for each joint have separate axes, one for each entry of the command. Not-finite
+    samples are gaps; so is everything of an env from where ``ok`` is False.
 
     Parameters
     ----------
@@ -150,18 +160,25 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
     if path.suffix.lower() == ".svg":
         write_atomically(path, lambda file: figure.savefig(file, dpi=dpi, format="svg"))
         return path
+    write_atomically(path, _png(figure, dpi))
+    return path
+
+
+def _png(figure: Figure, dpi: int) -> bytes:
+    """Return the figure as a PNG file."""
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    # A palette of 256 colours cannot be told from the original, and takes a third of the bytes.
+    # A palette of 256 colours looks the same, and takes a third of the bytes.
     image = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    write_atomically(path, lambda file: image.save(file, "PNG", optimize=True, dpi=(dpi, dpi)))
-    return path
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True, dpi=(dpi, dpi))
+    return file.getvalue()
 
 
 def _blank_failed(rollout: Rollout) -> Rollout:
-    """Return the rollout with NaN where an env has failed, and for setpoints that are no positions."""
+    """Return the rollout with NaN where an env has failed, and for setpoints that are not positions."""
     alive, seen = rollout.ok[..., None], rollout.observation
     blank = seen._replace(qpos=np.where(alive, seen.qpos, np.nan), effort=np.where(alive, seen.effort, np.nan))
     setpoint = np.full(seen.qpos.shape, np.nan)
@@ -195,7 +212,7 @@ def _figure(
     heights = (1.7, 0.85)[:rows]
     between = 0.06  # a thin empty row separates the joints
     size = ((4.0 if columns < 5 else 3.6) * columns, (sum(heights) + between) * lines + 0.75)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Picture(figsize=size, layout="constrained")
     figure.get_layout_engine().set(h_pad=0.02, w_pad=0.05, hspace=0.0)  # type: ignore[call-arg, union-attr]
     if title:
         figure.suptitle(title, fontsize=11)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from batchpid.sim.plots import drawing
+from batchpid.sim.plots.figures import Picture
 
 Float64 = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def fit_errors(fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[
     """
     columns = min(3, len(names))
     rows = math.ceil(len(names) / columns)
-    figure = Figure(figsize=(4.2 * columns, 0.8 + 2.0 * rows), layout="constrained")
+    figure = Picture(figsize=(4.2 * columns, 0.8 + 2.0 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
     kept = [fit.time[~fit.fitted] for fit in fits]
     for number, axes in enumerate(grid.flat):

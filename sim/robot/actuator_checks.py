@@ -17,9 +17,9 @@ from batchpid.sim.robot.description import RobotDescription
 FRICTION_SHARE = 0.8
 """Share of the robot's own actuators' Coulomb friction that is compensated.
 
-Friction that is compensated by more than there is lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust
-control for servo-mechanisms under inexact friction compensation", Automatica 29, 1993), and figures from a log are
-inexact, other than those of a description, by which the joint is simulated.
+Overcompensated friction lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust control for
+servo-mechanisms under inexact friction compensation", Automatica 29, 1993). Friction identified from a log is inexact;
+friction in the robot's description is exact, because the joint is simulated with it.
 """
 
 

@@ -14,12 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.digest import digest
+from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
+from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
@@ -72,11 +74,11 @@ def register_engine(load: Callable[[], RobotFunctions]) -> None:
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
-    among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
-    that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are
-    its motors and sensors, None for ideal ones.
+    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``; ``coupling`` couples the mimic joints
+    among them to their leaders, and is None without mimic joints. ``bodies`` is the placement of every link, by name,
+    in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is False.
+    ``settings`` is None unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up
+    first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -102,6 +104,9 @@ class RobotDescription(Urdf):
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
+
+    def _repr_html_(self) -> str:
+        return html_table(repr(self).partition("\n")[0].rstrip(",") + ")", HEADERS, joint_rows(self.joints))
 
     @property
     def dof(self) -> int:
@@ -272,7 +277,7 @@ class RobotDescription(Urdf):
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default: unless the base is fixed so low that links dip into it at rest."""
+        """True if scenes have a ground by default; False if the base is fixed so low that links dip into it at rest."""
         return not self.self_contact.reaches_ground
 
     def about(self) -> dict[str, Any]:

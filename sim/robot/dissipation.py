@@ -9,8 +9,8 @@ class Dissipation(NamedTuple):
     """Friction and damping in the engine.
 
     ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
-    ``modelled``: whether the joints' friction and damping are those of :mod:`batchpid.motors.friction`, in the URDF's
-    units, and not the engine's.
+    ``modelled``: whether :mod:`batchpid.motors.friction` computes the joints' friction and damping, in the URDF's
+    units, instead of the engine.
     """
 
     joint_friction: float

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from lxml import etree
 
+from batchpid.arrays.display import html_table
 from batchpid.errors import RobotError
 
 MOST_LISTED = 50  # repairs in an error
-SEVERITIES = ("warning", "note")  # probably not what is meant; good to know
+SEVERITIES = ("warning", "note")  # probably an error; good to know
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,18 @@ class Finding:
     def _name(self) -> str:
         name = self.link if self.joint is None else self.joint
         return "" if name is None else repr(name)
+
+
+class Findings(list[Finding]):
+    """List of findings with a representation for people: a line, or in a notebook a row, for each."""
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, self)) or "[]"
+
+    def _repr_html_(self) -> str:
+        headers = ("", "where", "finding", "remedy")
+        rows = ((each.severity, each.where, " ".join([each.text, each.detail]).strip(), each.remedy) for each in self)
+        return html_table("Findings" if self else "No findings", headers if self else (), rows)
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:

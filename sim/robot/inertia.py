@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 
 SLENDER = 1e-3  # smallest principal moment over the largest of a tensor that had to be replaced; PhysX divides by it
-DENSITY = 1000.0  # [kg/m^3], that of water, at which SAPIEN gives shapes their mass
+DENSITY = 1000.0  # [kg/m^3] of water, with which SAPIEN computes the mass of shapes
 
 
 def from_entries(entries: Sequence[float]) -> Float64:

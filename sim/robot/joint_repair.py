@@ -16,7 +16,7 @@ GIVE_RANGE = "give <limit lower= upper=>"
 
 
 def repair(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
-    """Repair a joint of the robot ``root``, but for its mimic."""
+    """Repair a joint of the robot ``root``, except its mimic."""
     yield from _type(joint, root)
     if joint.get("type") == "fixed":
         for tag in ("axis", "limit", "dynamics"):
@@ -69,7 +69,7 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
 
 
 def _limits(joint: etree._Element) -> Iterator[Finding]:
-    """Repair the limits: what is no limit, or a placeholder, is infinite."""
+    """Repair the limits: missing and placeholder limits become infinite."""
     limit, kind = joint.find("limit"), joint.get("type")
     if limit is None:
         limit = etree.SubElement(joint, "limit")
@@ -121,7 +121,7 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
 
 
 def _dynamics(joint: etree._Element) -> Iterator[Finding]:
-    """Make friction and damping that cannot be zero."""
+    """Set invalid friction and damping to zero."""
     dynamics = joint.find("dynamics")
     for key in ("damping", "friction") if dynamics is not None else ():
         values = readable(dynamics, key, "0")

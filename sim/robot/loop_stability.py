@@ -49,7 +49,8 @@ class StabilityReport(NamedTuple):
 class Gains(NamedTuple):
     """Gains and plant as the law acts on it at one pose: in units of ``matrix`` (n, n), for independent joints (n,).
 
-    kp, ki, kd and the derivative's filter time are (envs, n) or (1, n); ``damping`` is that of the joints.
+    kp, ki, kd and the derivative's filter time are (envs, n) or (1, n); ``damping`` is the viscous damping of the
+    joints.
     """
 
     matrix: Float64
@@ -123,19 +124,19 @@ def slow_oscillation(
 class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see :mod:`batchpid.sim.robot.loop_stability`.
 
-    The bound is that of ideal motors at the start pose, with the armature of actuators. There is no warning with
-    actuators that delay or limit efforts, or measure with errors, which have other bounds, and for a robot loaded with
-    ``dissipation="sapien"``, whose friction is not in the formula.
+    The bound holds for ideal motors at the start pose, with the armature of actuators. Actuators that delay or limit
+    efforts, or measure with errors, have other bounds, and ``dissipation="sapien"`` adds friction that is not in the
+    formula: in these cases there is no warning.
     """
 
 
 class StabilityCheck:
-    """Check of gains against the stability bound, which warns when they pass it, and not again while they are beyond.
+    """Check of gains against the stability bound. It warns when they pass it, and again only after a return within it.
 
     Parameters
     ----------
     robot, timestep
-        The bound is that at the robot's start pose with this time step [s].
+        The bound is taken at the robot's start pose with this time step [s].
     """
 
     def __init__(self, robot: RobotDescription, timestep: float) -> None:

@@ -30,7 +30,7 @@ class Merged(NamedTuple):
 
     ``urdf``: its text; ``bodies``: placement of every link of the original; ``inertias``: inertia of those links of the
     original that the engine gives one, in their own frames; ``owners``: the original link of each collision shape of
-    each link of ``urdf``, in the engine's order, which is that of the text with mirrored meshes last.
+    each link of ``urdf``, in the engine's order: the order of the text, with mirrored meshes last.
     """
 
     urdf: str
@@ -58,8 +58,8 @@ def place_links(urdf: str, merge_fixed: bool = True) -> dict[str, Placement]:
 def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia]) -> Merged:
     """Return the robot of a sanitised URDF with its fixed joints merged.
 
-    ``inertia_of_shapes(link)`` is what the engine gives a link without ``<inertial>`` that has collision shapes, in the
-    frame of that link.
+    ``inertia_of_shapes(link)`` is the inertia that the engine computes for a link with collision shapes but without
+    ``<inertial>``, in the frame of that link.
     """
     root = etree.fromstring(urdf.encode())
     edges = _edges(root)
@@ -106,7 +106,7 @@ def _edges(root: etree._Element) -> list[_Edge]:
 
 
 def _merged_joints(edges: Sequence[_Edge]) -> set[str]:
-    """Return the fixed joints to merge: all, but for some above joints whose order would change."""
+    """Return the fixed joints to merge: all except those whose merge would change the order of joints below them."""
     wanted = [edge.name for edge in edges if edge.moves]
     carriers: set[str] = set()  # links with a joint that moves below them
     for edge in reversed(edges):

@@ -25,10 +25,11 @@ def coupling_of(joints: tuple[Joint, ...]) -> Coupling | None:
 
 
 def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
-    """Return ``joints`` with what followers contribute to their leaders.
+    """Return ``joints`` with the leaders' limits, friction and damping adapted to their followers.
 
-    Their position limits narrow those of the leader, which are theirs then, multiplied; those that would leave no range
-    do not count. Their friction |m| F and damping m^2 B act on the leader, which is the same in the coupled motion.
+    A follower's position limits narrow the leader's, unless that would leave no range; the follower then gets the
+    leader's limits, multiplied. Its friction and damping act on the leader as |m| F and m^2 B, which is equivalent in
+    the coupled motion.
     """
     joints = tuple(joints)
     coupling = coupling_of(joints)

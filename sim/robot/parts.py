@@ -136,8 +136,8 @@ class Urdf:
 
     ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
     fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
-    that were not found or cannot be read, the latter with the reason. ``repairs`` are the findings of what was changed
-    so that the simulator can run it.
+    that were not found or cannot be read, the latter with the reason. ``repairs`` are findings, one for each change
+    that the simulator needs.
     """
 
     name: str

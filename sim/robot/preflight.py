@@ -1,7 +1,7 @@
 """Preflight: oddities of a robot, and of the way it is to be run, reported before the first step.
 
-SAPIEN silently accepts most of what is listed here. ``Robot.load`` raises an error for what SAPIEN cannot run at all; a
-:class:`batchpid.sim.Finding` is something that runs otherwise than the URDF, or the user, means.
+SAPIEN silently accepts most of these oddities. ``Robot.load`` raises an error if SAPIEN cannot run the file at all. A
+:class:`batchpid.sim.Finding` reports a robot that runs, but differently than the URDF or the user intends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES
-from batchpid.sim.robot.findings import SEVERITIES, Finding
+from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
 from batchpid.sim.robot.loop_stability import slow_oscillation, stability_report
@@ -37,7 +37,7 @@ def check(
     setpoint: ArrayLike | None,
     timestep: float,
     control: str,
-) -> list[Finding]:
+) -> Findings:
     """Return the findings, most severe first; :meth:`batchpid.sim.Robot.check` describes the arguments."""
     timestep = number("timestep", timestep, 1e-6, 0.1, "seconds")
     choice("control", control, ("pid", "drive", "effort"))
@@ -64,14 +64,14 @@ def check(
         findings += _params(robot, params, control)
         if control == "pid":
             findings += _stability(robot, params, start, timestep)
-    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    return Findings(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
     bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
     solid = {bodies[link.name] for link in robot.links if link.inertial or link.collisions}
-    loaded = set(solid)  # bodies with mass in them or in what they carry
+    loaded = set(solid)  # bodies with mass in them or in the links that they carry
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])

@@ -1,7 +1,7 @@
-"""Repair of URDFs as published: what can be put right without a guess of the robot's geometry.
+"""Repair of published URDFs: all faults that can be repaired without a guess about the robot's geometry.
 
-Every function changes the XML tree in place and yields a finding of each repair. What is left is valid for the reader
-(:mod:`batchpid.sim.robot.urdf`), or has no repair and is an error there.
+Every function changes the XML tree in place and yields a finding of each repair. After the repairs the tree is valid
+for the reader (:mod:`batchpid.sim.robot.urdf`), or has a fault without repair, which is an error there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.joint_repair import ends_of
 from batchpid.sim.robot.link_repair import SHAPES
 
-_READ = {  # elements that are kept, by parent: what SAPIEN does not use it may still fail to parse
+_READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that it does not use
     "robot": {"link", "joint"},
     "link": {"inertial", "collision"},
     "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "safety_controller"},
@@ -51,7 +51,7 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
 
 
 def _elements(root: etree._Element) -> Iterator[Finding]:
-    """Remove elements that SAPIEN does not use, and all but the first of those that may stand once."""
+    """Remove elements that SAPIEN does not use, and repetitions of elements that may occur once."""
     unknown: Counter[str] = Counter()
     xacro: Counter[str] = Counter()
     stack = [root]
@@ -122,7 +122,7 @@ def _links(root: etree._Element) -> Iterator[Finding]:
 
 
 def _joints(root: etree._Element) -> Iterator[Finding]:
-    """Give joints without a name, or with one that is taken, a name; remove copies."""
+    """Name joints that have no name or a repeated one; remove copies of joints."""
     seen: dict[str, tuple[str | None, str | None]] = {}
     for joint in root.findall("joint"):
         name, ends = joint.get("name"), ends_of(joint)

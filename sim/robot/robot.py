@@ -21,7 +21,7 @@ from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
 from batchpid.sim.robot.parts import Joint, Settings
@@ -69,7 +69,7 @@ class Robot(RobotDescription):
             True to fix the root link to the world.
         merge_fixed
             True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
-            steps. False keeps every link, and contacts of a link with those that it is joined to by way of others.
+            steps. False keeps every link, and contacts between links that are joined through other links.
         self_collision
             ``"auto"``: links that are neighbours, overlap at the start pose, or touch in nearly every sampled pose do
             not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
@@ -88,7 +88,7 @@ class Robot(RobotDescription):
             The file is not a usable URDF; the message names the element and the remedy. With ``strict``, it needs
             repairs, which the message lists.
         InvalidArgumentError
-            An option is not one of those above.
+            An option has none of the values above.
         """
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, DISSIPATION)
@@ -139,13 +139,13 @@ class Robot(RobotDescription):
         setpoint: ArrayLike | None = None,
         timestep: float = 1 / 2000,
         control: str = "pid",
-    ) -> list[Finding]:
+    ) -> Findings:
         """Return the findings of the preflight, most severe first: oddities of this robot and of running it this way.
 
         Parameters
         ----------
         params
-            PID parameters to check too; default those of :meth:`params` where the robot has gains.
+            PID parameters to check, too; default :meth:`params` if the robot has gains.
         qpos, setpoint
             Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or m].
         timestep
@@ -165,11 +165,11 @@ class Robot(RobotDescription):
     def designed(self, gain_units: str = "mass_matrix") -> bp.PIDParams:
         """Return params designed from the robot's inertia alone; a search for gains starts from them.
 
-        With the mass matrix the poles lie between those of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E. Thomson,
-        "Delay networks having maximally flat frequency characteristics", Proc. IEE 96, 1949), with zeta = sqrt(0.6) and
-        Ti = sqrt(15) / w, and three equal ones. A step settles in 0.91 s with 0.1 % overshoot, at two thirds of the
-        effort that three equal poles of that speed need. In other units the joints disturb each other, which three
-        equal poles tolerate better.
+        With the mass matrix the poles lie between the poles of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E.
+        Thomson, "Delay networks having maximally flat frequency characteristics", Proc. IEE 96, 1949), with zeta =
+        sqrt(0.6) and Ti = sqrt(15) / w, and three equal ones. A step settles in 0.91 s with 0.1 % overshoot, at two
+        thirds of the effort that three equal poles of that speed need. In other units the joints disturb each other,
+        which three equal poles tolerate better.
 
         Parameters
         ----------

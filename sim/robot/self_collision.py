@@ -54,9 +54,9 @@ class Srdf(NamedTuple):
 class SelfContact(NamedTuple):
     """Contact of a robot's links with each other and with the ground.
 
-    ``pairs`` do not collide. Those ``left_over`` should not, but do: PhysX's filter holds all pairs of up to 31 links,
-    any 62 pairs of more links, and mostly many more. ``reaches_ground`` is True if a link other than the base touches
-    the ground at the start pose.
+    ``pairs`` do not collide. The pairs ``left_over`` should not collide, but do, because PhysX's filter is full: it
+    holds all pairs of up to 31 links, any 62 pairs of more links, and usually many more. ``reaches_ground`` is True if
+    a link other than the base touches the ground at the start pose.
     """
 
     pairs: tuple[DisabledPair, ...]
@@ -65,9 +65,9 @@ class SelfContact(NamedTuple):
 
 
 def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
-    """Return the pairs in the .srdf at ``path``, whatever their reason; one without reason gets "User".
+    """Return the pairs in the .srdf at ``path``, for any reason; a pair without reason gets "User".
 
-    Pairs that name a link twice or one that is not among ``links`` are left out, as MoveIt does, with a finding.
+    Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from batchpid.sim.robot.parts import Joint
 
 
 class GuardedRobot(Protocol):
-    """Robot as far as the guard needs it; arrays are (dof,)."""
+    """Part of a robot that the guard needs; arrays are (dof,)."""
 
     @property
     def joints(self) -> tuple[Joint, ...]:

@@ -43,7 +43,7 @@ class Surface(NamedTuple):
 def surfaces(
     robot: RobotDescription, deviation: float = DEVIATION, findings: list[Finding] | None = None
 ) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] is that of :func:`segments_of`.
+    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in :func:`segments_of`.
 
     A mesh that cannot be read is appended to ``findings``.
 
@@ -114,7 +114,7 @@ class _UnreadableMesh(Exception):
         self.name, self.reason, self.remedy = name, reason, remedy
 
     def finding(self, link: str, shown: str) -> Finding:
-        """Return the finding for a ``link``; ``shown`` says what is drawn instead."""
+        """Return the finding for a ``link``; ``shown`` names the shapes drawn instead."""
         text = f"mesh {self.reason}: {shown}"
         return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=repr(self.name))
 

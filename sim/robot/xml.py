@@ -1,7 +1,7 @@
 """Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees, no odd numbers.
 
-lxml's own options do it: they cover what ``defusedxml`` checks, whose lxml module is deprecated, and libxml2 limits
-nesting and the size of text, which the standard library's parser does not.
+The options of lxml suffice: they cover the checks of ``defusedxml``, whose lxml module is deprecated. libxml2 also
+limits nesting and the size of text, unlike the parser of the standard library.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 MOST_PREFIXES = 100  # of namespaces that nobody declared
-LARGEST = 1e18  # magnitude of a number, whose square single precision, that of PhysX, can hold
+LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
 LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
     """Return the root element of the file at ``path``, without comments and processing instructions.
 
-    A file that is not quite XML is read as :func:`_lenient` says, and a finding appended to ``repairs``.
+    A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``.
 
     Raises
     ------
@@ -58,10 +58,10 @@ def _parse(data: bytes) -> etree._Element:
 
 
 def _lenient(data: bytes) -> etree._Element:
-    """Return the first ``<robot>``, or other element, of a file that is XML but for what other readers of URDFs accept.
+    """Return the first ``<robot>``, or other element, of a file with faults in its XML that other readers accept.
 
-    These are: text or comments before the declaration or after the root, a wrong encoding, ``--`` in comments, ``&``
-    alone, and prefixes of namespaces that nobody declared.
+    Accepted faults are: text or comments before the declaration or after the root, a wrong encoding, ``--`` in
+    comments, ``&`` alone, and prefixes of namespaces that nobody declared.
     """
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
@@ -89,8 +89,8 @@ def numbers(
 ) -> tuple[float, ...]:
     """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing or empty one.
 
-    They are finite and at most LARGEST in magnitude, those of a joint ``limit`` at most LARGEST_LIMIT or infinite, or a
-    RobotError is raised, whose message begins with ``where``.
+    Raises a RobotError, whose message begins with ``where``, unless they are finite and at most LARGEST in magnitude;
+    numbers of a joint ``limit`` may be up to LARGEST_LIMIT or infinite.
     """
     given = default if element is None else element.get(key, default)
     text, count = given if given.strip() else default, len(default.split())

@@ -5,12 +5,12 @@ The cost of a candidate is the mean over joints, taken as the mean over moves pl
     w_itae log(1 + ITAE / (A 1 s^2)) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %) + w_final log(1 + E / 1e-3)
         + w_chatter log(1 + max(TV / TV_smooth - 1, 0)) + w_saturation S
 
-and of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) of the arm's joint that settles last, the mean over moves. Where
-robots are drawn, one of them may be out of reach, and the mean over moves counts twice in place of the worst. Ts counts
-as 1.5 times the run at most; Tmax is the settling time asked for. A is the joint's move, or the smallest that counts as
-one; O the overshoot as a fraction of that; E the error left at the end; TV the total variation of the effort and
-TV_smooth that of the smooth motion that takes a second; S the share of time in saturation. Logarithms keep one move or
-joint out of reach from deciding alone.
+plus the mean over moves of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the arm's joint that settles last. With a
+randomization, a robot may be drawn that no gains can control; then twice the mean over moves replaces the sum of mean
+and worst. Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the joint's move, or the
+smallest move that counts; O the overshoot as a fraction of A; E the final error; TV the total variation of the effort,
+and TV_smooth its variation in the smooth motion that takes a second; S the share of time in saturation. The logarithms
+prevent that a single move or joint decides.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ FACTORS = {
 }
 """Factors that are searched for all joints together; with ``per_joint`` one for each joint's inertia as well.
 
-A bandwidth factor c moves all poles alike: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
+A bandwidth factor c scales all poles: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
 """
 HEADROOM = 0.9
 """Share of the effort limits that candidates may use."""
 PENALTY_RATIO = 0.8
 """Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
 DIVERGED_COST = 1e3
-"""Cost of a candidate that diverges; up to twice that, the sooner it does."""
+"""Cost of a candidate that diverges; up to twice as much if it diverges early."""
 
 
 class Candidates:
@@ -124,7 +124,7 @@ class Candidates:
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", StabilityWarning)  # a candidate may be beyond the bound, which costs it
+            warnings.simplefilter("ignore", StabilityWarning)  # a candidate beyond the bound gets a penalty
             runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
         each = np.tile(np.arange(len(moves.start)), count)
         rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each)

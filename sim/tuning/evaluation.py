@@ -1,4 +1,4 @@
-"""Evaluation of gains: a set of moves, each run in its own env, all at once, with metrics of every joint."""
+"""Evaluation of gains: a set of moves, each in a separate env, all at once, with metrics of every joint."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Evaluation(NamedTuple):
     rollout: Rollout
     metrics: StepMetrics
     chatter: Float64
-    """Total variation of the effort, over that of the smooth (minimum-jerk) motion of the same move and duration."""
+    """Total variation of the effort, over the variation in a smooth (minimum-jerk) motion of the same duration."""
     settling_limit: Float64
     """Settling time asked for (moves,) [s]."""
 
@@ -102,10 +102,10 @@ def absolute_band(robot: Robot) -> Float64:
 def step_response_metrics(
     robot: Robot, rollout: Rollout, start: NDArray[Any], *, with_effort: bool = True
 ) -> StepMetrics:
-    """Return the metrics of a rollout from rest at ``start`` (envs, dof); those of envs that diverged are inf.
+    """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that diverged.
 
-    Followers have the metrics of their leaders.
-    Without ``with_effort`` those of the efforts are undefined (NaN), as under control "drive".
+    Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are undefined (NaN), as
+    under control "drive".
     """
     if (own := rollout.info.own_command) is not None:
         problem, remedy = f"has setpoints of {', '.join(own.names)}, not of joints", "pass a run with joint setpoints"
@@ -152,8 +152,8 @@ def run_moves(
 ) -> tuple[Rollout, StepMetrics]:
     """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
 
-    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` are those of the runner's randomization
-    (moves,), by default one for each move: the draws are the same at every call.
+    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` (moves,) are streams of the runner's
+    randomization, by default one for each move, so that the draws are the same at every call.
     """
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     with warnings.catch_warnings():
@@ -177,8 +177,7 @@ def evaluate_gains(
 ) -> Evaluation:
     """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
 
-    ``params`` have one row for all moves, or one row per move; ``runner_options`` are those of
-    :class:`batchpid.sim.Runner`.
+    ``params`` have one row for all moves, or one row per move; ``runner_options`` go to :class:`batchpid.sim.Runner`.
     """
     with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)

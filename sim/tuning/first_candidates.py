@@ -1,13 +1,13 @@
 r"""First candidates of a search for robots that differ from the model, from the time asked for and the loop's delay.
 
-Loads that the model does not know are learnt by the integral. Designed gains have three poles of nearly one speed, and
-faster ones saturate the effort on a step of the setpoint. The first candidates have one real pole -p, which sets the
-time in which a setpoint is reached, and two at -w, which reject the load::
+The integral adapts to unknown loads. Designed gains have three poles of nearly equal speed; faster ones would saturate
+the effort on a step of the setpoint. The first candidates have one real pole -p, which sets the time in which a
+setpoint is reached, and two at -w, which reject the load::
 
     s^3 + kd s^2 + kp s + ki = (s + p) (s + w)^2        kd = p + 2 w    kp = w^2 + 2 p w    ki = p w^2
 
-per unit of inertia. A load of acceleration a moves the joint by about a / w^2, whatever p is. The loop is stable while
-joints are heavier than the model by a factor below kd kp / ki (Routh and Hurwitz), 9 at w = p and 15 at w = 5 p.
+per unit of inertia. A load of acceleration a moves the joint by about a / w^2, independent of p. The loop is stable
+while joints are heavier than the model by a factor below kd kp / ki (Routh and Hurwitz), 9 at w = p and 15 at w = 5 p.
 
 The delay T of the loop limits w: the phase margin of L(s) = (kd s^2 + kp s + ki) / s^3 exp(-s T) is to be 45 degrees
 (K. J. Astrom and R. M. Murray, Feedback Systems, 2008, section 9.3).
@@ -70,7 +70,7 @@ def first_gains(delay: float) -> list[Float64]:
 
 
 def _fastest(delay: float, p: float | None = None) -> float:
-    """Return the largest w [1/s] with the phase margin, by bisection; without ``p`` that of three poles at -w."""
+    """Return the largest w [1/s] with the phase margin, by bisection; without ``p`` for three poles at -w."""
     low, high = 1e-2, 1e4
     for _ in range(50):
         w = float(np.sqrt(low * high))

@@ -1,10 +1,10 @@
 r"""Moves to evaluate gains on: seeded, free of contact, with the shortest duration that the effort limits allow.
 
 A move is a step of the setpoint from rest at ``start`` to ``target``. The straight line between them, which good gains
-follow, is tested for contact, and so is its continuation by as much as a good move may overshoot. On that line
-q(z) = start + z (target - start) all joints move in proportion, so that the effort of a motion z(t) in time T is
-gravity(q) + h / T^2 + B q' / T + F sgn(q'), with h and q' those of the same motion in unit time, joint damping B and
-friction F. The shortest bang-bang motion, accelerating up to half the way and braking from there, has in closed form::
+follow, is tested for contact, and so is its continuation by as much as a good move may overshoot. On that line q(z) =
+start + z (target - start) all joints move in proportion, so that the effort of a motion z(t) in time T is gravity(q) +
+h / T^2 + B q' / T + F sgn(q'), with h and q' of the same motion in unit time, joint damping B and friction F. The
+shortest bang-bang motion, accelerating up to half the way and braking from there, has in closed form::
 
     T = max over joints and line of the positive root of room_j T^2 - B_j |q_j'| T - |h_j|
 
@@ -78,8 +78,8 @@ def search_moves(robot: Robot, seed: int = 0) -> Moves:
     """Return the moves that gains are searched on.
 
     The tutorial's, where there is one, with the hardest of 64 that start within 0.3 rad [or m] of it; a random move of
-    each kind; and the hardest of 28 more. The hardest needs most time under the effort limits: the fastest gains just
-    do not saturate on it.
+    each kind; and the hardest of 28 more. The hardest needs most time under the effort limits, so it limits how fast
+    the gains may be.
     """
     moves, drawn = tutorial_move(robot), random_moves(robot, 32, seed)
     if robot.settings is not None:
@@ -101,9 +101,9 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
 
     Starts are uniform over :meth:`Robot.sample`, 2 % off the limits; targets within ``size`` [rad, or m but at most the
     whole range] of them, by the :data:`KINDS` in turn. The effort limits allow each move within LONGEST, and hold its
-    ends. A robot that is seldom free, such as one with many fingers or legs, or that is weak, moves nearer to its start
-    pose, or to the pose that it holds most easily: after each 50 draws in vain, starts and steps lie within half the
-    range. ``ground`` says whether there is one at height 0, by default as :attr:`Robot.has_ground`.
+    ends. If few poses are free of contact, as with many fingers or legs, or if the robot is weak, moves lie nearer to
+    its start pose, or to the pose that it holds most easily: after every 50 rejected draws, the range of starts and
+    steps is halved. ``ground`` says whether there is one at height 0, by default as :attr:`Robot.has_ground`.
 
     Raises
     ------
@@ -153,8 +153,8 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
 def _center(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
     """Return the pose about which moves lie if they are hard to find, and the joints that can move (dof,).
 
-    It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise it is one for which
-    that is more so, found by descent: some joints of the best so far move towards those of random poses, ever less.
+    It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise a better pose is
+    found by descent: some joints of the best pose so far move towards random poses, by smaller and smaller steps.
     """
     rng = np.random.default_rng(0)
 

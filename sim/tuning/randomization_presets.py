@@ -70,7 +70,7 @@ def usual_variation(
     """Return the robots of ``--variation``: payload and friction drawn uniformly, 18-bit sensors, efforts a step late.
 
     Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; friction from 0 to
-    ``friction`` [N m or N], added to all joints alike. Raises InvalidArgumentError for a number out of range.
+    ``friction`` [N m or N], the same for all joints. Raises InvalidArgumentError for a number out of range.
     """
     payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "N m or N")
     drawn = Randomization(
@@ -80,12 +80,12 @@ def usual_variation(
 
 
 def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:
-    """Return ``randomization`` with ``seed`` added to its own, for other draws."""
+    """Return ``randomization`` with ``seed`` added to its seed, for other draws."""
     return None if randomization is None else replace(randomization, seed=randomization.seed + seed)
 
 
 def at_the_joints(randomization: Randomization | None) -> Randomization | None:
-    """Return ``randomization`` with the fields of actuators that act on PhysX's drives, too: friction and inertia."""
+    """Return ``randomization`` with only the actuator fields that affect PhysX's drives: friction and inertia."""
     if randomization is None:
         return None
     fields = {name: each for name, each in randomization.actuators.items() if name in JOINT_SIDE}

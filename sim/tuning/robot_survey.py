@@ -1,8 +1,7 @@
-"""Survey of robots: each URDF loaded, built and moved under designed gains, in a process to itself.
+"""Survey of robots: each URDF is loaded, built and moved under designed gains, in a separate process.
 
-A robot that crashes the engine ends its own process only, and the survey says in which stage that was. The moves are
-those of :func:`batchpid.sim.tuning.moves.random_moves`, the gains those of :func:`batchpid.design_gains` per mass
-matrix.
+A robot that crashes the engine ends only its process, and the survey reports the stage. The moves come from
+:func:`batchpid.sim.tuning.moves.random_moves`, the gains from :func:`batchpid.design_gains` per mass matrix.
 """
 
 from __future__ import annotations
@@ -202,7 +201,7 @@ def _exit_text(status: int) -> str:
 
 
 def main() -> None:
-    """Survey the robot named on the command line; print what is known of it, as a line of JSON after each stage."""
+    """Survey the robot named on the command line; print the report so far as a line of JSON after each stage."""
     urdf, options = json.loads(sys.argv[2])
     out, stage = os.fdopen(os.dup(1), "w"), STAGES[0]
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # SAPIEN prints

@@ -1,17 +1,17 @@
 r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
 
-Each env runs one move of one candidate, so that a generation is one rollout. The moves touch nothing, so that robots
-have no collision shapes in the search. A share of the effort limits is reserved for moves that are harder than those
-searched; :mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen,
-"The CMA evolution strategy: a tutorial", arXiv:1604.00772).
+Each env runs one move of one candidate, so a generation is one rollout. The moves touch nothing, so the robots have no
+collision shapes in the search. A share of the effort limits is reserved for moves that are harder than those searched;
+:mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
+evolution strategy: a tutorial", arXiv:1604.00772).
 
-Gains for robots that differ from the model, by actuators or a randomization, lie farther from the designed ones. There
-the first generation are the designs of :mod:`batchpid.sim.tuning.first_candidates`, and CMA-ES starts from the best of
-them.
+Gains for robots that differ from the model, by actuators or a randomization, lie farther from the designed ones. For
+them the first generation consists of the designs of :mod:`batchpid.sim.tuning.first_candidates`, and CMA-ES starts from
+the best of them.
 
-The best of the candidates and the designed gains then run a final on more moves, with collisions, under the caller's
-solver, at the full effort limits. The cheapest there is the result: what suits the few moves of the search need not
-suit others.
+The best candidates and the designed gains then run a final round on more moves, with collisions, under the caller's
+solver, at the full effort limits, because gains that are best on the few moves of the search need not be best on
+others. The gains with the lowest cost there are the result.
 
 A search is a function of its seed and does not depend on the number of workers. To resume, a fresh search of the same
 seed is given the costs in the history, and continues as if it had never stopped.
@@ -59,7 +59,7 @@ FINALISTS, FINAL_MOVES = 3, 24
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
 """Options of the runner in the search, on moves of our own: these touch nothing."""
 _FINAL_SEED = 1_000_003
-"""Distance of the seed of these moves from that of the search."""
+"""Difference between the seed of these moves and the seed of the search."""
 
 
 class Tuning(NamedTuple):
@@ -67,7 +67,7 @@ class Tuning(NamedTuple):
 
     params: bp.PIDParams
     cost: float
-    """In the search."""
+    """Cost in the search."""
     start_params: bp.PIDParams
     """Designed gains that the search began with."""
     start_cost: float
@@ -103,7 +103,7 @@ def tune(
     Parameters
     ----------
     seed
-        Of the search, the moves and, with that of the randomization, of the draws.
+        Seed of the search, of the moves and, together with the randomization's seed, of the draws.
     generations, population
         Number of generations, and of candidates in each.
     seconds
@@ -115,10 +115,10 @@ def tune(
     weights
         Of the terms of the cost.
     moves
-        Default: those of :func:`batchpid.sim.tuning.moves.search_moves`, and a final on FINAL_MOVES random ones. Robots
-        with actuators or a randomization are searched on the tutorial's and VARIED_MOVES random ones: the hardest of
-        those that the effort limits allow the model ask too much of them. Moves that are given are the final as well,
-        and are searched on with the physics of the final, since they may touch something.
+        Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
+        robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones,
+        because the hardest moves that the effort limits allow for the model are too hard for them. Given moves are used
+        in the search and in the final round, both with the physics of the final round, since they may touch something.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     workers, cluster
@@ -130,8 +130,8 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``. The search has collisions, too, and
-        this physics, with ``build``, on a floating base, and where the solver has the drives or SAPIEN's friction.
+        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``. The search, too, uses this physics and
+        collisions if there is a ``build`` or a floating base, or if the solver computes drives or SAPIEN's friction.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def tune(
         moves = search_moves(robot, seed) if sample is None else sample
     count = len(moves.start)
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
-    # One iteration is enough where the loop computes friction, and not the solver.
+    # One iteration is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
     settings: dict[str, Any] = {
         **robot.about(),

@@ -1,7 +1,7 @@
 """Controls of the page, and the requests that they make.
 
-viser calls back from its own thread, with whatever a page sent. A control keeps the last value that was in its range;
-requests are queued and carried out between two frames.
+viser calls back from a separate thread, with unchecked data of a page. A control keeps its last valid value; requests
+are queued and carried out between two frames.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Gate of the page: the address it listens on, the requests it answers, the messages it takes.
 
-viser starts its server with ``websockets.asyncio.server.serve`` and passes no options on. :meth:`Gate.start` puts a
-function that adds documented options of websockets in the place of ``serve`` while that happens. A server that starts
-without them is an error.
+viser starts its server with ``websockets.asyncio.server.serve`` and passes no options on. :meth:`Gate.start`
+temporarily replaces ``serve`` by a function that adds documented options of websockets. A server that starts without
+them is an error.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from batchpid.sim.view.address import listen
 from batchpid.sim.view.messages import MAX_BYTES, check_message
 
 Refuse = Callable[[str], object]
-"""Function that is told why something was refused."""
+"""Function that is called with the reason for a refusal."""
 _STARTING = threading.Lock()
 _LOG = logging.getLogger("batchpid.view")
-_LOG.addHandler(logging.NullHandler())  # what strangers send is no matter for the terminal
+_LOG.addHandler(logging.NullHandler())  # messages of strangers do not belong on the terminal
 
 
 class Gate:
@@ -158,7 +158,7 @@ class Gate:
         return response
 
     def _report(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Tell of a value that viser cannot convert; it raises in a task that nobody waits for."""
+        """Report a value that viser cannot convert; viser raises in a task that nobody awaits."""
         error = context.get("exception")
         _LOG.error(context["message"], exc_info=error)
         if isinstance(error, ValueError | TypeError):

@@ -1,4 +1,4 @@
-"""Messages that the page may send, as schemas: what else arrives is not passed on to viser."""
+"""Messages that the page may send, as schemas; all others are not passed on to viser."""
 
 from __future__ import annotations
 

@@ -25,13 +25,13 @@ CHARTS_EVERY = 5
 STATUS_EVERY = 15
 """Frames between two updates of the status."""
 NOTICE_SECONDS = 1.0
-"""Shortest time between two notices of what was refused [s]."""
+"""Shortest time between two notices of refused messages [s]."""
 
 
 class View(SingleOwner, AbstractContextManager["View"]):
     """Page that shows ``data``, served at ``host`` and ``port``, or at the next free port, until :meth:`close`.
 
-    Only who knows :attr:`url` can open it. What a page sends is checked; what is refused is shown on the pages.
+    Only somebody who knows :attr:`url` can open it. Messages of a page are checked; refusals are shown on the pages.
 
     Raises
     ------
@@ -103,7 +103,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
                     self.rate = (len(laps) - 1) / (last - first)
                     self.factor = max(0.0, end - start) / (last - first)
                 count += 1
-                # A late frame is not made up for, which would only hurry the next ones.
+                # A late frame is not caught up, which would only hurry the next ones.
                 deadline = max(deadline + data.period / panel.speed, now)
                 time.sleep(deadline - now)
 
@@ -134,7 +134,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
                     client.add_notification("Not accepted", problem, auto_close_seconds=8.0, color="red")
 
     def _show(self, frame: Rollout, count: int) -> None:
-        """Send what has changed: charts and status at intervals, and once more when the robots come to rest."""
+        """Send changes: charts and status at intervals, and once more when the robots come to rest."""
         panel = self.panel
         watched = (panel.env, panel.joint, panel.show_setpoint)
         shown = (frame.qpos.tobytes(), frame.setpoint.tobytes(), frame.time[0], *watched)

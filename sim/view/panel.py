@@ -64,7 +64,7 @@ class Panel:
             checkbox = gui.add_checkbox("Show its setpoint", True)
             self._show_setpoint = self._control(checkbox)
             checkbox.visible = data.frame().info.sets_positions
-            self._entries = None if checkbox.visible else gui.add_html("")  # numbers of a setpoint that is no pose
+            self._entries = None if checkbox.visible else gui.add_html("")  # numbers of a setpoint that is not a pose
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
             adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
@@ -221,7 +221,7 @@ class Panel:
 def short_names(robot: Robot) -> tuple[str, ...]:
     """Return the joint names without the words that all of them begin with; a bare number keeps the word before."""
     words = [name.split("_") for name in robot.joint_names]
-    first, last = min(words), max(words)  # their common start is that of all names
+    first, last = min(words), max(words)  # their common start is the common start of all names
     shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
     return tuple("_".join(each[shared - (shared > 0 and each[shared].isdigit()) :]) for each in words)
 

@@ -23,7 +23,7 @@ Float64 = NDArray[np.float64]
 _SETPOINT_COLOUR = (70, 130, 255)
 _DIVERGED_COLOUR = np.array([200, 40, 40], np.uint8)
 _TINT, _TINT_SHARE = np.array([255, 150, 40]), 0.5
-"""Colour mixed into that of the second group's robots, and its share."""
+"""Colour mixed into the colours of the second group's robots, and its share."""
 _FLOOR_COLOURS = np.array([[189, 198, 211], [203, 211, 222]], np.uint8)
 _TILE_PIXELS = 16
 """Edge of a tile in the floor's picture, in which tiles blend over one pixel."""

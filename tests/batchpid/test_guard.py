@@ -1,4 +1,5 @@
-"""The guard of setpoints: within its limits, without overshoot, in the shortest time; and through what is allowed."""
+"""The guard of setpoints: within its limits, without overshoot, in the shortest time; allowed setpoints pass
+unchanged."""
 
 import jax
 import jax.numpy as jnp

@@ -123,7 +123,7 @@ def test_every_setting_that_is_needed_has_a_context():
 
 @pytest.mark.parametrize("wide", [False, True])
 def test_pure_functions_obey_the_strict_modes(wide):
-    """All functions that programs of the caller may trace; those of float32 stay so under 64-bit types."""
+    """All functions that programs of the caller may trace; functions of float32 stay in float32 under 64-bit types."""
 
     def run(rows, mask, mass):
         dtype = rows.dtype

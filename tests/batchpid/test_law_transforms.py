@@ -85,7 +85,8 @@ def test_scan_vmap_and_grad_in_float32(inputs):
 
 
 def check_scan_vmap_and_grad(options, inputs, dtype, tolerance):
-    """Scan over time, vmap over the gains, and grad with respect to every leaf; that of the gains is compared below."""
+    """Scan over time, vmap over the gains, and grad with respect to every leaf; the gradient of the gains is compared
+    below."""
     numpy_params = bp.make_params(JOINTS, **options, dtype=dtype)
     params, inputs = on_jax(numpy_params, dtype), [x.astype(dtype) for x in (inputs.setpoint, inputs.measurement)]
     r, y = map(jnp.asarray, inputs)
@@ -189,7 +190,7 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, in
 
 
 def test_params_whose_leaves_are_all_traced_can_be_changed(options, dtype):
-    """The arguments of a compiled function: replace gives what it gives outside."""
+    """The arguments of a compiled function: replace gives the same result as outside."""
     params = bp.make_params(JOINTS, **options, dtype=dtype)
     expected = params.replace(kp=2.0, effort_limit=3.0)
     changed = quick_jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(params, jnp.asarray(2.0, dtype))

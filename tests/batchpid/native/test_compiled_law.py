@@ -1,4 +1,4 @@
-"""BatchPID by the native extension: the bytes of NumPy, whatever the options, inputs, shapes and threads."""
+"""BatchPID by the native extension: the bytes of NumPy for all options, inputs, shapes and numbers of threads."""
 
 from __future__ import annotations
 

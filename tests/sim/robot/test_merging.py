@@ -137,7 +137,7 @@ def test_a_fixed_joint_is_kept_where_its_merge_would_change_the_order_of_the_joi
 
 
 def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
-    """Joints below a fixed one come after those of their new siblings, in any order of the file."""
+    """Joints below a fixed one come after the joints of their new siblings, in any order of the file."""
     parts = (
         joint("late", "mount", "c"),
         joint("early", "base", "a"),

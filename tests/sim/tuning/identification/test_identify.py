@@ -81,7 +81,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
 
 
 def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
-    """The change of a strength for finite differences moves a joint only by what couples it to others."""
+    """The change of a strength for finite differences moves a joint only by its coupling to others."""
     inertia = Plant(arm, (1,), Drive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
         np.zeros((1, 1)), np.zeros((1, 1))
     )
