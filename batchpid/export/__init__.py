@@ -2,5 +2,7 @@
 
 from batchpid.export.c_header import to_c
 from batchpid.export.exported import Exported
+from batchpid.export.ros2_control import to_ros2_control
+from batchpid.export.ros2_control_reader import Imported, from_ros2_control
 
-__all__ = ["Exported", "to_c"]
+__all__ = ["Exported", "Imported", "from_ros2_control", "to_c", "to_ros2_control"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 from batchpid.export import to_c
 from batchpid.sim import Robot
+from batchpid.sim.tuning.gain_sets import gain_set
 
 MIMIC = joint("b", "y", "z", "revolute", LIMIT + '<mimic joint="a" multiplier="0.5"/>')
 
@@ -39,3 +41,35 @@ def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
 def test_gains_without_a_law_are_refused(gains, batchpid, tmp_path):
     status, _, complaint = batchpid("export", "panda", "--gains", gains, "--out", tmp_path / "a.h")
     assert (status, complaint.count("\n")) == (2, 1)
+
+
+@pytest.mark.filterwarnings("default:.*effort_limit")
+def test_controllers_of_ros2_control_are_written_and_read(batchpid, tmp_path):
+    out = tmp_path / "controllers.yaml"
+    status, said, _ = batchpid("export", "panda", "--to", "ros2_control", "--prefix", "arm", "--limits", "--out", out)
+    assert (status, said.splitlines()[-1]) == (0, f"written: {out}: tuned gains of 9 joints at 1000 Hz")
+    listed = {line.split(":")[1].strip() for line in said.splitlines()[:-1]}
+    assert {"gain_units", "guard", "effort_limit"} <= listed
+    panda = Robot.load("panda")
+    with pytest.warns(UserWarning, match="effort_limit"):
+        params = gain_set(panda, str(out)).params
+    inertia = np.diagonal(panda.mass_matrix(panda.start)[0])
+    np.testing.assert_allclose(params.kp[0], panda.tuned().kp[0] * inertia, rtol=1e-12)
+    status, said, _ = batchpid("rollout", "panda", "--gains", out, "--seconds", 0.01, "--workers", 0, "--num-envs", 1)
+    assert status == 0
+
+
+def test_followers_are_left_out_of_controllers_and_read_from_their_leaders(batchpid, tmp_path):
+    names = ("x", "y", "z")
+    path = write(
+        tmp_path, robot(*(link(name, INERTIAL) for name in names), joint("a", "x", "y", "revolute", LIMIT), MIMIC)
+    )
+    out = tmp_path / "controllers.yaml"
+    status, said, _ = batchpid("export", path, "--to", "ros2_control", "--out", out)
+    assert status == 0
+    assert "differs: b: followers are not in the file" in said
+    pair = Robot.load(path)
+    with pytest.warns(UserWarning, match="effort_limit"):
+        params = gain_set(pair, str(out)).params
+    assert params.num_joints == 2
+    assert params.kp[0, 0] == params.kp[0, 1] > 0
