@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,24 +16,31 @@ if TYPE_CHECKING:
     import batchpid as bp
     from batchpid.export import Exported
 
-FILES = {"c": "-pid.h", "ros2_control": "-controllers.yaml"}
+FILES = {"c": "-pid.h", "ros2_control": "-controllers.yaml", "urdf": "-repaired.urdf"}
 """End of the default file name of each target."""
+USED = {
+    "c": ("gains", "timestep", "limits", "prefix"),
+    "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
+    "urdf": (),
+}
+"""Flags that have an effect for each target, of those that some have."""
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a robot's gains as a file for another program.
+    """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller. Differences between the target's law and batchpid's are printed, one line each.
+    is the YAML of a controller. "urdf" is the robot with its repairs. Differences between the file and batchpid's law
+    or the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control"] = "c"
-    """Target: "c", a header; "ros2_control", parameters of a controller."""
+    to: Literal["c", "ros2_control", "urdf"] = "c"
+    """Target: "c", a header; "ros2_control", parameters of a controller; "urdf", the repaired robot."""
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
     """Controller of ros2_control."""
     timestep: float = 1 / 1000
@@ -55,43 +62,55 @@ class ExportCommand:
         """Run the command."""
         from batchpid.errors import InvalidArgumentError
         from batchpid.io.files import write_atomically
+        from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
+        for field in fields(self):
+            unused = field.name in USED["ros2_control"] and field.name not in USED[self.to]
+            if unused and (value := getattr(self, field.name)) != field.default:
+                problem = f"has no effect with --to {self.to}"
+                raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
-        chosen = gain_set(robot, self.gains)
-        if chosen.control != "pid":
-            remedy = "choose gains of the law: tuned, designed, tutorial, or a file"
-            raise InvalidArgumentError("gains", "are a drive's, which has no file", value=chosen.name, remedy=remedy)
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         out = Outputs(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
-        exported = self._exported(robot, chosen.params)
-        differences = list(exported.differences)
-        if robot.coupling is not None:
-            followers = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
-            place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
-            differences.append(f"{', '.join(followers)}: followers are {place}")
+        if self.to == "urdf":
+            exported = to_urdf(robot, out.absolute().parent)
+            content = f"{robot.name}, {robot.dof} joints, without need of repair"
+        else:
+            chosen = gain_set(robot, self.gains)
+            if chosen.control != "pid":
+                remedy = "choose gains of the law: tuned, designed, tutorial, or a file"
+                problem = "are a drive's, which has no file"
+                raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
+            exported = self._exported(robot, chosen.params)
+            content = f"{chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz"
+        differences = exported.differences
         if self.strict and differences:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, exported.text)
         for each in differences:
             print(f"differs: {each}")
-        print(f"written: {out}: {chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz")
+        print(f"written: {out}: {content}")
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
-        """Return the file of the target."""
+        """Return the file of a target for gains."""
         from batchpid.export import to_c, to_ros2_control
 
+        followers = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
+        place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
+        notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
         if self.to == "c":
             guard = robot.guard() if self.limits else None
-            return to_c(params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
-        joints = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if own]
-        params = params.for_joints(robot.independent)
-        exported = to_ros2_control(
-            params, joints, self.timestep, controller=self.controller, name=self.prefix, inertia=_inertia(robot)
-        )
-        unlimited = ("guard: setpoints are not limited in the controller",) if self.limits else ()
-        return exported._replace(differences=(*exported.differences, *unlimited))
+            exported = to_c(params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+        else:
+            if self.limits:
+                notes.append("guard: setpoints are not limited in the controller")
+            joints = [name for name in robot.joint_names if name not in followers]
+            params = params.for_joints(robot.independent)
+            options = {"controller": self.controller, "name": self.prefix}
+            exported = to_ros2_control(params, joints, self.timestep, inertia=_inertia(robot), **options)
+        return exported._replace(differences=(*exported.differences, *notes))
 
 
 def _inertia(robot: Robot) -> np.ndarray:

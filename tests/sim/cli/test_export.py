@@ -73,3 +73,15 @@ def test_followers_are_left_out_of_controllers_and_read_from_their_leaders(batch
         params = gain_set(pair, str(out)).params
     assert params.num_joints == 2
     assert params.kp[0, 0] == params.kp[0, 1] > 0
+
+
+def test_a_repaired_urdf_is_written_with_its_changes(batchpid, tmp_path):
+    path = write(tmp_path, robot(link("x"), link("y"), joint("a", "x", "y", "revolute", LIMIT.replace("-1", "3"))))
+    status, said, _ = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "again.urdf")
+    assert status == 0
+    assert said.startswith("differs: joint 'a' (3, 1): limits are swapped; swap them\nwritten: ")
+    assert Robot.load(tmp_path / "again.urdf", strict=True).joints == Robot.load(path).joints
+    status, _, complaint = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "b.urdf", "--strict")
+    assert (status, "swapped" in complaint) == (2, True)
+    status, _, complaint = batchpid("export", path, "--to", "urdf", "--gains", "designed")
+    assert (status, "gains: has no effect with --to urdf" in complaint) == (2, True)
