@@ -43,6 +43,7 @@ from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 
 if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.solver import MujocoSolver
     from batchpid.sim.engine.sapien.physics import Physics
     from batchpid.sim.runner import Runner
     from batchpid.sim.workers.pool import RecoveryWarning
@@ -58,6 +59,7 @@ __all__ = [
     "LogUniform",
     "MissedContact",
     "MissedContactWarning",
+    "MujocoSolver",
     "Normal",
     "Observation",
     "Physics",
@@ -79,7 +81,8 @@ __all__ = [
     "write_recording",
 ]
 
-_LOADS_SAPIEN = {
+_LOADED_LATE = {
+    "MujocoSolver": "batchpid.sim.engine.mujoco.solver",
     "Physics": "batchpid.sim.engine.sapien.physics",
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
@@ -87,9 +90,9 @@ _LOADS_SAPIEN = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LOADS_SAPIEN:
+    if name not in _LOADED_LATE:
         raise AttributeError(f"module 'batchpid.sim' has no attribute {name!r}")
-    return getattr(importlib.import_module(_LOADS_SAPIEN[name]), name)
+    return getattr(importlib.import_module(_LOADED_LATE[name]), name)
 
 
 def _engine() -> RobotFunctions:

@@ -30,6 +30,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 
 if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.solver import MujocoSolver
     from batchpid.sim.engine.sapien.physics import Physics
 
 ControlMode = Literal["pid", "drive", "effort"]
@@ -71,6 +72,7 @@ class Controller(Protocol):
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
 Backend = Literal["numpy", "jax"]
 Precision = Literal["float64", "float32"]
+EngineName = Literal["sapien", "mujoco"]
 PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
@@ -112,9 +114,12 @@ class RunnerOptions:
     compensate: Compensation = "gravity+coriolis+friction"
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
     "effort" friction is not compensated."""
-    physics: PhysicsPreset | Physics = "accurate"
-    """``"accurate"`` (SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
-    :class:`batchpid.sim.Physics`."""
+    engine: EngineName = "sapien"
+    """Physics engine: ``"sapien"``, the reference, or ``"mujoco"``, which is several times as fast (extra ``mujoco``;
+    docs/two-engines.md)."""
+    physics: PhysicsPreset | Physics | MujocoSolver = "accurate"
+    """Solver: ``"accurate"`` (SAPIEN's own settings), ``"fast"``, ``"free"`` (for motion without contact), or a
+    :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""
     ground: bool | None = None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose."""
@@ -201,6 +206,9 @@ class RunnerOptions:
         engine = self.load_engine()
         if not engine.is_physics(self.physics):
             choice("physics", self.physics, engine.physics)
+        if self.pack_size is not None and not engine.shares_systems:
+            problem = f"has no meaning for the engine {engine.name!r}, whose robots share nothing"
+            raise InvalidArgumentError("pack_size", problem, value=self.pack_size, remedy="leave it out")
         needed: dict[Capability, tuple[str, bool]] = {
             "drive": ("control", checked["control"] == "drive"),
             "build": ("build", self.build is not None),
@@ -242,13 +250,13 @@ class RunnerOptions:
             raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
 
     @property
-    def solver(self) -> Physics:
+    def solver(self) -> Physics | MujocoSolver:
         """Solver settings that ``physics`` stands for."""
         return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
 
     def load_engine(self) -> Engine:
         """Return the physics engine of the robots, with its packages imported."""
-        return load_engine()
+        return load_engine(self.engine)
 
     @property
     def control_name(self) -> str:
@@ -279,6 +287,8 @@ class RunnerOptions:
         miss: any number of workers get equal shares, and pack these.
         """
         assert self.pack_size is not None
+        if not self.load_engine().shares_systems:
+            return 1
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
 
     @property

@@ -35,6 +35,7 @@ from batchpid.sim.options import (
     Compensation,
     Controller,
     ControlMode,
+    EngineName,
     FaultAction,
     InvalidInputAction,
     PhysicsPreset,
@@ -64,6 +65,7 @@ from batchpid.sim.workers.requests import (
 )
 
 if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.solver import MujocoSolver
     from batchpid.sim.engine.sapien.physics import Physics
 
 
@@ -136,7 +138,8 @@ class Runner(SingleOwner):
         backend: Backend = "numpy",
         dtype: Precision = "float64",
         compensate: Compensation = "gravity+coriolis+friction",
-        physics: PhysicsPreset | Physics = "accurate",
+        engine: EngineName = "sapien",
+        physics: PhysicsPreset | Physics | MujocoSolver = "accurate",
         ground: bool | None = None,
         collisions: bool = True,
         build: Callable[[Any, int], Any] | None = None,
@@ -163,6 +166,7 @@ class Runner(SingleOwner):
             backend=backend,
             dtype=dtype,
             compensate=compensate,
+            engine=engine,
             physics=physics,
             ground=ground,
             collisions=collisions,
@@ -200,9 +204,9 @@ class Runner(SingleOwner):
         faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault, entry_names)
         contacts = None
         if not options.collisions:
-            engine = options.load_engine()
+            loaded = options.load_engine()
             contacts = MissedContactLog(
-                self.num_envs, self.timestep, lambda qpos: engine.robot_dynamics(robot).nearest_links(qpos)
+                self.num_envs, self.timestep, lambda qpos: loaded.robot_dynamics(robot).nearest_links(qpos)
             )
         self._pool = WorkerPool(options, params)
         randomization = options.randomization

@@ -26,6 +26,7 @@ class CompareCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
+    engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None
@@ -59,6 +60,7 @@ class CompareCommand:
             randomization=randomization,
             seconds=self.seconds,
             workers=self.workers,
+            engine=self.engine,
             physics=self.physics,
             collisions=self.collisions,
         )

@@ -29,6 +29,7 @@ class DemoCommand:
     seed: int = 0
     """Seed of the start poses."""
     workers: flags.Workers = None
+    engine: flags.Engine = "sapien"
     backend: flags.Backend = "numpy"
     missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
@@ -64,6 +65,7 @@ class DemoCommand:
             "params": gains.params,
             "control": gains.control,
             "workers": self.workers,
+            "engine": self.engine,
             "backend": self.backend,
         }
         with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:

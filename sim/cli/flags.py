@@ -61,6 +61,10 @@ GainSets = Annotated[
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
+Engine = Annotated[
+    Literal["sapien", "mujoco"],
+    _flag("Physics engine; mujoco is several times as fast, and its contacts differ (extra mujoco)."),
+]
 Physics = Annotated[
     Literal["accurate", "fast", "free"],
     _flag("Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact."),

@@ -38,6 +38,7 @@ class RolloutCommand:
     spread: float = 0.3
     """Largest distance of a start pose from the robot's own [rad or m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
+    engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
     backend: flags.Backend = "numpy"
     collisions: flags.Collisions = True
@@ -84,6 +85,7 @@ class RolloutCommand:
             timestep=self.timestep,
             substeps=self.substeps,
             compensate=self.compensate,
+            engine=self.engine,
             physics=self.physics,
             backend=self.backend,
             collisions=self.collisions,

@@ -40,6 +40,7 @@ class SurveyCommand:
     seconds: flags.Seconds = 2.0
     bandwidth: float = 2.0
     """Bandwidth of the designed gains [Hz]."""
+    engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
     time_limit: float = 300.0
     """Wall-clock time for each robot [s]."""
@@ -68,6 +69,7 @@ class SurveyCommand:
             seed=self.seed,
             seconds=self.seconds,
             bandwidth_hz=self.bandwidth,
+            engine=self.engine,
             physics=self.physics,
             time_limit=self.time_limit,
             processes=max(1, cores if self.workers is None else self.workers),

@@ -43,6 +43,7 @@ class TuneCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
+    engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None
@@ -93,6 +94,7 @@ class TuneCommand:
             time_limit=self.time_limit,
             history=history,
             progress=bar("tuning", unit="generation"),
+            engine=self.engine,
             physics=self.physics,
             collisions=self.collisions,
         )
@@ -106,6 +108,7 @@ class TuneCommand:
             randomization=randomization,
             workers=self.workers,
             cluster=self.cluster,
+            engine=self.engine,
             physics=self.physics,
             collisions=self.collisions,
         )
@@ -142,7 +145,7 @@ class TuneCommand:
         """Return the command that runs the robot under the gains in the file ``params``, with the same options."""
         words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
         defaults = {each.name: each.default for each in fields(self)}
-        for name in ("randomize", "physics", "collisions", "cluster", "actuators", "missing_meshes"):
+        for name in ("randomize", "engine", "physics", "collisions", "cluster", "actuators", "missing_meshes"):
             value, flag = getattr(self, name), name.replace("_", "-")
             if value != defaults[name]:
                 words += [f"--no-{flag}"] if value is False else [f"--{flag}", str(value)]

@@ -36,6 +36,7 @@ class ViewCommand:
     """Batch PID, PhysX's internal drive, or both side by side."""
     gains: flags.Gains = None
     compensate: flags.Compensate = "gravity+coriolis+friction"
+    engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     actuators: flags.Actuators = None
@@ -87,6 +88,7 @@ class ViewCommand:
             controls=self.control,
             period=1 / self.fps,
             compensate=self.compensate,
+            engine=self.engine,
             physics=self.physics,
             workers=self.workers,
             params=gains and gains.params,

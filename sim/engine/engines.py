@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from importlib import import_module
+from sys import modules
 
 from batchpid.checks.validate import choice
+from batchpid.errors import MissingDependencyError
 from batchpid.sim.engine.protocol import Engine, RobotModel
 from batchpid.sim.engine.scene_spec import SceneSpec
 
-MODULES = {"sapien": "batchpid.sim.engine.sapien.sapien_engine"}
+MODULES = {
+    "sapien": "batchpid.sim.engine.sapien.sapien_engine",
+    "mujoco": "batchpid.sim.engine.mujoco.mujoco_engine",
+}
 """Module of each engine; its constant ENGINE is the engine."""
 
 
@@ -19,9 +24,21 @@ def load_engine(name: str = "sapien") -> Engine:
     ------
     InvalidArgumentError
         No engine has this name.
+    MissingDependencyError
+        The engine's package is not installed, or is too old.
     """
-    engine: Engine = import_module(MODULES[choice("engine", name, MODULES)]).ENGINE
+    module = MODULES[choice("engine", name, MODULES)]
+    if name == "mujoco" and module not in modules:
+        _require_mujoco()
+    engine: Engine = import_module(module).ENGINE
     return engine
+
+
+def _require_mujoco() -> None:
+    try:
+        import_module("mujoco.batch")
+    except ImportError as error:
+        raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'", "mujoco") from error
 
 
 def scene_dynamics(spec: SceneSpec) -> RobotModel:

@@ -239,11 +239,18 @@ class Engine(description.RobotFunctions, Protocol):
         Its optional features.
     physics
         Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
+    group_size
+        Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough for the working set
+        to stay in the cache. It changes no result.
+    shares_systems
+        Whether robots of a pack share worlds of the engine, so that ``system_size`` matters.
     """
 
     name: str
     capabilities: frozenset[Capability]
     physics: Mapping[str, Any]
+    group_size: int
+    shares_systems: bool
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are settings of its solver."""

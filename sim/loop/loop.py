@@ -24,9 +24,6 @@ from batchpid.sim.loop.snapshot import EnvStates, Snapshot
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING, Draws
 
-GROUP_SIZE = 16
-"""Envs of a group: enough to share the overhead of NumPy calls, few enough for the working set to stay in the cache."""
-
 
 class Loop:
     """Closed loop of some envs of a runner, with their scenes.
@@ -62,10 +59,11 @@ class Loop:
             merge_fixed=robot.merge_fixed,
             collisions=options.collisions,
             build=options.build,
+            engine=options.engine,
         )
         self._steps = 0
         count, pack_size = envs.stop - envs.start, options.scenes_per_system
-        size = max(GROUP_SIZE // pack_size, 1) * pack_size
+        size = max(options.load_engine().group_size // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         controller = None if isinstance(options.control, str) else OwnController(options)
         self.groups = [

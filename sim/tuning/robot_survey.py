@@ -108,6 +108,7 @@ def survey(
     seed: int = 0,
     seconds: float = 2.0,
     bandwidth_hz: float = 2.0,
+    engine: str = "sapien",
     physics: str = "accurate",
     dissipation: str = "urdf",
     time_limit: float = 300.0,
@@ -123,7 +124,7 @@ def survey(
         Simulated time of a move [s].
     bandwidth_hz
         Of the designed gains [Hz].
-    physics, dissipation
+    engine, physics, dissipation
         Options of :class:`batchpid.sim.Runner` and :meth:`batchpid.sim.Robot.load`.
     time_limit
         Seconds after which the process of a robot is ended [s].
@@ -139,6 +140,7 @@ def survey(
         "seed": integer("seed", seed, 0, 2**31 - 1),
         "seconds": number("seconds", seconds, 0.05, 600.0, "s"),
         "bandwidth_hz": number("bandwidth_hz", bandwidth_hz, 1e-3, 100.0, "Hz"),
+        "engine": engine,
         "physics": physics,
         "dissipation": dissipation,
     }
@@ -224,7 +226,14 @@ def main() -> None:
 
 
 def _stages(
-    urdf: Path, moves: int, seed: int, seconds: float, bandwidth_hz: float, physics: str, dissipation: str
+    urdf: Path,
+    moves: int,
+    seed: int,
+    seconds: float,
+    bandwidth_hz: float,
+    engine: str,
+    physics: str,
+    dissipation: str,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield each stage of the survey as it begins, with the fields of the report that the one before found."""
     import batchpid as bp
@@ -242,7 +251,8 @@ def _stages(
     drawn = random_moves(robot, moves, seed)
     yield STAGES[4], {"moves": len(drawn.start)}
     params = bp.design_gains(robot, bandwidth_hz, gain_units="mass_matrix")
-    metrics = evaluate_gains(robot, params, drawn, seconds=seconds, physics=physics, workers=0).metrics
+    options: dict[str, Any] = {"engine": engine, "physics": physics, "workers": 0}
+    metrics = evaluate_gains(robot, params, drawn, seconds=seconds, **options).metrics
     error = np.nan_to_num(metrics.steady_state_error, nan=0.0, posinf=np.inf)
     done = ((error <= MAX_ERROR) & ~np.isinf(metrics.settling_time)).all(1)
     finite = np.isfinite(error).all()

@@ -173,7 +173,7 @@ def tune(
         "randomization": None if randomization is None else randomization.to_dict(),
         **{name: _plain(name, value, history is not None) for name, value in runner_options.items()},
         "search_physics": SEARCH_PHYSICS if is_free else None,
-        "versions": package_versions(("batchpid", "sapien", "numpy", "cmaes")),
+        "versions": package_versions(("batchpid", runner_options.get("engine", "sapien"), "numpy", "cmaes")),
     }
     record = HistoryFile(history, "search", settings)
     known = _known_costs(record, population)

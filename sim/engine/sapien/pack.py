@@ -22,6 +22,7 @@ from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.sapien.building import (
     build_scene,
     engine_settings,
@@ -37,7 +38,6 @@ from batchpid.sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_ro
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import SceneContent, refuse_shapes
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.mimics import coupling_of
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
@@ -118,10 +118,7 @@ class Pack(SingleOwner):
 
     def _friction(self) -> Friction:
         """Return the friction and damping of the joints that the engine does not simulate."""
-        if not DISSIPATION[self.spec.dissipation].modelled:
-            return Friction()
-        rows = (np.array([[getattr(joint, name) for joint in self.spec.joints]]) for name in ("friction", "damping"))
-        return Friction(*(row if row.any() else None for row in rows))
+        return own_friction(self.spec)
 
     def _bind(self) -> None:
         """Prepare the calls of every sim step, for the present robots and systems."""
@@ -307,15 +304,9 @@ class Pack(SingleOwner):
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
-        added = Actuators() if actuators is None else actuators
-        own, static = self._friction(), added.static
-        both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
-        coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
-        if static is not None:
-            static = static if own.coulomb is None else static + own.coulomb
-            coulomb = np.zeros_like(static) if coulomb is None else coulomb
-        self.friction = Friction(coulomb, viscous, static)
-        self.armature = self._motors + (0.0 if added.armature is None else added.armature)
+        self.friction = added_friction(self._friction(), actuators)
+        armature, viscous = None if actuators is None else actuators.armature, self.friction.viscous
+        self.armature = self._motors + (0.0 if armature is None else armature)
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
         values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
         for row in range(self.size) if rows is None else rows:

@@ -25,6 +25,8 @@ class SapienEngine:
     name = "sapien"
     capabilities: frozenset[Capability] = frozenset(get_args(Capability))
     physics: Mapping[str, Any] = PHYSICS
+    group_size = 16
+    shares_systems = True
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are :class:`batchpid.sim.Physics`."""

@@ -8,26 +8,23 @@ with one exception: a new center of mass moves the frames of the joints by round
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sapien import Pose
 
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine.sapien.building import center_of_mass, merged, set_inertia
+from batchpid.sim.engine.joint_friction import own_friction
+from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
+from batchpid.sim.engine.sapien.building import set_inertia
 from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, spatial_matrix, total
+from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
 
 Float64 = NDArray[np.float64]
-_NO_MASS = 1e-6
-"""Mass [kg] that SAPIEN gives a link without mass."""
 
 
 class VariedPack(Pack):
@@ -49,7 +46,7 @@ class VariedPack(Pack):
         self._variation = variation
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         varies_mass = varies_links or variation.payload is not None
-        self._bodies = _bodies(spec, carrier, links if varies_links else []) if varies_mass else {}
+        self._bodies = varied_bodies(spec, carrier, links if varies_links else []) if varies_mass else {}
         self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
         self._frames: list[tuple[Pose, Pose] | None] = []
@@ -84,7 +81,7 @@ class VariedPack(Pack):
             return
         for link in robot.links:
             if (body := self._bodies.get(name := link.name)) is not None:
-                inertia = _varied_inertia(body, self._variation, row)
+                inertia = varied_inertia(body, self._variation, row)
                 set_inertia(link, inertia)
                 self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._models[name])
         for joint, frames in zip(robot.joints, self._frames, strict=True):
@@ -94,12 +91,7 @@ class VariedPack(Pack):
 
     def _friction(self) -> Friction:
         """Return the friction and damping of the joints."""
-        model, variation = super()._friction(), self._variation
-        if variation.friction is not None:
-            coupling = coupling_of(self.spec.joints)
-            where = 1.0 if coupling is None else coupling.independent  # the coupling moves the others
-            model = model._replace(coulomb=variation.friction * where)
-        return model if variation.damping is None else model._replace(viscous=variation.damping.copy())
+        return own_friction(self.spec, self._variation)
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
@@ -116,55 +108,3 @@ class VariedPack(Pack):
             return super().passive_force(gravity, coriolis, dtype)
         force = scene_dynamics(self.spec).passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis)
         return force.astype(dtype)
-
-
-class _Part(NamedTuple):
-    """Link of the URDF in the simulated body that it is part of."""
-
-    inertia: SpatialInertia
-    """In the frame of the body."""
-    axes: Float64
-    """Axes of the link's frame in that of the body, as columns (3, 3)."""
-    column: int | None
-    """Number among the links that vary; None for a link that does not."""
-
-
-class _Body(NamedTuple):
-    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without."""
-
-    parts: list[_Part]
-    payload: Float64 | None
-
-
-def _bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, _Body]:
-    """Return the simulated bodies whose mass varies, by name: those of ``links``, and that of ``carrier``."""
-    placements, inertias = place_links(spec.urdf, spec.merge_fixed), merged(spec).inertias
-    parts: dict[str, list[_Part]] = defaultdict(list)
-    for name, at in placements.items():
-        if name in inertias and inertias[name].mass > 0:
-            inertia, axes = inertias[name].moved(at.position, at.wxyz), rotation_matrix(at.wxyz)
-            parts[at.link].append(_Part(inertia, axes, links.index(name) if name in links else None))
-    loaded, place = center_of_mass(spec, carrier)
-    if not parts[loaded]:
-        parts[loaded].append(_Part(SpatialInertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)), np.eye(3), None))
-    return {
-        body: _Body(members, place if body == loaded else None)
-        for body, members in parts.items()
-        if body == loaded or any(part.column is not None for part in members)
-    }
-
-
-def _varied_inertia(body: _Body, variation: Variation, row: int) -> SpatialInertia:
-    """Return the inertia of a body with its links scaled, and with the payload."""
-    parts = []
-    for part in body.parts:
-        (mass, center, tensor), column, share = part.inertia, part.column, 1.0
-        if variation.link_mass is not None and column is not None:
-            share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
-        if variation.center_of_mass is not None and column is not None:
-            displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
-            center = center + part.axes @ np.nan_to_num(displacement)
-        parts.append(SpatialInertia(share * mass, center, share * tensor))
-    if body.payload is not None and variation.payload is not None:
-        parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
-    return total(parts)

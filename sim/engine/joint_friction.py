@@ -1,0 +1,38 @@
+"""Friction and damping of a robot's joints: the description's, those of its variation, and those of its actuators."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from batchpid.motors import Actuators
+from batchpid.motors.friction import Friction
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.mimics import coupling_of
+
+
+def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Friction:
+    """Return the friction and damping that the loop applies to robots of ``spec``, with ``variation``."""
+    model = Friction()
+    if DISSIPATION[spec.dissipation].modelled:
+        rows = (np.array([[getattr(joint, name) for joint in spec.joints]]) for name in ("friction", "damping"))
+        model = Friction(*(row if row.any() else None for row in rows))
+    if variation is not None and variation.friction is not None:
+        coupling = coupling_of(spec.joints)
+        where = 1.0 if coupling is None else coupling.independent  # the coupling moves the others
+        model = model._replace(coulomb=variation.friction * where)
+    if variation is not None and variation.damping is not None:
+        model = model._replace(viscous=variation.damping.copy())
+    return model
+
+
+def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
+    """Return ``own`` friction and damping with those of ``actuators`` added."""
+    added = Actuators() if actuators is None else actuators
+    static = added.static
+    both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
+    coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
+    if static is not None:
+        static = static if own.coulomb is None else static + own.coulomb
+        coulomb = np.zeros_like(static) if coulomb is None else coulomb
+    return Friction(coulomb, viscous, static)

@@ -1,0 +1,94 @@
+r"""Mass matrix and bias of many robots by MuJoCo, in double precision, without contact, friction and motors.
+
+On a floating base the joints show the Schur complements by the base's six degrees of freedom (b; j are the joints)::
+
+    M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
+
+so that efforts h keep the joints from accelerating while the base falls freely.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.engine.mujoco.model_builder import RobotMj, principal_inertia
+from batchpid.sim.robot.spatial_inertia import SpatialInertia
+
+Float64 = NDArray[np.float64]
+INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+"""Fields of MuJoCo's model with the inertias of the bodies."""
+FLOATING = 6
+"""Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
+
+
+class BatchModel:
+    """Dynamics of ``size`` robots, which may differ in their masses. Arrays are (size, dof), in the joints' order."""
+
+    def __init__(self, robot: RobotMj, size: int) -> None:
+        model = copy.copy(robot.model)
+        off = mujoco.mjtDisableBit
+        model.opt.disableflags |= off.mjDSBL_CONTACT | off.mjDSBL_CONSTRAINT
+        model.dof_armature[:] = 0.0
+        self.batch = mujoco.batch.Batch(model, size, nthread=1)
+        self._robot, self._floats = robot, model.nv > len(robot.qvel)
+        self._qpos, self._qvel, self._bias = (self.batch.bind(name) for name in ("qpos", "qvel", "qfrc_bias"))
+        self._sparse = self.batch.bind("M")  # lower triangle, by rows
+        self._rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+        self._columns = np.array(model.M_colind)
+
+    def compute(self, qpos: Any, qvel: Any = 0.0, base: tuple[Float64, Float64] | None = None) -> None:
+        """Compute at positions and velocities, on a base at the origin or in the state ``base`` (M, 7), (M, 6)."""
+        self._qpos[:, self._robot.qpos], self._qvel[...] = qpos, 0.0
+        self._qvel[:, self._robot.qvel] = qvel
+        if self._floats:
+            origin = (np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(FLOATING))
+            self._qpos[:, : FLOATING + 1], self._qvel[:, :FLOATING] = origin if base is None else base
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def joint_mass_matrix(self) -> Float64:
+        """Return the mass matrices that the joints show (size, dof, dof) [kg m^2 or kg]."""
+        full, joints = self._full(), self._robot.qvel
+        own = full[:, joints[:, None], joints]
+        if not self._floats:
+            return own
+        couples = full[:, :FLOATING, joints]
+        return own - couples.transpose(0, 2, 1) @ np.linalg.solve(full[:, :FLOATING, :FLOATING], couples)
+
+    def joint_bias(self) -> Float64:
+        """Return gravity, Coriolis and centrifugal efforts that the joints show (size, dof) [N m or N]."""
+        joints = self._robot.qvel
+        if not self._floats:
+            return self._bias[:, joints]
+        full = self._full()
+        falling = np.linalg.solve(full[:, :FLOATING, :FLOATING], self._bias[:, :FLOATING, None])
+        return self._bias[:, joints] - (full[:, joints, :FLOATING] @ falling)[..., 0]
+
+    def _full(self) -> Float64:
+        full = np.zeros((len(self._sparse), self.batch.qvel.shape[1], self.batch.qvel.shape[1]))
+        full[:, self._rows, self._columns] = full[:, self._columns, self._rows] = self._sparse
+        return full
+
+
+def set_inertia(batch: Any, row: int, body: int, inertia: SpatialInertia) -> None:
+    """Give a body of simulation ``row`` of ``mujoco.batch.Batch`` this inertia, in the frame of the body.
+
+    The fields were expanded by :func:`expand_inertias`.
+    """
+    moments, wxyz = principal_inertia(inertia)
+    for name, value in zip(INERTIAL, (inertia.mass, inertia.center, wxyz, moments), strict=True):
+        batch.expand(name)[row, body] = value
+
+
+def expand_inertias(batch: Any) -> None:
+    """Give each simulation of a batch masses and inertias of its own."""
+    for name in INERTIAL:
+        batch.expand(name)
+    # The compiler's shortcuts for centers of mass in the body's frame, and bodies that are moved by one joint.
+    for name in ("body_sameframe", "body_simple", "dof_simplenum"):
+        batch.expand(name)[...] = 0

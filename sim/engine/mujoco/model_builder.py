@@ -1,0 +1,227 @@
+r"""Robots as MuJoCo's models.
+
+Each simulated link of the robot (rigid bodies, with fixed joints merged) is a body in the frame of its joint. Masses
+and inertias are those of the URDF, in double precision; shapes are the convex ones that SAPIEN builds, so that both
+engines collide the same geometry. A body whose links collide with another body in part has one body without mass for
+each link with shapes, since MuJoCo excludes pairs of bodies.
+
+Damping and Coulomb friction are no forces of MuJoCo's: the loop applies them as efforts, in the same way for every
+engine, with the damping's share dt d in the armature, which makes it implicit (:mod:`batchpid.motors.friction`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+import mujoco
+import numpy as np
+from lxml import etree
+from numpy.typing import NDArray
+
+from batchpid.errors import RobotError
+from batchpid.sim.engine.mujoco.solver import MujocoSolver
+from batchpid.sim.engine.sapien.body_inertias import body_inertias
+from batchpid.sim.engine.sapien.building import merged
+from batchpid.sim.engine.sapien.link_shapes import LinkShape, link_shapes
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.parts import MOVING_TYPES
+from batchpid.sim.robot.rotations import from_rpy, multiply
+from batchpid.sim.robot.spatial_inertia import SpatialInertia
+from batchpid.sim.robot.xml import numbers
+
+ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
+"""Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""
+_FRICTION = 0.3
+"""Coefficient of sliding friction of every shape, that of SAPIEN's default material."""
+LARGEST_FORCE = 1e10
+"""Limit of a drive without a limit [N m or N]."""
+_NARROWEST = 1e-9
+"""Smallest range of a limited joint [rad or m]: MuJoCo requires a positive one."""
+_FARTHEST = 1e10
+"""Limit in place of an infinite one on one side [rad or m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMj:
+    """Compiled model of a robot, and where its joints stand in MuJoCo's arrays."""
+
+    model: Any
+    """``mujoco.MjModel``; it is shared, so copy it before a change."""
+    qpos: NDArray[np.intp]
+    """Index of each joint in MuJoCo's qpos (dof,)."""
+    qvel: NDArray[np.intp]
+    """Index of each joint in MuJoCo's qvel (dof,)."""
+    bodies: dict[str, int]
+    """Number of the body of each simulated link."""
+
+
+@lru_cache(maxsize=8)
+def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
+    """Return the model of ``spec``, with a drive of every joint if asked; the same object for equal arguments.
+
+    Raises
+    ------
+    RobotError
+        SAPIEN's loader or MuJoCo's compiler refuses the description.
+    """
+    scene = mujoco.MjSpec()
+    _set_options(scene, spec)
+    inertias = body_inertias(spec)
+    names = _add_links(scene, spec, inertias)
+    if spec.collisions:
+        _add_shapes(scene, spec, names)
+    if drives:
+        _add_drives(scene, spec)
+    try:
+        model = scene.compile()
+    except ValueError as error:
+        raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
+    bodies = {link: model.body(name).id for link, name in names.items()}
+    for link, body in bodies.items():  # the compiler refuses some inertias that both engines simulate
+        model.body_inertia[body] = np.linalg.eigh(inertias[link].tensor)[0]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    joints = [model.joint(joint.name) for joint in spec.joints]
+    qpos, qvel = (np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr"))
+    return RobotMj(model, qpos, qvel, bodies)
+
+
+def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the axes of the body."""
+    moments, axes = np.linalg.eigh(inertia.tensor)
+    wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(wxyz, (axes * np.linalg.det(axes)).ravel())  # a rotation, not a reflection
+    return moments, wxyz
+
+
+def _set_options(scene: Any, spec: SceneSpec) -> None:
+    solver: MujocoSolver = spec.physics
+    option, off = scene.option, mujoco.mjtDisableBit
+    option.timestep, option.gravity = spec.timestep, spec.gravity
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.iterations, option.tolerance = solver.iterations, solver.tolerance
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # A diverged env must stay visible: the loop suspends or resets it, and reports it.
+    option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION | off.mjDSBL_SPRING | off.mjDSBL_DAMPER
+    scene.compiler.fusestatic, scene.compiler.degree = False, False
+
+
+def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
+    """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
+    root = etree.fromstring((merged(spec).urdf if spec.merge_fixed else spec.urdf).encode())
+    above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
+    names = {link: "world_link" if link == "world" else link for link in inertias}
+    limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
+    damping = {joint.name: joint.damping for joint in spec.joints}
+    continuous = {joint.name for joint in spec.joints if joint.continuous}
+    added: dict[str, Any] = {}
+
+    def add(link: str) -> Any:
+        if link in added:
+            return added[link]
+        inertia, joint = inertias[link], above.get(link)
+        moments, wxyz = principal_inertia(inertia)
+        parent, origin = scene.worldbody if joint is None else add(joint.find("parent").get("link")), None
+        if joint is not None:
+            origin = joint.find("origin")
+        body = parent.add_body(
+            name=names[link],
+            pos=numbers(origin, "xyz", "0 0 0", link),
+            quat=from_rpy(numbers(origin, "rpy", "0 0 0", link)),
+            mass=inertia.mass,
+            ipos=inertia.center,
+            iquat=wxyz,
+            inertia=np.full(3, max(moments.max(), 1e-12)),  # replaced after compilation
+            explicitinertial=True,
+        )
+        if joint is None and not spec.fixed_base:
+            body.add_freejoint()
+        elif joint is not None and joint.get("type") in MOVING_TYPES:
+            name, slides = joint.get("name"), joint.get("type") == "prismatic"
+            axis = np.array(numbers(joint.find("axis"), "xyz", "1 0 0", name))
+            lower, upper = np.clip(limits[name], -_FARTHEST, _FARTHEST)
+            limited = name not in continuous and bool(np.isfinite(limits[name]).any())
+            body.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis / np.linalg.norm(axis),
+                limited=limited,
+                range=[lower, max(upper, lower + _NARROWEST)],
+                solref_limit=[spec.physics.limit_time, 1.0],
+                armature=spec.timestep * damping[name],
+            )
+        added[link] = body
+        return body
+
+    for link in inertias:
+        add(link)
+    return names
+
+
+def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
+    """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
+    shapes = link_shapes(spec)
+    owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
+    ignored = {frozenset(pair) for pair in spec.ignored}
+    solid = [link for link in owners if owners[link]]
+    excluded, split = [], set()
+    for number, first in enumerate(solid):
+        for second in solid[:number]:
+            pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
+            if all(pairs):
+                excluded.append((names[first], names[second]))
+            elif any(pairs):
+                split |= {first, second}
+    for link in split:
+        for owner in owners[link]:
+            scene.body(names[link]).add_body(name=_part(owner))
+    for pair in ignored:
+        holders = [next((link for link in split if owner in owners[link]), None) for owner in pair]
+        if None not in holders and len(set(holders)) == 2:
+            first, second = pair
+            excluded.append((_part(first), _part(second)))
+    for first, second in excluded:
+        scene.add_exclude(bodyname1=first, bodyname2=second)
+    meshes: dict[bytes, str] = {}
+    for link, of_link in shapes.items():
+        for shape in of_link:
+            _add_shape(scene, scene.body(_part(shape.owner) if link in split else names[link]), shape, meshes, spec)
+    if spec.ground:
+        scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
+
+
+def _add_drives(scene: Any, spec: SceneSpec) -> None:
+    """Add an actuator for each joint, in their order: effort = ctrl + bias (1, q, q'), between its limits."""
+    scene.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    scene.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for joint in spec.joints:
+        actuator = scene.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
+
+
+def _part(owner: str) -> str:
+    return f"{owner} (shapes)"
+
+
+def _add_shape(scene: Any, body: Any, shape: LinkShape, meshes: dict[bytes, str], spec: SceneSpec) -> None:
+    kinds, wxyz = mujoco.mjtGeom, shape.wxyz
+    place = {"pos": shape.position, "mass": 0.0, **_contact(spec)}
+    if shape.vertices is not None:
+        key = shape.vertices.tobytes()
+        if key not in meshes:
+            meshes[key] = f"hull{len(meshes)}"
+            shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of flat hulls as well; it is not used
+            scene.add_mesh(name=meshes[key], uservert=shape.vertices.ravel(), inertia=shell)
+        body.add_geom(type=kinds.mjGEOM_MESH, meshname=meshes[key], quat=wxyz, **place)
+        return
+    kind = getattr(kinds, f"mjGEOM_{shape.kind.upper()}")
+    if shape.kind in ("capsule", "cylinder"):
+        wxyz = multiply(wxyz, ALONG_X)
+    body.add_geom(type=kind, size=np.pad(shape.size, (0, 3 - len(shape.size))), quat=wxyz, **place)
+
+
+def _contact(spec: SceneSpec) -> dict[str, Any]:
+    return {"friction": [_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}

@@ -1,0 +1,74 @@
+"""MuJoCo as an :class:`batchpid.sim.engine.protocol.Engine`.
+
+What a robot's description says, whichever engine simulates it (masses of links, pairs of links that do not collide,
+contacts at a pose), comes from SAPIEN, which is always installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.mujoco.mujoco_dynamics import MujocoDynamics, scene_dynamics
+from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
+from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
+from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine, RobotModel
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.parts import LinkMass
+from batchpid.sim.robot.self_collision import SelfContact
+
+
+class MujocoEngine:
+    """MuJoCo on the CPU. The methods are those of the protocol."""
+
+    name = "mujoco"
+    capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts"})
+    physics: Mapping[str, Any] = SOLVERS
+    group_size = 64
+    shares_systems = False
+
+    def is_physics(self, settings: object) -> bool:
+        """Return whether these are :class:`batchpid.sim.MujocoSolver`."""
+        return isinstance(settings, MujocoSolver)
+
+    def make_pack(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int = 0,
+        system_size: int = 8,
+        variation: Variation | None = None,
+        carrier: str = "",
+        links: Sequence[str] = (),
+    ) -> MujocoPack:
+        """Return a new pack; its robots share nothing, whatever ``system_size``."""
+        return MujocoPack(spec, size, first_env, variation, carrier, links)
+
+    def scene_dynamics(self, spec: SceneSpec) -> MujocoDynamics:
+        """Return the model of the robot of ``spec``, in double precision."""
+        return scene_dynamics(spec)
+
+    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> RobotModel:
+        """Return the model of ``robot`` on a fixed base, by SAPIEN."""
+        return load_engine("sapien").robot_dynamics(robot, ground)
+
+    def loaded_dynamics(self, robot: RobotDescription, payload: float) -> RobotModel:
+        """Return the model with a payload [kg] at the tool, by SAPIEN."""
+        return load_engine("sapien").loaded_dynamics(robot, payload)
+
+    def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
+        """Return the record of contacts of robots without shapes, by SAPIEN."""
+        return load_engine("sapien").missed_contacts(spec, size, ground)
+
+    def self_contact(self, robot: RobotDescription) -> SelfContact:
+        """Return the pairs of links that do not collide, by SAPIEN."""
+        return load_engine("sapien").self_contact(robot)
+
+    def link_masses(self, robot: RobotDescription) -> Mapping[str, LinkMass]:
+        """Return the mass of every link of the URDF, by SAPIEN."""
+        return load_engine("sapien").link_masses(robot)
+
+
+ENGINE: Engine = MujocoEngine()
