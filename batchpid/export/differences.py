@@ -46,8 +46,6 @@ class Differences(list[str]):
         check_gain_units(params)
         self.inertia = None if inertia is None else _inertia(inertia, self.joints)
         self.params = self._in_efforts(params)
-        if params.dtype != np.float64:
-            self.append(f"dtype: the target computes in float64, these params are {params.dtype}")
 
     def _in_efforts(self, params: PIDParams) -> PIDParams:
         """Return the params with gains in effort units."""
@@ -106,6 +104,13 @@ class Differences(list[str]):
         worst = int(np.argmax(np.where(sampled, np.abs(more), -1.0)))
         at = f"crossover of {self.joints[worst]}, {w[worst] / (2 * math.pi):.3g} Hz"
         return f"; {more[worst]:+.2g} degrees of phase at the {at}"
+
+    def degrees(self, delay: Float64) -> str:
+        """Return the phase of a delay [s] (joints,) at the crossover, as text; empty without inertia."""
+        if self.inertia is None:
+            return ""
+        lag = np.degrees(np.nan_to_num(self._crossover()) * delay)
+        return f"; {lag.max():.2g} degrees of phase at the crossover of {self.joints[int(np.argmax(lag))]}"
 
     def _crossover(self) -> Float64:
         """Return the crossover of each joint [rad/s], NaN without gains."""

@@ -103,6 +103,8 @@ def to_ros2_control(
     """
     choice("controller", controller, TYPES)
     found = Differences(params, joint_names, dt, inertia)
+    if params.dtype != np.float64:
+        found.append(f"dtype: the target computes in float64, these params are {params.dtype}")
     given = found.params
     trajectory = controller == "joint_trajectory_controller"
     two = trajectory or isinstance(given.measurement_rate, MeasuredRate)

@@ -16,14 +16,22 @@ if TYPE_CHECKING:
     import batchpid as bp
     from batchpid.export import Exported
 
-FILES = {"c": "-pid.h", "ros2_control": "-controllers.yaml", "urdf": "-repaired.urdf"}
+FILES = {
+    "c": "-pid.h",
+    "ros2_control": "-controllers.yaml",
+    "isaac_lab": "-actuators.py",
+    "maniskill": "-controller.py",
+    "urdf": "-repaired.urdf",
+}
 """End of the default file name of each target."""
 USED = {
     "c": ("gains", "timestep", "limits", "prefix"),
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
+    "isaac_lab": ("gains", "timestep", "limits", "actuators"),
+    "maniskill": ("gains", "timestep", "limits", "actuators"),
     "urdf": (),
 }
-"""Flags that have an effect for each target, of those that some have."""
+"""Flags that have an effect for each target, of those that only some have."""
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
@@ -33,18 +41,19 @@ class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller. "urdf" is the robot with its repairs. Differences between the file and batchpid's law
-    or the robot's file are printed, one line each.
+    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "urdf" is the robot with its
+    repairs. Differences between the file and batchpid's law or the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "urdf"] = "c"
-    """Target: "c", a header; "ros2_control", parameters of a controller; "urdf", the repaired robot."""
+    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "urdf"] = "c"
+    """Target: a C header, a controller of ros2_control, actuators of Isaac Lab, a controller of ManiSkill, a URDF."""
+    actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
     """Controller of ros2_control."""
     timestep: float = 1 / 1000
-    """Time step of the control on the robot [s]."""
+    """Time step of the control on the robot, or of the physics [s]."""
     limits: flags.Switch = False
     """Limit setpoints to the robot's joint limits and speeds before they reach the law."""
     prefix: str = "batchpid"
@@ -66,11 +75,11 @@ class ExportCommand:
         from batchpid.sim.tuning.gain_sets import gain_set
 
         for field in fields(self):
-            unused = field.name in USED["ros2_control"] and field.name not in USED[self.to]
+            unused = any(field.name in names for names in USED.values()) and field.name not in USED[self.to]
             if unused and (value := getattr(self, field.name)) != field.default:
                 problem = f"has no effect with --to {self.to}"
                 raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         out = Outputs(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
         if self.to == "urdf":
@@ -95,22 +104,40 @@ class ExportCommand:
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
         """Return the file of a target for gains."""
-        from batchpid.export import to_c, to_ros2_control
+        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_ros2_control
 
-        followers = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
+        own, dt = robot.independent, self.timestep
+        joints, followers = ([robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (own, ~own))
         place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
         notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
         if self.to == "c":
             guard = robot.guard() if self.limits else None
-            exported = to_c(params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+            exported = to_c(params, dt, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+            return exported._replace(differences=(*exported.differences, *notes))
+        if self.limits:
+            notes.append("guard: setpoints are not limited in the target")
+        params, inertia = params.for_joints(own), _inertia(robot)
+        if self.to == "ros2_control":
+            names = {"controller": self.controller, "name": self.prefix}
+            exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
         else:
-            if self.limits:
-                notes.append("guard: setpoints are not limited in the controller")
-            joints = [name for name in robot.joint_names if name not in followers]
-            params = params.for_joints(robot.independent)
-            options = {"controller": self.controller, "name": self.prefix}
-            exported = to_ros2_control(params, joints, self.timestep, inertia=_inertia(robot), **options)
+            to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
+            exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
+
+
+def _motors(robot: Robot) -> bp.Actuators:
+    """Return the motors of the independent joints with the whole friction of the joints, that of the robot included."""
+    import batchpid as bp
+
+    own = np.flatnonzero(robot.independent)
+    motors = bp.make_actuators(robot.dof) if robot.actuators is None else robot.actuators
+    friction = {"coulomb": robot.friction, "static": robot.friction, "viscous": robot.damping}
+    if motors.static is None:
+        del friction["static"]
+    given = {name: getattr(motors, name) for name in friction}
+    total = {name: friction[name] + (0.0 if leaf is None else leaf) for name, leaf in given.items()}
+    return motors.replace(joints=robot.dof, **total).for_joints(own)
 
 
 def _inertia(robot: Robot) -> np.ndarray:

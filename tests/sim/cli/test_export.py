@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
+import batchpid as bp
 from batchpid.export import to_c
 from batchpid.sim import Robot
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -85,3 +86,19 @@ def test_a_repaired_urdf_is_written_with_its_changes(batchpid, tmp_path):
     assert (status, "swapped" in complaint) == (2, True)
     status, _, complaint = batchpid("export", path, "--to", "urdf", "--gains", "designed")
     assert (status, "gains: has no effect with --to urdf" in complaint) == (2, True)
+
+
+def test_pd_targets_have_the_motors_and_the_friction_of_the_robot(batchpid, tmp_path):
+    rubs = '<dynamics friction="0.25" damping="0.5"/>'
+    path = write(tmp_path, robot(link("x"), link("y"), joint("a", "x", "y", "revolute", LIMIT + rubs)))
+    bp.save_actuators(tmp_path / "motors.yaml", bp.make_actuators(1, command_delay=0.002, coulomb=0.5), ["a"])
+    out, words = tmp_path / "arm.py", ("--actuators", tmp_path / "motors.yaml", "--force")
+    status, said, _ = batchpid("export", path, "--to", "isaac_lab", "--out", out, *words)
+    assert (status, "differs: ki: no integral" in said) == (0, True)
+    text = out.read_text()
+    expected = ("DelayedPDActuatorCfg(", "dynamic_friction=0.75", "viscous_friction=0.5", "min_delay=2", "_limit=10.0")
+    assert all(each in text for each in expected)
+    status, said, _ = batchpid("export", path, "--to", "maniskill", "--out", out, *words)
+    assert (status, "differs: coulomb: friction of PhysX" in said) == (0, True)
+    assert "force_limit=[10.0]" in out.read_text()
+    assert batchpid("export", path, "--out", tmp_path / "a.h", *words)[0] == 2
