@@ -1,4 +1,4 @@
-"""Differences of targets that have a PD law alone: stiffness, damping and an effort limit."""
+"""Differences of simulators' drives: stiffness, damping and an effort limit, with or without an integral."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ LACKING = {
 
 
 class Drive(Differences):
-    """PD gains with their differences: explicit, or of a drive that the simulator integrates implicitly."""
+    """Gains of a drive with their differences.
+
+    ``implicit``: the simulator integrates the drive implicitly. ``whole``: it has an integral and two limits of the
+    total effort, which the caller compares.
+    """
 
     def __init__(
         self,
@@ -41,6 +45,7 @@ class Drive(Differences):
         inertia: ArrayLike | None,
         actuators: Actuators | None,
         implicit: bool,
+        whole: bool = False,
     ) -> None:
         super().__init__(params, joint_names, dt, inertia)
         self.actuators = (
@@ -52,7 +57,7 @@ class Drive(Differences):
             problem = f"are of {self.actuators.num_envs} envs and {self.actuators.num_joints} joints"
             remedy = f"give those of one env and {len(self.joints)} joints"
             raise InvalidArgumentError("actuators", problem, remedy=remedy)
-        self._compare(implicit)
+        self._compare(implicit, whole)
 
     def motor(self, effect: str, off: float = 0.0) -> Float64:
         """Return an effect of the actuators (joints,), ``off`` where it is off."""
@@ -71,14 +76,14 @@ class Drive(Differences):
         if (on := values != off).any():
             self.append(f"{effect}: {problem}; here {self.listed(values, on)} {unit}".rstrip())
 
-    def _compare(self, implicit: bool) -> None:
+    def _compare(self, implicit: bool, whole: bool) -> None:
         params, kp, ki = self.params, self.value("kp"), self.value("ki")
-        if ki.any():
+        if ki.any() and not whole:
             soft = np.divide(1.0, kp, out=np.full(len(kp), math.inf), where=kp > 0)
             left = self.listed(soft, ki > 0)
             self.append(f"ki: no integral: a load of 1 N m or N leaves an error of {left} rad or m")
         low, high = self.value("effort_min", -math.inf), self.value("effort_max", math.inf)
-        if (uneven := -low != high).any():
+        if not whole and (uneven := -low != high).any():
             limit = self.listed(self.effort_limit, uneven)
             self.append(f"effort_limit: one number for both directions: {limit} N m or N")
         elif implicit and np.isfinite(high).any():

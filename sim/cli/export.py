@@ -21,6 +21,7 @@ FILES = {
     "ros2_control": "-controllers.yaml",
     "isaac_lab": "-actuators.py",
     "maniskill": "-controller.py",
+    "mjcf": "-pid.xml",
     "urdf": "-repaired.urdf",
 }
 """End of the default file name of each target."""
@@ -29,9 +30,11 @@ USED = {
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
     "isaac_lab": ("gains", "timestep", "limits", "actuators"),
     "maniskill": ("gains", "timestep", "limits", "actuators"),
+    "mjcf": ("gains", "timestep", "limits", "actuators"),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
+UNLIMITED = "guard: setpoints are not limited in the target"
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
@@ -41,14 +44,15 @@ class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "urdf" is the robot with its
-    repairs. Differences between the file and batchpid's law or the robot's file are printed, one line each.
+    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "mjcf" is the robot with the
+    law in MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and batchpid's law or
+    the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "urdf"] = "c"
-    """Target: a C header, a controller of ros2_control, actuators of Isaac Lab, a controller of ManiSkill, a URDF."""
+    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "mjcf", "urdf"] = "c"
+    """Target."""
     actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
     """Controller of ros2_control."""
@@ -106,6 +110,8 @@ class ExportCommand:
         """Return the file of a target for gains."""
         from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_ros2_control
 
+        if self.to == "mjcf":
+            return _mjcf(robot, params, self.timestep, self.limits)
         own, dt = robot.independent, self.timestep
         joints, followers = ([robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (own, ~own))
         place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
@@ -114,9 +120,8 @@ class ExportCommand:
             guard = robot.guard() if self.limits else None
             exported = to_c(params, dt, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
             return exported._replace(differences=(*exported.differences, *notes))
-        if self.limits:
-            notes.append("guard: setpoints are not limited in the target")
-        params, inertia = params.for_joints(own), _inertia(robot)
+        notes += [UNLIMITED] if self.limits else []
+        params, inertia = params.for_joints(own), _inertia(robot)[:, own]
         if self.to == "ros2_control":
             names = {"controller": self.controller, "name": self.prefix}
             exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
@@ -124,6 +129,17 @@ class ExportCommand:
             to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
             exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
+
+
+def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Exported:
+    """Return the MJCF of the robot with its motors."""
+    from batchpid.sim.engine.engines import load_engine
+
+    load_engine("mujoco")  # raises without MuJoCo
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    exported = to_mjcf(robot, params, dt, actuators=robot.actuators, inertia=_inertia(robot))
+    return exported._replace(differences=(*exported.differences, *([UNLIMITED] if limits else [])))
 
 
 def _motors(robot: Robot) -> bp.Actuators:
@@ -141,8 +157,8 @@ def _motors(robot: Robot) -> bp.Actuators:
 
 
 def _inertia(robot: Robot) -> np.ndarray:
-    """Return the inertia of the independent joints (poses, joints) at the start pose, then at sampled poses."""
+    """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at sampled poses."""
     matrices = robot.mass_matrix(np.vstack([robot.start, robot.sample(POSES)]))
     if robot.coupling is not None:
         matrices = robot.coupling.mass_matrix(matrices)
-    return np.diagonal(matrices, axis1=1, axis2=2)[:, robot.independent]
+    return np.diagonal(matrices, axis1=1, axis2=2)

@@ -102,3 +102,13 @@ def test_pd_targets_have_the_motors_and_the_friction_of_the_robot(batchpid, tmp_
     assert (status, "differs: coulomb: friction of PhysX" in said) == (0, True)
     assert "force_limit=[10.0]" in out.read_text()
     assert batchpid("export", path, "--out", tmp_path / "a.h", *words)[0] == 2
+
+
+def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
+    mujoco = pytest.importorskip("mujoco", "3.17")
+    out = tmp_path / "panda.xml"
+    words = ("--gains", "designed", "--timestep", 0.0005, "--limits", "--out", out)
+    status, said, _ = batchpid("export", "panda", "--to", "mjcf", *words)
+    assert (status, "differs: guard" in said) == (0, True)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
