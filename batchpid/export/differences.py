@@ -1,6 +1,6 @@
-"""Differences between the law of this package and that of a target, each with a figure.
+"""Differences between the law and a target, each with a figure.
 
-A phase is that of the sampled controller from measurement to effort, with z = exp(j w dt)::
+Phases are taken from the sampled controller, from measurement to effort, with z = exp(j w dt)::
 
     C(z) = kp + ki dt / (z - 1) [output first], ki dt z / (z - 1) [integrate first] + kd F(z) R(z)
     F(z) = dt / (tau + dt - tau / z)        R(z) = (1 - 1/z) / dt [differences], j w [measured rate]

@@ -28,8 +28,9 @@ def to_maniskill(
 ) -> Exported:
     """Return a ``PDJointPosControllerConfig`` as Python text, and its differences from the law.
 
-    Its actions are positions [rad or m], not normalised, as setpoints are here. Its friction is that of PhysX, without
-    unit, and is 0. Parameters and errors are as in :func:`batchpid.export.to_isaac_lab`; ``dt`` is that of the law.
+    Its actions are positions [rad or m], not normalised, as setpoints are here. Its friction, a coefficient of PhysX
+    without unit, is 0. Parameters and errors are as in :func:`batchpid.export.to_isaac_lab`; ``dt`` is the law's time
+    step [s].
     """
     if not name.isidentifier():
         raise InvalidArgumentError("name", "is no name in Python", value=name, remedy="use letters, digits and _")

@@ -66,7 +66,7 @@ class Drive(Differences):
 
     @property
     def effort_limit(self) -> Float64:
-        """Symmetric effort limit (joints,) [N m or N] of law and motor; inf is none."""
+        """Symmetric effort limit (joints,) [N m or N] of law and motor; infinite without a limit."""
         low, high = self.value("effort_min", -math.inf), self.value("effort_max", math.inf)
         return np.minimum(np.maximum(np.minimum(-low, high), 0.0), self.motor("effort_limit", math.inf))
 

@@ -27,7 +27,7 @@ _ANTI_WINDUP = {theirs: ours for ours, theirs in STRATEGIES.items()}
 
 
 class Imported(NamedTuple):
-    """Params and the names of their joints, and the differences of the law from that of the file's controller."""
+    """Params, the names of their joints, and the differences of the law from the file's controller."""
 
     params: PIDParams
     joint_names: list[str]
@@ -48,7 +48,7 @@ def from_ros2_control(
     text
         YAML of controllers with ``gains``.
     joint_names
-        Order of the joints. Default: that of the file.
+        Order of the joints. Default: the file's order.
     controller
         Name of the controller to read. Default: all that have gains, of different joints.
     continuous
@@ -57,8 +57,8 @@ def from_ros2_control(
     Raises
     ------
     InvalidArgumentError
-        Text that is no such file, a key or strategy that control_toolbox 6 does not have, or gains of another
-        interface than effort.
+        Text without controllers, a key or strategy unknown to control_toolbox 6, or gains of another interface than
+        effort.
     """
     document = documents.parse("text", text, "yaml")
     found = {name: body for name, body in _controllers(document, "") if controller in (None, name)}

@@ -143,7 +143,7 @@ def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Export
 
 
 def _motors(robot: Robot) -> bp.Actuators:
-    """Return the motors of the independent joints with the whole friction of the joints, that of the robot included."""
+    """Return the motors of the independent joints, with the friction and damping of the robot's description added."""
     import batchpid as bp
 
     own = np.flatnonzero(robot.independent)

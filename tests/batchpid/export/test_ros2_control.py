@@ -141,6 +141,21 @@ def test_a_round_trip_loses_only_what_is_listed(params, controller):
         assert now == pytest.approx(was, rel=tolerance, abs=tolerance), (name, exported.differences)
 
 
+@given(random_params(), st.sampled_from(CONTROLLERS))
+@settings(max_examples=60, deadline=None)
+def test_params_without_a_listed_difference_have_the_targets_efforts(params, controller):
+    params = params.replace(gain_units="effort", dtype=np.float64)
+    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    # Without a feedforward, u_clamp is the effort limit; the motion has no error of exactly 0, and none of half a turn.
+    same = ("effort_limit", "continuous: taken", "anti_windup: back-calculation is left out")
+    if not all(each.startswith(same) for each in exported.differences):
+        return
+    two = controller == "joint_trajectory_controller" or params.measurement_rate is not None
+    ours = run(params, two)
+    atol = 1e-9 * max(1.0, np.abs(ours).max())
+    np.testing.assert_allclose(target_run(exported.text, controller, two), ours, rtol=1e-9, atol=atol)
+
+
 @pytest.mark.parametrize("case", [name for name in OPTIONS if not name.endswith("per env")])
 def test_every_case_of_the_law_is_written_and_read(case):
     params = bp.make_params(3, **OPTIONS[case])
