@@ -114,7 +114,7 @@ def test_the_file_is_that_of_a_controller_manager():
 
 
 @given(random_params(), st.sampled_from(CONTROLLERS))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(params, controller):
     exported = to_ros2_control(params, JOINTS, DT, controller=controller, inertia=[2.0, 1.0, 0.5])
     back, joints, _ = from_ros2_control(exported.text)

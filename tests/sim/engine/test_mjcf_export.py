@@ -10,7 +10,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot
+from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 mujoco = pytest.importorskip("mujoco", "3.17")
@@ -86,6 +86,24 @@ def test_the_actuators_compute_the_law_with_limits_and_feedforward():
         np.testing.assert_allclose(data.actuator_force, effort[0], rtol=0, atol=1e-9)
         saturated += np.isin(effort, (-3.0, 4.0)).sum()
     assert 100 < saturated < 2600
+
+
+def test_the_file_moves_as_the_runner_does():
+    loaded = Robot.load("panda")
+    params = plain(loaded, effort_limit=loaded.effort_limit)
+    model = model_of(to_mjcf(loaded, params, DT))
+    data, goal = mujoco.MjData(model), 0.5 * (loaded.start + loaded.settings.target)
+    data.qpos[:] = loaded.start
+    options = {"workers": 0, "timestep": DT, "substeps": 1, "engine": "mujoco", "compensate": "gravity+coriolis"}
+    with Runner(loaded, 1, params=params, **options) as runner:
+        runner.reset()
+        for _ in range(200):
+            reached = runner.step(goal).qpos[0]
+            mujoco.mj_forward(model, data)
+            data.ctrl[:] = np.stack([goal, 0 * goal, data.qfrc_bias], axis=1).ravel()
+            mujoco.mj_step(model, data)
+            np.testing.assert_allclose(data.qpos, reached, rtol=0, atol=1e-6)
+    assert np.abs(reached - loaded.start).max() > 0.1
 
 
 def test_motors_friction_and_followers_are_written(tmp_path):
