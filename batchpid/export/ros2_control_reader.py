@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -15,14 +14,15 @@ from batchpid.export.ros2_control import LEAVES, NEUTRAL, STRATEGIES
 from batchpid.io import documents
 from batchpid.law.params import PIDParams, make_params
 
-_KNOWN = (
-    *NEUTRAL,
-    "ff_velocity_scale",
-    "feedforward_gain",
-    "angle_wraparound",
-    "save_i_term",
-    "activate_state_publisher",
-)
+_KNOWN: dict[str, Any] = {
+    **NEUTRAL,
+    "ff_velocity_scale": 0.0,
+    "feedforward_gain": 0.0,
+    "angle_wraparound": False,
+    "save_i_term": True,
+    "activate_state_publisher": False,
+}
+"""Gains of both controllers, with their defaults."""
 _ANTI_WINDUP = {theirs: ours for ours, theirs in STRATEGIES.items()}
 
 
@@ -130,15 +130,13 @@ def _gains(name: str, joint: str, gains: Any, two: bool) -> dict[str, Any]:
         if key not in _KNOWN:
             problem, remedy = f"{key} is no gain of control_toolbox 6", f"use one of {', '.join(_KNOWN)}"
             raise InvalidArgumentError(where, problem, joint=joint, remedy=remedy)
-        if not isinstance(value, bool | str) and not documents.is_number(value):
-            raise InvalidArgumentError(where, f"{key} is no number", joint=joint, value=value, remedy="give a number")
-    own = {**NEUTRAL, **gains}
-    for key, neutral in NEUTRAL.items():
-        if isinstance(own[key], str) != isinstance(neutral, str) or isinstance(own[key], bool):
-            raise InvalidArgumentError(where, f"{key} is no value", joint=joint, value=own[key], remedy="correct it")
+        kind = type(_KNOWN[key])
+        if not (documents.is_number(value) if kind is float else isinstance(value, kind)):
+            problem, remedy = f"{key} is no {kind.__name__}", f"give a value as in '{key}: {_KNOWN[key]}'"
+            raise InvalidArgumentError(where, problem, joint=joint, value=value, remedy=remedy)
+    own = {**_KNOWN, **gains}
     choice(f"{where}.{joint}.antiwindup_strategy", own["antiwindup_strategy"], _ANTI_WINDUP)
-    own["feedforward"] = float(own.pop("ff_velocity_scale", 0.0) or own.pop("feedforward_gain", 0.0))
-    own["angle_wraparound"] = bool(own.get("angle_wraparound", False))
+    own["feedforward"] = float(own["ff_velocity_scale"]) + float(own["feedforward_gain"])
     if own["feedforward"] and not (two and own["d"]):
         what = "of the desired velocity is not weighted by d" if two else "of the desired position"
         remedy = "leave it out, and give the effort as feedforward"
@@ -155,7 +153,7 @@ def _params(columns: dict[str, Any], order: list[str], two: bool, continuous: Ar
     options["anti_windup"] = strategy
     if "back_calculation" in strategy:
         given, safe = columns["tracking_time_constant"].astype(float), np.where(i > 0, i, 1.0)
-        rule = np.where(d > 0, np.sqrt(d / safe), p / safe)
+        rule = np.where(d > 0, np.sqrt(np.maximum(d, 0.0) / safe), p / safe)
         options["tracking_time"] = np.where(given > 0, given, rule)
     for key in ("ki", "kd"):
         if not options[key].any():
@@ -184,6 +182,7 @@ def _differences(columns: dict[str, Any], order: list[str]) -> tuple[str, ...]:
     limits = columns["u_clamp_max"].astype(float), -columns["u_clamp_min"].astype(float)
     if any(np.isfinite(each).any() for each in limits):
         found.append("effort_limit: limits the sum with a feedforward, where u_clamp limits the PID alone")
-    if any(math.isfinite(x) and x <= 0 for each in limits for x in each):
+    conditional = columns["antiwindup_strategy"] == STRATEGIES["conditional"]
+    if any((conditional & (each <= 0)).any() for each in limits):
         found.append("anti_windup: conditional integration follows the excess of the effort, not its sign")
     return tuple(found)
