@@ -79,6 +79,10 @@ class PIDParams(NamedTuple):
         """Return the params of some envs (a slice or an index array); shared rows stay shared."""
         return PIDParams(*(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self))
 
+    def for_joints(self, joints: Any) -> PIDParams:
+        """Return the params of some joints (an index array or a mask)."""
+        return PIDParams(*(leaf[:, joints] if _is_array(leaf) else leaf for leaf in self))
+
     def __repr__(self) -> str:
         return params_summary(self)
 

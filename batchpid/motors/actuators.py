@@ -84,6 +84,12 @@ class Actuators(NamedTuple):
         """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
         return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
 
+    def for_joints(self, joints: Any) -> Actuators:
+        """Return the actuators of some joints (an index array or a mask)."""
+        whole = ("max_delay", "seed")
+        leaves = self._asdict().items()
+        return Actuators(**{name: leaf if leaf is None or name in whole else leaf[:, joints] for name, leaf in leaves})
+
     def joint_side(self) -> Actuators:
         """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
         return Actuators(**{name: getattr(self, name) for name in JOINT_SIDE})

@@ -2,41 +2,71 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
 
-SUFFIXES = {"c": ".h"}
-"""Suffix of the file of each target."""
+if TYPE_CHECKING:
+    import batchpid as bp
+    from batchpid.export import Exported
+
+FILES = {
+    "c": "-pid.h",
+    "ros2_control": "-controllers.yaml",
+    "isaac_lab": "-actuators.py",
+    "maniskill": "-controller.py",
+    "mjcf": "-pid.xml",
+    "urdf": "-repaired.urdf",
+}
+"""End of the default file name of each target."""
+USED = {
+    "c": ("gains", "timestep", "limits", "prefix"),
+    "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
+    "isaac_lab": ("gains", "timestep", "limits", "actuators"),
+    "maniskill": ("gains", "timestep", "limits", "actuators"),
+    "mjcf": ("gains", "timestep", "limits", "actuators"),
+    "urdf": (),
+}
+"""Flags that have an effect for each target, of those that only some have."""
+UNLIMITED = "guard: setpoints are not limited in the target"
+POSES = 64
+"""Sampled poses, for the range of the inertia."""
 
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a robot's gains as a file for another program.
+    """Write a robot's gains, or the robot itself, as a file for another program.
 
-    Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. Differences
-    between the target's law and batchpid's are printed, one line each.
+    Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
+    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "mjcf" is the robot with the
+    law in MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and batchpid's law or
+    the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c"] = "c"
-    """Target: "c", a header."""
+    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "mjcf", "urdf"] = "c"
+    """Target."""
+    actuators: flags.Actuators = None
+    controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
+    """Controller of ros2_control."""
     timestep: float = 1 / 1000
-    """Time step of the control on the robot [s]."""
+    """Time step of the control on the robot, or of the physics [s]."""
     limits: flags.Switch = False
     """Limit setpoints to the robot's joint limits and speeds before they reach the law."""
     prefix: str = "batchpid"
-    """Beginning of every name in the file."""
+    """Beginning of every name in the file; in ros2_control the name of the controller."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
     missing_meshes: flags.MissingMeshes = "skip"
     out: flags.OptionalPath = None
-    """File to write. Default: out/ROBOT-pid.h."""
+    """File to write. Default: out/ROBOT-pid.h, or another ending."""
     force: flags.Force = False
 
     imports = ("batchpid.sim.tuning.gain_sets", "batchpid.export")
@@ -44,30 +74,91 @@ class ExportCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.errors import InvalidArgumentError
-        from batchpid.export import to_c
         from batchpid.io.files import write_atomically
+        from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
-        chosen = gain_set(robot, self.gains)
-        if chosen.control != "pid":
-            remedy = "choose gains of the law: tuned, designed, tutorial, or a file"
-            raise InvalidArgumentError("gains", "are a drive's, which has no file", value=chosen.name, remedy=remedy)
-        suffix = SUFFIXES[self.to]
-        out = self.out or Path(f"out/{robot.path.stem}-pid{suffix}")
-        out = Outputs(force=self.force).path("out", out, (suffix,))
-        guard = robot.guard() if self.limits else None
-        exported = to_c(chosen.params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
-        differences = list(exported.differences)
-        if robot.coupling is not None:
-            followers = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
-            differences.append(
-                f"{', '.join(followers)}: followers are joints of their own in the file; ignore their efforts"
-            )
+        for field in fields(self):
+            unused = any(field.name in names for names in USED.values()) and field.name not in USED[self.to]
+            if unused and (value := getattr(self, field.name)) != field.default:
+                problem = f"has no effect with --to {self.to}"
+                raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
+        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
+        out = Outputs(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
+        if self.to == "urdf":
+            exported = to_urdf(robot, out.absolute().parent)
+            content = f"{robot.name}, {robot.dof} joints, without need of repair"
+        else:
+            chosen = gain_set(robot, self.gains)
+            if chosen.control != "pid":
+                remedy = "choose gains of the law: tuned, designed, tutorial, or a file"
+                problem = "are a drive's, which has no file"
+                raise InvalidArgumentError("gains", problem, value=chosen.name, remedy=remedy)
+            exported = self._exported(robot, chosen.params)
+            content = f"{chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz"
+        differences = exported.differences
         if self.strict and differences:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, exported.text)
         for each in differences:
             print(f"differs: {each}")
-        print(f"written: {out}: {chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz")
+        print(f"written: {out}: {content}")
+
+    def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
+        """Return the file of a target for gains."""
+        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_ros2_control
+
+        if self.to == "mjcf":
+            return _mjcf(robot, params, self.timestep, self.limits)
+        own, dt = robot.independent, self.timestep
+        joints, followers = ([robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (own, ~own))
+        place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
+        notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
+        if self.to == "c":
+            guard = robot.guard() if self.limits else None
+            exported = to_c(params, dt, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+            return exported._replace(differences=(*exported.differences, *notes))
+        notes += [UNLIMITED] if self.limits else []
+        params, inertia = params.for_joints(own), _inertia(robot)[:, own]
+        if self.to == "ros2_control":
+            names = {"controller": self.controller, "name": self.prefix}
+            exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
+        else:
+            to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
+            exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
+        return exported._replace(differences=(*exported.differences, *notes))
+
+
+def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Exported:
+    """Return the MJCF of the robot with its motors."""
+    from batchpid.sim.engine.engines import load_engine
+
+    load_engine("mujoco")  # raises without MuJoCo
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    exported = to_mjcf(robot, params, dt, actuators=robot.actuators, inertia=_inertia(robot))
+    return exported._replace(differences=(*exported.differences, *([UNLIMITED] if limits else [])))
+
+
+def _motors(robot: Robot) -> bp.Actuators:
+    """Return the motors of the independent joints, with the friction and damping of the robot's description added."""
+    import batchpid as bp
+
+    own = np.flatnonzero(robot.independent)
+    motors = bp.make_actuators(robot.dof) if robot.actuators is None else robot.actuators
+    friction = {"coulomb": robot.friction, "static": robot.friction, "viscous": robot.damping}
+    if motors.static is None:
+        del friction["static"]
+    given = {name: getattr(motors, name) for name in friction}
+    total = {name: friction[name] + (0.0 if leaf is None else leaf) for name, leaf in given.items()}
+    return motors.replace(joints=robot.dof, **total).for_joints(own)
+
+
+def _inertia(robot: Robot) -> np.ndarray:
+    """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at sampled poses."""
+    matrices = robot.mass_matrix(np.vstack([robot.start, robot.sample(POSES)]))
+    if robot.coupling is not None:
+        matrices = robot.coupling.mass_matrix(matrices)
+    return np.diagonal(matrices, axis1=1, axis2=2)

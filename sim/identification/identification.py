@@ -215,7 +215,7 @@ def _of_joints(params: bp.PIDParams, robot: Robot, joints: tuple[int, ...]) -> b
     if params.num_joints != robot.dof:
         problem = f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs {len(joints)}"
         raise InvalidArgumentError("params", problem, remedy="give one gain per joint of the robot")
-    return bp.PIDParams(*(leaf[:, list(joints)] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    return params.for_joints(list(joints))
 
 
 def _unknowns(

@@ -27,7 +27,8 @@ _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that
     "geometry": {*SHAPES},
 }
 _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
-_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
+UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
+"""Elements of a URDF that have no effect here."""
 _VECTORS = ("xyz", "rpy", "size", "scale")
 
 
@@ -68,7 +69,7 @@ def _elements(root: etree._Element) -> Iterator[Finding]:
                 yield finding_of(parent, "warning", "repeated-element", text, "remove the others")
             elif "xacro" in (etree.QName(child).namespace or ""):
                 xacro[tag] += 1
-            elif tag not in _UNUSED:
+            elif tag not in UNUSED:
                 unknown[tag] += 1
             parent.remove(child)
     if xacro:

@@ -40,6 +40,24 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     RobotError
         Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a bad mesh.
     """
+    root, missing, repairs = read_repaired(path, package_dirs, missing_meshes)
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    links = [_read_link(element, path) for element in root.findall("link")]
+    added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
+    ordered = _breadth_first(links, joints, path, added)
+    for element, joint in zip(root.findall("joint"), joints, strict=True):
+        if joint.mimic is not None:
+            element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
+    if strict:
+        refuse(path, repairs)
+    text = etree.tostring(root, encoding="unicode")
+    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
+
+
+def read_repaired(
+    path: Path, package_dirs: tuple[Path, ...], missing_meshes: str
+) -> tuple[etree._Element, list[str], list[Finding]]:
+    """Return the repaired ``<robot>`` of the file at ``path``, its missing meshes, and the repairs; see above."""
     repairs: list[Finding] = []
     root = parse_xml(path, repairs)
     if root.tag != "robot":
@@ -57,17 +75,7 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
         text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
-    links = [_read_link(element, path) for element in root.findall("link")]
-    added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
-    ordered = _breadth_first(links, joints, path, added)
-    for element, joint in zip(root.findall("joint"), joints, strict=True):
-        if joint.mimic is not None:
-            element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
-    if strict:
-        refuse(path, repairs)
-    text = etree.tostring(root, encoding="unicode")
-    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
+    return root, missing, repairs
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
+from batchpid.io import documents
 from batchpid.sim.options import ControlMode
 from batchpid.sim.robot.robot import Robot
 
@@ -27,7 +32,12 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
     "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
     SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names
-    are params files. Raises InvalidArgumentError where there is no such name or file, or the robot has no gains of it.
+    are params files, or files of ros2_control, whose differences from the law are warnings.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such name or file, or the robot has no gains of it.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
     named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}
@@ -47,4 +57,20 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=f"use a file or {', '.join(NAMES)}"
         )
+    if path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
+        return GainSet(path.name, _of_ros2_control(robot, path))
     return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
+
+
+def _of_ros2_control(robot: Robot, path: Path) -> bp.PIDParams:
+    """Return the params in a file of ros2_control; followers, which it does not name, have those of their leaders."""
+    own = robot.independent
+    joints = [name for name, independent in zip(robot.joint_names, own, strict=True) if independent]
+    found = from_ros2_control(path.read_text(), joints, continuous=robot.continuous[own])
+    for each in found.differences:
+        warnings.warn(f"{path}: {each}", stacklevel=3)
+    return (
+        found.params
+        if robot.coupling is None
+        else found.params.for_joints(robot.coupling.of_all(np.arange(len(joints))))
+    )

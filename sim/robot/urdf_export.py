@@ -1,0 +1,92 @@
+"""The repaired robot as a URDF for other programs."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+
+from lxml import etree
+
+from batchpid.errors import RobotError
+from batchpid.export.exported import Exported
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.findings import summary
+from batchpid.sim.robot.meshes import find_mesh
+from batchpid.sim.robot.repair import UNUSED
+from batchpid.sim.robot.urdf import read_repaired, read_urdf
+from batchpid.sim.robot.xml import parse_xml
+
+
+def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
+    """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
+
+    Links, joints, numbers and mimics are those of the file, where they were not repaired; visuals and other elements
+    without effect here are copied. Links that fixed joints connect stay apart.
+
+    Parameters
+    ----------
+    robot
+        Its file is read again.
+    folder
+        Of the new file: paths of meshes are relative to it. Default: absolute paths.
+
+    Raises
+    ------
+    RobotError
+        The file cannot be read, or has changed since the robot was loaded.
+    """
+    path, packages = robot.path, robot.package_dirs
+    if read_urdf(path, packages, "skip", False).urdf != robot.urdf:
+        raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
+    root, *_ = read_repaired(path, packages, "skip")
+    root.set("name", robot.name)
+    found = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
+    found += _copy_unused(parse_xml(path, []), root, path, packages)
+    found += _lacking(robot)
+    if folder is not None:
+        for mesh in root.iter("mesh"):
+            if os.path.isabs(name := mesh.get("filename", "")):
+                mesh.set("filename", os.path.relpath(name, folder))
+    etree.indent(root)
+    etree.cleanup_namespaces(root)
+    text = etree.tostring(root, encoding="unicode")
+    return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(found))
+
+
+def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]) -> list[str]:
+    """Copy the elements without effect here into ``root``; return the visual meshes that are not found."""
+    owners = {(tag, each.get("name")): each for tag in ("link", "joint") for each in root.findall(tag)}
+    copied = set()
+    missing = []
+    for parent in (source, *source.findall("link"), *source.findall("joint")):
+        owner = (parent.tag, (parent.get("name") or "").strip())
+        target = root if parent is source else owners.get(owner)
+        if target is None or owner in copied:
+            continue  # left out, or the second of its name
+        copied.add(owner)
+        target.extend(deepcopy([each for each in parent if each.tag in UNUSED]))
+    for mesh in root.iterfind("link/visual/geometry/mesh"):
+        if (found := find_mesh(mesh.get("filename", ""), path, packages)) is None:
+            missing.append(mesh.get("filename", ""))
+        else:
+            mesh.set("filename", str(found))
+    return [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"] if missing else []
+
+
+def _lacking(robot: RobotDescription) -> Iterator[str]:
+    """Yield what is infinite here and has no number in a URDF, and what a URDF has no place for."""
+    for what, names in (
+        ("effort limit", [joint.name for joint in robot.joints if math.isinf(joint.effort_limit)]),
+        ("velocity limit", [joint.name for joint in robot.joints if math.isinf(joint.velocity_limit)]),
+    ):
+        if names:
+            yield f"no {what}, which other programs may require: {', '.join(names)}"
+    endless = [joint for joint in robot.joints if not joint.continuous and math.isinf(joint.upper - joint.lower)]
+    if endless:
+        names = [joint.name for joint in endless]
+        yield f"no position limit, written as inf, which other programs may refuse: {', '.join(names)}"
+    if robot.actuators is not None:
+        yield "motors and sensors (actuators) are not in a URDF"

@@ -1,0 +1,73 @@
+"""Cases that the tests of exports share: random params of any options, as comparable values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import strategies as st
+
+import batchpid as bp
+
+DT = 0.004
+JOINTS = ["shoulder", "elbow", "wrist"]
+
+number = st.floats(0, 1e3, allow_subnormal=False)
+OPTION = {
+    "ki": number,
+    "kd": number,
+    "effort_limit": st.floats(0.1, 1e3),
+    "effort_max": st.floats(-5.0, 1e3),
+    "effort_rate_limit": st.floats(1.0, 1e3),
+    "integral_min": st.floats(-10.0, 0.5),
+    "integral_max": st.floats(0.6, 10.0),
+    "derivative_filter_time": st.floats(0, 0.1),
+    "setpoint_weight": st.floats(0, 1),
+    "setpoint_weight_derivative": st.floats(0, 1),
+    "deadband": st.floats(1e-6, 0.1),
+    "tracking_time": st.floats(1e-4, 1.0),
+    "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
+    "continuous": st.booleans(),
+    "integration": st.sampled_from(["output_first", "integrate_first"]),
+    "first_derivative": st.sampled_from(["zero", "kick"]),
+    "non_finite": st.sampled_from(["propagate", "zero", "hold"]),
+    "measurement_rate": st.sampled_from(["difference", "measured"]),
+    "gain_units": st.sampled_from(["effort", "inertia"]),
+    "dtype": st.sampled_from([np.float32, np.float64]),
+}
+SHARED = ("integration", "first_derivative", "non_finite", "measurement_rate", "gain_units", "dtype")
+
+
+@st.composite
+def random_params(draw):
+    chosen = draw(st.sets(st.sampled_from(sorted(OPTION)), max_size=8))
+    if "effort_limit" in chosen:
+        chosen.discard("effort_max")
+    if "tracking_time" in chosen:
+        chosen.discard("anti_windup")
+    columns = {
+        name: draw(OPTION[name] if name in SHARED else st.lists(OPTION[name], min_size=3, max_size=3))
+        for name in chosen
+    }
+    if "clamp" in columns.get("anti_windup", ()):
+        columns["effort_limit"] = 50.0
+        columns.pop("effort_max", None)
+    if "tracking_time" in chosen:
+        columns["anti_windup"] = "back_calculation"
+    if columns.get("first_derivative") == "kick":
+        columns["setpoint_weight_derivative"] = 0.5
+    if "back_calculation" in columns.get("anti_windup", ()) and "tracking_time" not in columns:
+        columns["tracking_time"] = 0.3
+    return bp.make_params(3, draw(st.lists(number, min_size=3, max_size=3)), **columns)
+
+
+NEUTRAL = {"ki": 0.0, "kd": 0.0, "effort_min": -math.inf, "effort_max": math.inf, "effort_rate_limit": math.inf}
+NEUTRAL |= {"integral_min": -math.inf, "integral_max": math.inf, "setpoint_weight": 1.0, "tracking_time": math.inf}
+
+
+def values(params, name):
+    """Return an option as comparable values (joints,)."""
+    leaf = getattr(params, name)
+    if isinstance(leaf, tuple):
+        return [1.0] * 3
+    return [NEUTRAL.get(name, 0.0)] * 3 if leaf is None else leaf[0].astype(float).tolist()

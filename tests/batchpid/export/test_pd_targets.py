@@ -1,0 +1,170 @@
+"""Configurations of Isaac Lab and ManiSkill: Python that parses, with the figures of the law, and what it loses."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+
+import numpy as np
+import pytest
+from export_cases import DT, JOINTS, random_params, values
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.export import to_isaac_lab, to_maniskill
+from batchpid.motors import envelope
+from batchpid.motors.actuators import make_actuators
+
+PD = {"measurement_rate": "measured"}
+
+
+def configurations(text):
+    """Return the class and the arguments of each call in a text."""
+    calls = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
+    return [(call.func.id, {each.arg: ast.literal_eval(each.value) for each in call.keywords}) for call in calls]
+
+
+def figure(text, key, joint, default=None):
+    """Return the figure of a joint, as Isaac Lab finds it by the regular expressions."""
+    for _, arguments in configurations(text):
+        if any(re.fullmatch(each, joint) for each in arguments["joint_names_expr"]):
+            found = arguments.get(key, default)
+            if isinstance(found, dict):
+                return next((value for name, value in found.items() if re.fullmatch(name, joint)), default)
+            return found
+    raise AssertionError(joint)
+
+
+def test_an_ideal_pd_is_the_law():
+    """u = clip(kp e + kd (v_d - v) + feedforward), isaaclab/actuators/actuator_pd.py, without differences."""
+    params = bp.make_params(3, [40.0, 20.0, 1 / 3], None, [2.0, 0.3, 0.1], effort_limit=[30.0, 4.0, 1.0], **PD)
+    text, differences = to_isaac_lab(params, JOINTS, DT, model="ideal_pd")
+    assert differences == ()
+    rng = np.random.default_rng(0)
+    r, y, v, v_d, ff = rng.normal(size=(5, 1, 3))
+    _, effort = bp.step(params, bp.init(params, y), r, y, DT, measurement_rate=v, setpoint_rate=v_d, feedforward=ff)
+    p, d, limit = ([figure(text, key, joint) for joint in JOINTS] for key in ("stiffness", "damping", "effort_limit"))
+    expected = np.clip(p * (r - y) + d * (v_d - v) + ff, np.negative(limit), limit)
+    np.testing.assert_allclose(effort, expected, rtol=1e-12)
+
+
+def test_motors_are_grouped_by_what_a_configuration_has_once():
+    motors = make_actuators(
+        3, saturation_effort=[60.0, 9.0, 60.0], no_load_speed=[8.0, 20.0, 9.0], armature=0.01, coulomb=0.2
+    )
+    text, differences = to_isaac_lab(bp.make_params(3, 1.0, **PD), JOINTS, DT, actuators=motors)
+    assert differences == ()
+    (first, one), (second, other) = configurations(text)
+    assert (first, second) == ("DCMotorCfg", "DCMotorCfg")
+    assert (one["joint_names_expr"], other["joint_names_expr"]) == (["shoulder", "wrist"], ["elbow"])
+    assert one["velocity_limit"] == {"shoulder": 8.0, "wrist": 9.0}
+    assert (one["armature"], one["friction"], one["dynamic_friction"]) == (0.01, 0.2, 0.2)
+    assert "effort_limit" not in one
+    partly = motors.replace(saturation_effort=[60.0, np.inf, 60.0])
+    text = to_isaac_lab(bp.make_params(3, 1.0, **PD), JOINTS, DT, actuators=partly).text
+    assert [cls for cls, _ in configurations(text)] == ["DCMotorCfg", "IdealPDActuatorCfg"]
+    assert "import DCMotorCfg, IdealPDActuatorCfg" in text
+
+
+def test_the_envelope_of_a_dc_motor_is_that_of_the_actuators():
+    """DCMotor clips the speed at v0 (1 + L / S) and the line at the continuous effort."""
+    motors = make_actuators(1, saturation_effort=60.0, no_load_speed=8.0, effort_limit=30.0)
+    text = to_isaac_lab(bp.make_params(1, 1.0, **PD), ["a"], DT, actuators=motors).text
+    stall, speed, limit = (figure(text, key, "a") for key in ("saturation_effort", "velocity_limit", "effort_limit"))
+    v = np.linspace(-20, 20, 81)[:, None]
+    at = np.clip(v, -speed * (1 + limit / stall), speed * (1 + limit / stall))
+    low, high = envelope.limits(envelope.envelope(motors), np.zeros_like(v), v)
+    np.testing.assert_allclose(high, np.minimum(stall * (1 - at / speed), limit))
+    np.testing.assert_allclose(low, np.maximum(stall * (-1 - at / speed), -limit))
+
+
+def test_delays_are_whole_steps_of_the_setpoint():
+    motors = make_actuators(3, command_delay=[0.008, 0.008, 0.0101])
+    params = bp.make_params(3, 100.0, None, 20.0, **PD)
+    text, differences = to_isaac_lab(params, JOINTS, DT, actuators=motors, inertia=[1.0, 1.0, 1.0])
+    assert [figure(text, "min_delay", joint) for joint in JOINTS] == [2, 2, 3]
+    assert [figure(text, "max_delay", joint) for joint in JOINTS] == [2, 2, 3]
+    rounded, late = differences
+    assert "wrist 3" in rounded
+    w = max(np.sqrt(np.roots([1.0, -(20.0**2), -(100.0**2), 0.0]).real.max()), 0)
+    assert f"{math.degrees(w * 0.0101):.2g} degrees" in late
+
+
+def test_names_are_no_patterns():
+    text = to_isaac_lab(bp.make_params(2, [1.0, 2.0], **PD), ["a.b", "a+b"], DT).text
+    assert (figure(text, "stiffness", "a.b"), figure(text, "stiffness", "a+b")) == (1.0, 2.0)
+    with pytest.raises(AssertionError):
+        figure(text, "stiffness", "axb")
+
+
+def test_maniskill_has_lists_in_the_order_of_the_joints():
+    params = bp.make_params(3, [40.0, 20.0, 1 / 3], None, 0.1, effort_limit=[30.0, math.inf, 1.0], **PD)
+    ((cls, arguments),) = configurations(to_maniskill(params, JOINTS, DT).text)
+    assert cls == "PDJointPosControllerConfig"
+    assert arguments == {
+        "joint_names": JOINTS,
+        "lower": None,
+        "upper": None,
+        "stiffness": [40.0, 20.0, 1 / 3],
+        "damping": [0.1, 0.1, 0.1],
+        "force_limit": [30.0, 1e10, 1.0],
+        "friction": 0.0,
+        "normalize_action": False,
+    }
+
+
+@given(random_params(), st.sampled_from(["implicit", "ideal_pd", "maniskill"]))
+@settings(max_examples=100, deadline=None)
+def test_nothing_is_lost_that_is_not_listed(params, target):
+    inertia = np.array([2.0, 1.0, 0.5])
+    options = {} if target == "maniskill" else {"model": target}
+    to = to_maniskill if target == "maniskill" else to_isaac_lab
+    text, differences = to(params, JOINTS, DT, inertia=inertia, **options)
+    listed = {each.partition(":")[0] for each in differences}
+    key = {"implicit": "effort_limit_sim", "ideal_pd": "effort_limit", "maniskill": "force_limit"}[target]
+    if target == "maniskill":
+        ((_, arguments),) = configurations(text)
+        p, d, limit = (arguments[name] for name in ("stiffness", "damping", key))
+        limit = [math.inf if each == 1e10 else each for each in limit]
+    else:
+        p, d = ([figure(text, name, joint) for joint in JOINTS] for name in ("stiffness", "damping"))
+        limit = [figure(text, key, joint, math.inf) for joint in JOINTS]
+    scale = 1.0 if params.gain_units is None else inertia
+    tolerance = 1e-12 if params.dtype == np.float64 else 1e-6
+    np.testing.assert_allclose(p, np.array(values(params, "kp")) * scale, rtol=tolerance)
+    np.testing.assert_allclose(d, np.array(values(params, "kd")) * scale, rtol=tolerance)
+    if not listed & {"effort_limit"} or target == "implicit":
+        low, high = (np.array(values(params, name)) for name in ("effort_min", "effort_max"))
+        np.testing.assert_allclose(limit, np.clip(np.minimum(-low, high), 0, None), rtol=1e-12)
+    damps = params.kd is not None
+    needed = {
+        "ki": any(values(params, "ki")),
+        "effort_rate_limit": params.effort_rate_limit is not None,
+        "setpoint_weight": params.setpoint_weight is not None,
+        "setpoint_weight_derivative": damps and params.setpoint_weight_derivative is not None,
+        "derivative_filter_time": damps and params.derivative_filter_time is not None,
+        "measurement_rate": damps and params.measurement_rate is None,
+        "deadband": params.deadband is not None,
+        "continuous": params.continuous is not None,
+        "non_finite": params.non_finite is not None,
+        "gain_units": params.gain_units is not None,
+        "law": target != "ideal_pd",
+    }
+    assert {name for name, lost in needed.items() if lost} == listed - {"effort_limit"}
+
+
+def test_bad_requests_are_refused():
+    params = bp.make_params(1, 1.0)
+    for options in (
+        {"model": "dc_motor"},
+        {"model": "net"},
+        {"name": "a b"},
+        {"actuators": make_actuators(2, lag=0.1)},
+    ):
+        with pytest.raises(InvalidArgumentError):
+            to_isaac_lab(params, ["a"], DT, **options)
+    with pytest.raises(InvalidArgumentError):
+        to_maniskill(params, ["a"], DT, name="1")

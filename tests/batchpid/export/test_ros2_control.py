@@ -1,0 +1,229 @@
+"""Parameters of ros2_control: the target's law beside the law, and a round trip that loses only what it lists."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from export_cases import DT, JOINTS, random_params, values
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from law_cases import OPTIONS
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.export import from_ros2_control, to_ros2_control
+
+CONTROLLERS = ("joint_trajectory_controller", "pid_controller")
+
+
+def target_effort(gains, memory, error, rate, desired_rate, dt):
+    """One step of control_toolbox's PID with a feedforward of the desired velocity, on one joint."""
+    u = gains["p"] * error + memory["i"] + gains["d"] * rate
+    command = min(max(u, gains["u_clamp_min"]), gains["u_clamp_max"])
+    strategy = gains["antiwindup_strategy"]
+    if abs(error) > gains["error_deadband"]:
+        if strategy == "back_calculation" and gains["i"] != 0:
+            memory["i"] += dt * (gains["i"] * error + (command - u) / gains["tracking_time_constant"])
+        elif strategy == "none" or (
+            strategy == "conditional_integration" and not (abs(u - command) > 2.3e-16 and error * u > 0)
+        ):
+            memory["i"] += dt * gains["i"] * error
+    memory["i"] = min(max(memory["i"], gains["i_clamp_min"]), gains["i_clamp_max"])
+    feedforward = gains.get("ff_velocity_scale", gains.get("feedforward_gain", 0.0))
+    return command + feedforward * desired_rate
+
+
+def gains_of(text, controller):
+    return yaml.safe_load(text)[controller]["ros__parameters"]["gains"]
+
+
+def motion(two, steps=150):
+    """A setpoint (steps, joints) and a measurement, with their rates; without rates they begin at one point."""
+    t = np.arange(steps)[:, None] * DT
+    w, far = np.array([3.0, 7.0, 11.0]), np.array([1.0, 0.5, 2.0])
+    setpoint, measurement = far * np.sin(w * t) + 0.03 * two, 0.7 * far * np.sin(0.8 * w * t)
+    return setpoint, measurement, far * w * np.cos(w * t), 0.56 * far * w * np.cos(0.8 * w * t)
+
+
+def target_run(text, controller, two):
+    gains, columns = gains_of(text, controller), motion(two)
+    memory = {joint: {"i": 0.0, "last": 0.0} for joint in gains}
+    efforts = np.zeros_like(columns[0])
+    for at, (r, y, r_rate, y_rate) in enumerate(zip(*columns, strict=True)):
+        for j, (joint, own) in enumerate(gains.items()):
+            error, last = r[j] - y[j], memory[joint]["last"]
+            rate = r_rate[j] - y_rate[j] if two else (error - last) / DT
+            memory[joint]["last"] = error
+            efforts[at, j] = target_effort(own, memory[joint], error, rate, r_rate[j] if two else 0.0, DT)
+    return efforts
+
+
+def run(params, two):
+    columns = motion(two)
+    state, efforts = bp.init(params, columns[1][:1]), []
+    for r, y, r_rate, y_rate in zip(*(column[:, None] for column in columns), strict=True):
+        rates = {"measurement_rate": y_rate, "setpoint_rate": r_rate} if two else {}
+        state, effort = bp.step(params, state, r, y, DT, **rates)
+        efforts.append(effort[0])
+    return np.array(efforts)
+
+
+EXPRESSIBLE = {
+    "pid": {},
+    "limits": {"effort_limit": [30.0, 4.0, 1.0]},
+    "one limit": {"effort_max": 3.0},
+    "integral limit": {"integral_limit": 0.2},
+    "clamp": {"effort_limit": 2.0, "anti_windup": "clamp"},
+    "conditional": {"effort_limit": 2.0, "anti_windup": "conditional"},
+    "back calculation": {"effort_limit": 2.0, "anti_windup": "back_calculation", "tracking_time": [0.1, 0.5, 0.02]},
+    "mixed": {"effort_limit": 2.0, "anti_windup": ["back_calculation", "conditional", "none"]},
+}
+
+
+@pytest.mark.parametrize("case", EXPRESSIBLE)
+@pytest.mark.parametrize(("controller", "two"), [*((each, True) for each in CONTROLLERS), ("pid_controller", False)])
+def test_the_targets_law_gives_the_same_efforts(controller, two, case):
+    own = {"measurement_rate": "measured"} if two else {"setpoint_weight_derivative": 1.0}
+    params = bp.make_params(3, [40.0, 20.0, 0.5], [50.0, 5.0, 2.0], [2.0, 0.3, 0.02], **EXPRESSIBLE[case], **own)
+    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    assert {each.partition(":")[0] for each in exported.differences} <= {"effort_limit", "anti_windup"}
+    np.testing.assert_allclose(target_run(exported.text, controller, two), run(params, two), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_derivative_weight_is_a_feedforward_of_the_velocity(controller):
+    own = {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "measurement_rate": "measured"}
+    params = bp.make_params(3, [40.0, 20.0, 0.5], 1.0, [2.0, 0.3, 0.02], **own)
+    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    np.testing.assert_allclose(target_run(exported.text, controller, True), run(params, True), rtol=0, atol=1e-11)
+
+
+def test_the_file_is_that_of_a_controller_manager():
+    params = bp.make_params(3, 1.0, measurement_rate="measured")
+    document = yaml.safe_load(to_ros2_control(params, JOINTS, 0.002, name="arm").text)
+    assert document["controller_manager"]["ros__parameters"] == {
+        "update_rate": 500,
+        "arm": {"type": "joint_trajectory_controller/JointTrajectoryController"},
+    }
+    body = document["arm"]["ros__parameters"]
+    assert body.pop("gains").keys() == set(JOINTS)
+    assert body == {"joints": JOINTS, "command_interfaces": ["effort"], "state_interfaces": ["position", "velocity"]}
+
+
+@given(random_params(), st.sampled_from(CONTROLLERS))
+@settings(max_examples=80, deadline=None)
+def test_a_round_trip_loses_only_what_is_listed(params, controller):
+    exported = to_ros2_control(params, JOINTS, DT, controller=controller, inertia=[2.0, 1.0, 0.5])
+    back, joints, _ = from_ros2_control(exported.text)
+    assert joints == JOINTS
+    listed = {each.partition(":")[0] for each in exported.differences}
+    tolerance = 1e-12 if params.dtype == np.float64 else 1e-6
+    acts = np.array(values(params, "kd")) > 0
+    integrates = np.array(values(params, "ki")) > 0
+    for name in params._fields:
+        was, now = values(params, name), values(back, name)
+        if name in ("setpoint_weight_derivative", "measurement_rate", "derivative_filter_time", "first_derivative"):
+            was, now = ([x for x, on in zip(each, acts, strict=True) if on] for each in (was, now))
+        if name == "setpoint_weight_derivative" and params.setpoint_weight_derivative is None:
+            assert back.setpoint_weight_derivative is None or name in listed or not acts.any()
+            continue
+        if name in ("tracking_time", "conditional", "integration"):
+            was, now = ([x for x, on in zip(each, integrates, strict=True) if on] for each in (was, now))
+        if name == "setpoint_weight_derivative" and back.setpoint_weight_derivative is None:
+            now = [1.0] * len(now)  # with the rate of the trajectory's setpoint
+        if name in ("kp", "ki", "kd") and params.gain_units is not None:
+            was = (np.array(was) * [2.0, 1.0, 0.5]).tolist()
+        if name in listed or (name == "first_derivative" and params.setpoint_weight_derivative is None):
+            continue
+        assert now == pytest.approx(was, rel=tolerance, abs=tolerance), (name, exported.differences)
+
+
+@given(random_params(), st.sampled_from(CONTROLLERS))
+@settings(max_examples=60, deadline=None)
+def test_params_without_a_listed_difference_have_the_targets_efforts(params, controller):
+    params = params.replace(gain_units="effort", dtype=np.float64)
+    exported = to_ros2_control(params, JOINTS, DT, controller=controller)
+    # Without a feedforward, u_clamp is the effort limit; the motion has no error of exactly 0, and none of half a turn.
+    same = ("effort_limit", "continuous: taken", "anti_windup: back-calculation is left out")
+    if not all(each.startswith(same) for each in exported.differences):
+        return
+    two = controller == "joint_trajectory_controller" or params.measurement_rate is not None
+    ours = run(params, two)
+    atol = 1e-9 * max(1.0, np.abs(ours).max())
+    np.testing.assert_allclose(target_run(exported.text, controller, two), ours, rtol=1e-9, atol=atol)
+
+
+@pytest.mark.parametrize("case", [name for name in OPTIONS if not name.endswith("per env")])
+def test_every_case_of_the_law_is_written_and_read(case):
+    params = bp.make_params(3, **OPTIONS[case])
+    back = from_ros2_control(to_ros2_control(params, JOINTS, DT).text, JOINTS[::-1]).params
+    np.testing.assert_array_equal(back.kp[:, ::-1], params.kp)
+
+
+def test_the_phase_is_that_of_the_filter():
+    """A first-order lag of tau at w has the phase -atan(w tau) on a pure D controller."""
+    params = bp.make_params(1, 0.0, 0.0, 2.0, derivative_filter_time=0.01, measurement_rate="measured")
+    (said,) = to_ros2_control(params, ["a"], 1e-6, inertia=[0.1]).differences
+    w = 2.0 / 0.1
+    assert f"{math.degrees(math.atan(w * 0.01)):+.2g} degrees" in said
+    assert f"{w / (2 * math.pi):.3g} Hz" in said
+
+
+FILE = """
+/**:
+  arm_controller:
+    ros__parameters:
+      joints: [shoulder, elbow]
+      command_interfaces: [effort]
+      state_interfaces: [position, velocity]
+      gains:
+        shoulder: {p: 100, i: 4.0, d: 1.0, antiwindup_strategy: back_calculation}
+        elbow: {p: 50.0, d: 2.0, ff_velocity_scale: -0.5}
+wrist_controller:
+  ros__parameters:
+    joints: [wrist]
+    gains: {wrist: {p: 10.0, error_deadband: 0.01, i_clamp_max: .inf}}
+"""
+
+
+def test_files_by_hand_are_read_with_their_defaults():
+    params, joints, differences = from_ros2_control(FILE)
+    assert joints == JOINTS
+    np.testing.assert_array_equal(params.kp, [[100.0, 50.0, 10.0]])
+    np.testing.assert_array_equal(params.setpoint_weight_derivative, [[1.0, 0.75, 1.0]])
+    assert params.tracking_time[0, 0] == 0.5  # sqrt(d / i)
+    assert [each.partition(":")[0] for each in differences] == ["deadband"]
+    assert from_ros2_control(FILE, ["elbow"]).params.num_joints == 1
+    assert from_ros2_control(FILE, controller="wrist_controller").joint_names == ["wrist"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        ("antiwindup_strategy: back_calculation", "antiwindup_strategy: legacy", "legacy"),
+        ("p: 100", "p: much", "shoulder"),
+        ("p: 100", "i_clamp: 4.0", "i_clamp"),
+        ("[effort]", "[velocity]", "velocity"),
+        ("joints: [wrist]", "joints: [elbow]", "elbow"),
+        ("d: 2.0, ", "", "feedforward"),
+        ("gains:", "gain:", "holds no controller"),
+        ("p: 10.0", "p: -10.0", "kp"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(before, after, named):
+    text = FILE.replace(before, after)
+    with pytest.raises(InvalidArgumentError, match=named):
+        from_ros2_control(text, controller="arm_controller" if after == "gain:" else None)
+
+
+def test_params_that_the_target_cannot_hold_are_refused():
+    fixed = bp.make_params(1, 1.0, effort_min=2.0, effort_max=2.0)
+    for params in (bp.make_params(1, 1.0, gain_units="inertia"), bp.make_params(1, [[1.0], [2.0]]), fixed):
+        with pytest.raises(InvalidArgumentError):
+            to_ros2_control(params, ["a"], DT)
+    for inertia in ([0.0], [[1.0, 2.0]], []):
+        with pytest.raises(InvalidArgumentError, match="inertia"):
+            to_ros2_control(bp.make_params(1, 1.0), ["a"], DT, inertia=inertia)

@@ -1,0 +1,153 @@
+"""The robot as MJCF: MuJoCo's own loader gives the simulated robot, and its actuators the law."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.scene_spec import SceneSpec
+
+mujoco = pytest.importorskip("mujoco", "3.17")
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_dynamics import scene_dynamics  # noqa: E402
+from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+
+DT = 1 / 2000
+
+
+def model_of(exported):
+    return mujoco.MjModel.from_xml_string(exported.text)
+
+
+def plain(loaded, **options):
+    return bp.make_params(loaded.dof, 40.0, 5.0, 2.0, measurement_rate="measured", **options)
+
+
+@pytest.mark.parametrize("name", Robot.bundled())
+def test_the_loaded_model_has_the_dynamics_of_the_robot(name):
+    loaded = Robot.load(name)
+    model = model_of(to_mjcf(loaded, plain(loaded), DT))
+    spec = SceneSpec(
+        loaded.urdf,
+        loaded.ignored_pairs,
+        loaded.joints,
+        DT,
+        SOLVERS["accurate"],
+        ground=loaded.has_ground,
+        engine="mujoco",
+    )
+    oracle = scene_dynamics(spec)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    columns = [model.joint(each).dofadr[0] for each in loaded.joint_names]
+    for qpos in loaded.sample(3):
+        data.qpos[columns], data.qvel[columns] = qpos, (qvel := rng.normal(size=loaded.dof))
+        mujoco.mj_forward(model, data)
+        matrix = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, matrix)
+        np.testing.assert_allclose(
+            matrix[np.ix_(columns, columns)], oracle.mass_matrix(qpos[None])[0], rtol=1e-10, atol=1e-12
+        )
+        bias = oracle.inverse_dynamics(qpos[None], qvel[None], 0 * qpos[None])[0]
+        np.testing.assert_allclose(data.qfrc_bias[columns], bias, rtol=1e-9, atol=1e-10)
+    for each in loaded.joints:
+        held = model.joint(each.name)
+        assert (held.damping[0], held.frictionloss[0]) == (each.damping, each.friction)
+        assert bool(held.limited[0]) == (not each.continuous and np.isfinite([each.lower, each.upper]).any())
+        if held.limited[0]:
+            np.testing.assert_allclose(held.range, np.clip([each.lower, each.upper], -1e10, 1e10), rtol=1e-12)
+
+
+def test_the_actuators_compute_the_law_with_limits_and_feedforward():
+    loaded = Robot.load("panda")
+    limits = {"effort_min": -3.0, "effort_max": 4.0, "integral_limit": np.linspace(0.05, 9, 9)}
+    params = plain(loaded, **limits).replace(kp=np.linspace(5, 80, 9), ki=np.linspace(1, 30, 9))
+    exported = to_mjcf(loaded, params, DT)
+    assert [each.partition(":")[0] for each in exported.differences] == ["integral_limit"]
+    exported = to_mjcf(loaded, params.replace(integral_limit=np.inf), DT)
+    assert exported.differences == ()
+    params = params.replace(integral_limit=np.inf)
+    model = model_of(exported)
+    data, state = mujoco.MjData(model), bp.init(params, np.zeros((1, 9)))
+    saturated = 0
+    for step in range(300):
+        wanted = 0.4 * np.sin(0.05 * step + np.arange(9))
+        rate, feedforward = np.cos(0.03 * step) * np.ones(9), 0.5 * np.sin(0.02 * step) * np.ones(9)
+        data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
+        q, v = data.qpos[None].copy(), data.qvel[None].copy()
+        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        state, effort = bp.step(params, state, wanted[None], q, DT, **rates)
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(data.actuator_force, effort[0], rtol=0, atol=1e-9)
+        saturated += np.isin(effort, (-3.0, 4.0)).sum()
+    assert 100 < saturated < 2600
+
+
+def test_the_file_moves_as_the_runner_does():
+    loaded = Robot.load("panda")
+    params = plain(loaded, effort_limit=loaded.effort_limit)
+    model = model_of(to_mjcf(loaded, params, DT))
+    data, goal = mujoco.MjData(model), 0.5 * (loaded.start + loaded.settings.target)
+    data.qpos[:] = loaded.start
+    options = {"workers": 0, "timestep": DT, "substeps": 1, "engine": "mujoco", "compensate": "gravity+coriolis"}
+    with Runner(loaded, 1, params=params, **options) as runner:
+        runner.reset()
+        for _ in range(200):
+            reached = runner.step(goal).qpos[0]
+            mujoco.mj_forward(model, data)
+            data.ctrl[:] = np.stack([goal, 0 * goal, data.qfrc_bias], axis=1).ravel()
+            mujoco.mj_step(model, data)
+            np.testing.assert_allclose(data.qpos, reached, rtol=0, atol=1e-6)
+    assert np.abs(reached - loaded.start).max() > 0.1
+
+
+def test_motors_friction_and_followers_are_written(tmp_path):
+    rubs = LIMIT + '<dynamics friction="0.25" damping="0.5"/>'
+    mimic = LIMIT + '<mimic joint="a" multiplier="-0.5" offset="0.1"/>'
+    parts = [
+        *(link(name, INERTIAL) for name in "xyz"),
+        joint("a", "x", "y", inner=rubs),
+        joint("b", "y", "z", inner=mimic),
+    ]
+    loaded = Robot.load(write(tmp_path, robot(*parts)))
+    motors = bp.make_actuators(2, armature=0.02, coulomb=0.5, viscous=0.1, effort_limit=6.0, lag=0.001)
+    exported = to_mjcf(loaded, plain(loaded, effort_limit=10.0, anti_windup="conditional"), DT, actuators=motors)
+    listed = [each.partition(":")[0] for each in exported.differences]
+    assert listed == ["lag", "anti_windup", "friction", "followers"]
+    model = model_of(exported)
+    held = model.joint("a")
+    assert (held.armature[0], held.frictionloss[0], held.damping[0]) == (0.02, 0.75, 0.6)
+    assert model.nu == 3
+    assert model.actuator_forcerange.tolist() == [[-6.0, 6.0]]
+    data = mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
+    data.qpos[1] = 0.1
+    for _ in range(2000):
+        data.ctrl[0] = 0.4
+        mujoco.mj_step(model, data)
+    assert abs(data.qpos[0]) > 0.05
+    assert data.qpos[1] == pytest.approx(0.1 - 0.5 * data.qpos[0], abs=2e-3)
+
+
+def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
+    impossible = INERTIAL.replace('izz="0.1"', 'izz="0.3"')
+    loaded = Robot.load(write(tmp_path, robot(link("x"), link("y", impossible), joint("a", "x", "y"))))
+    exported = to_mjcf(loaded, plain(loaded), DT)
+    (said,) = exported.differences
+    assert said.startswith("inertia: link 'y': MuJoCo needs moments of a body")
+    moments = np.sort(model_of(exported).body("y").inertia)
+    assert moments[0] + moments[1] >= moments[2] * (1 - 1e-9)
+
+
+def test_bad_requests_are_refused():
+    loaded = Robot.load("panda")
+    for params in (plain(loaded).replace(gain_units="inertia"), plain(loaded, effort_min=1.0, effort_max=1.0)):
+        with pytest.raises(InvalidArgumentError):
+            to_mjcf(loaded, params, DT)
+    with pytest.raises(InvalidArgumentError, match="physics"):
+        to_mjcf(dataclasses.replace(loaded), plain(loaded), DT, physics="exact")
