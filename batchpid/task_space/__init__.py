@@ -1,0 +1,21 @@
+"""Kinematics, dynamics and control in the space of a tool: pure functions of a :class:`KinematicTree`.
+
+Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a position and a quaternion (w, x, y, z);
+twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
+"""
+
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
+from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
+
+__all__ = [
+    "KinematicTree",
+    "bias",
+    "forward_dynamics",
+    "gravity",
+    "inverse_dynamics",
+    "jacobian",
+    "jacobian_rate",
+    "link_poses",
+    "mass_matrix",
+]
