@@ -29,6 +29,13 @@ def unrotate(turn: Any, vector: Any) -> Any:
     return turn[..., 0, :] * vector[..., :1] + turn[..., 1, :] * vector[..., 1:2] + turn[..., 2, :] * vector[..., 2:3]
 
 
+def in_axes(turn: Any, twists: Any) -> Any:
+    """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
+    xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
+    halves = [unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])]
+    return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
+
+
 def multiply(a: Any, b: Any) -> Any:
     """Return the products of matrices (..., n, 3) and (..., 3, m)."""
     return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:3] * b[..., 2:3, :]
@@ -100,8 +107,7 @@ def rotation_error(goal: Any, wxyz: Any) -> Any:
     return v * xp.where(small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length))
 
 
-def pose_error(goal: Any, frame: Any) -> Any:
-    """Return the errors (..., 6) [m, rad] from frames (..., 3, 4) to poses (..., 7), in the axes of the world."""
-    xp = namespace(goal, frame)
-    turn = rotation_error(goal[..., 3:], wxyz_of(frame[..., :3]))
-    return xp.concatenate([goal[..., :3] - frame[..., 3], turn], axis=-1)
+def pose_error(goal: Any, pose: Any) -> Any:
+    """Return the errors (..., 6) [m, rad] from ``pose`` to ``goal`` (..., 7), in the axes of the world."""
+    turn = rotation_error(goal[..., 3:], pose[..., 3:])
+    return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)

@@ -1,11 +1,13 @@
 r"""Symmetric positive matrices of a few rows: Cholesky's factor, inverses, eigenvalues.
 
-Matrices are (..., n, n). Each operation is elementwise over the leading axes, so that the result of a row does not
-depend on the others, and a row that is not finite stays alone; ``numpy.linalg`` promises neither.
+Matrices are (..., n, n). For NumPy, each operation is elementwise over the leading axes, so that the result of a row
+does not depend on the others, and a row that is not finite stays alone: ``numpy.linalg`` promises neither. JAX's arrays
+go to JAX's linear algebra.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,12 @@ from batchpid.arrays.elementwise import namespace
 from batchpid.errors import InvalidArgumentError
 
 SWEEPS = 7
-"""Sweeps of Jacobi's method; convergence is quadratic, and matrices of six rows need five."""
+"""Sweeps of Jacobi's method; convergence is quadratic, and matrices of six rows need five at most."""
+
+
+def quiet() -> np.errstate:
+    """Return a context in which rows that are not finite, or not positive definite, cause no warnings."""
+    return np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore")
 
 
 def whitened(matrix: Any, right: Any) -> Any:
@@ -24,15 +31,17 @@ def whitened(matrix: Any, right: Any) -> Any:
 
         l = S_:j / sqrt(S_jj)      S <- S - l l^T      y_j = B_j / sqrt(S_jj)      B <- B - l y_j
     """
-    size, rows = matrix.shape[-1], []
+    xp, size, rows = namespace(matrix, right), matrix.shape[-1], list[Any]()
+    if xp is not np:
+        return xp.linalg.solve(xp.linalg.cholesky(matrix), right)
     for j in range(size):
-        root = 1 / namespace(matrix).sqrt(matrix[..., :1, :1])  # of the rest of the matrix, which shrinks
+        root = 1 / np.sqrt(matrix[..., :1, :1])  # of the rest of the matrix, which shrinks
         rows.append(right[..., :1, :] * root)
         if j + 1 < size:
             below = matrix[..., 1:, :1] * root
             right = right[..., 1:, :] - below * rows[-1]
             matrix = matrix[..., 1:, 1:] - below * (matrix[..., :1, 1:] * root)
-    return namespace(matrix).concatenate(rows, axis=-2)
+    return np.concatenate(rows, axis=-2)
 
 
 def gram(factor: Any, other: Any) -> Any:
@@ -66,6 +75,14 @@ def bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
     An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
     and 0 where s is 0. Where 1/|matrix^-1| >= s0, no eigenvalue is below s0, and the inverse is Cholesky's.
     """
+    with quiet():
+        if matrix.ndim > 2:
+            return _bounded_inverse(matrix, smallest)
+        found, near = _bounded_inverse(matrix[None], smallest)
+        return found[0], near[0]
+
+
+def _bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
     xp = namespace(matrix)
     plain = inverse(matrix)
     s0 = xp.asarray(smallest, dtype=matrix.dtype)
@@ -100,44 +117,47 @@ def eigen(matrix: Any) -> tuple[Any, Any]:
     Van Loan, Matrix Computations, 4th ed., section 8.5).
     """
     xp, size = namespace(matrix), matrix.shape[-1]
-    vectors = _identity(matrix) + xp.zeros_like(matrix)
-    for _ in range(SWEEPS):
-        for first, second in _rounds(size):
-            matrix, vectors = _rotated(matrix, vectors, first, second, xp)
-    return xp.stack([matrix[..., k, k] for k in range(size)], axis=-1), vectors
+    if xp is not np:
+        return xp.linalg.eigh(matrix)
+    vectors = _identity(matrix) + np.zeros_like(matrix)
+    if size == 1:
+        return matrix[..., 0], vectors
+    for partner, sign, upper, lower in _rounds(size) * SWEEPS:
+        own = np.diagonal(matrix, axis1=-2, axis2=-1)
+        # The same entry for both of a pair: above and below the diagonal roundings differ.
+        off = matrix[..., upper, lower]
+        other = np.take(own, partner, axis=-1)
+        clear = (np.abs(off) <= 1e-30 * (np.abs(own) + np.abs(other))) | (sign == 0)
+        cot = (other - own) / (2 * np.where(clear, 1.0, off))
+        tan = np.where(cot == 0, sign, np.sign(cot)) / (np.abs(cot) + np.sqrt(cot * cot + 1))
+        tan = np.where(clear, 0.0, tan)
+        cos = 1 / np.sqrt(tan * tan + 1)
+        matrix = _combined(_combined(matrix, partner, cos, tan, -1), partner, cos, tan, -2)
+        vectors = _combined(vectors, partner, cos, tan, -1)
+    return np.diagonal(matrix, axis1=-2, axis2=-1), vectors
 
 
-def _rotated(a: Any, vectors: Any, first: list[int], second: list[int], xp: Any) -> tuple[Any, Any]:
-    """Return matrix and eigenvectors after the rotations that clear the entries (first, second) of the matrix."""
-    order = [*first, *second, *(k for k in range(a.shape[-1]) if k not in (*first, *second))]
-    back, pairs = [order.index(k) for k in range(len(order))], len(first)
-    p, q, off = a[..., first, first], a[..., second, second], a[..., first, second]
-    clear = off == 0
-    cot = (q - p) / (2 * xp.where(clear, 1.0, off))
-    sign = xp.where(cot < 0, -1.0, 1.0)
-    tan = xp.where(clear, 0.0, sign / (xp.abs(cot) + xp.sqrt(cot * cot + 1)))
-    cos = 1 / xp.sqrt(tan * tan + 1)
-    sin = cos * tan
-
-    def columns(x: Any) -> Any:
-        one, two = x[..., first], x[..., second]
-        c, s = cos[..., None, :], sin[..., None, :]
-        parts = [c * one - s * two, s * one + c * two, x[..., order[2 * pairs :]]]
-        return xp.concatenate(parts, axis=-1)[..., back]
-
-    half = columns(a)
-    return xp.swapaxes(columns(xp.swapaxes(half, -1, -2)), -1, -2), columns(vectors)
+def _combined(x: Any, partner: Any, cos: Any, tan: Any, axis: int) -> Any:
+    """Return cos (x_k - tan x_partner) of the columns or rows k of ``x``."""
+    cos, tan = (cos[..., None, :], tan[..., None, :]) if axis == -1 else (cos[..., None], tan[..., None])
+    return cos * (x - tan * np.take(x, partner, axis=axis))
 
 
-def _rounds(size: int) -> list[tuple[list[int], list[int]]]:
-    """Return the rounds of a tournament in which each of ``size`` players meets each other once."""
-    players = [*range(size), *([-1] * (size % 2))]
+@cache
+def _rounds(size: int) -> list[tuple[Any, ...]]:
+    """Return the rounds of a tournament in which each of ``size`` players meets each other once.
+
+    For each player: the partner; 1 for the first of a pair, -1 for the second, 0 for one who sits out; the lower and
+    the higher number of the pair.
+    """
+    players = list(range(size + size % 2))
     rounds = []
     for _ in range(len(players) - 1):
-        half = len(players) // 2
-        pairs = [sorted(pair) for pair in zip(players[:half], reversed(players[half:]), strict=True) if -1 not in pair]
-        if pairs:
-            rounds.append(([pair[0] for pair in pairs], [pair[1] for pair in pairs]))
+        partner, sign = np.arange(size), np.zeros(size)
+        for pair in zip(players[: len(players) // 2], reversed(players), strict=False):
+            if max(pair) < size:
+                partner[list(pair)], sign[list(pair)] = pair[::-1], (1.0, -1.0)
+        rounds.append((partner, sign, np.minimum(partner, range(size)), np.maximum(partner, range(size))))
         players = [players[0], players[-1], *players[1:-1]]
     return rounds
 

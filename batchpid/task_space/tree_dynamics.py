@@ -21,7 +21,7 @@ from typing import Any
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import cross, multiply, rotate
 from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
-from batchpid.task_space.symmetric import solve
+from batchpid.task_space.symmetric import quiet, solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
     Velocities,
@@ -29,7 +29,6 @@ from batchpid.task_space.tree_kinematics import (
     from_tips,
     motions_of,
     prepared,
-    quiet,
     velocities_of,
 )
 

@@ -25,11 +25,12 @@ import numpy as np
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import choice, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.frames import cross, pose_of, rotate, turned, unrotate
+from batchpid.task_space.frames import cross, in_axes, pose_of, rotate, turned
 from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
+from batchpid.task_space.symmetric import quiet
 
 FRAMES = ("world", "tool")
-"""Axes in which Jacobians and the like are given: the world's, or those of the link."""
+"""Axes of Jacobians and accelerations: the axes of the world or of the link."""
 
 
 class Motions(NamedTuple):
@@ -50,11 +51,6 @@ class Velocities(NamedTuple):
     angular: Any
     linear_rate: Any
     angular_rate: Any
-
-
-def quiet() -> np.errstate:
-    """Return a context in which rows that are not finite cause no warnings."""
-    return np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 
 def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None) -> Any:
@@ -83,7 +79,7 @@ def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, fr
     point
         Point in the link's frame, (3,) or (..., 3) [m]; default its origin.
     frame
-        Axes of the twist: "world" or "tool", those of the link.
+        Axes of the twist: "world" or "tool", the axes of the link.
 
     Raises
     ------
@@ -96,7 +92,7 @@ def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, fr
         motions = motions_of(tree, bodies, q, xp)
         tool = tool_frame(tree, bodies, motions.frames, index, point)
         matrix = jacobian_at(tree, bodies, motions, index, tool[..., 3])
-        return matrix if frame == "world" else in_axes(tool, matrix)
+        return matrix if frame == "world" else in_axes(tool[..., :3], matrix)
 
 
 def jacobian_rate(
@@ -105,7 +101,7 @@ def jacobian_rate(
     """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by velocities alone.
 
     ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
-    arguments and errors are those of :func:`jacobian`.
+    arguments and errors as in :func:`jacobian`.
     """
     index, _ = tree.index(link), choice("frame", frame, FRAMES)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
@@ -113,7 +109,7 @@ def jacobian_rate(
         motions = motions_of(tree, bodies, q, xp)
         tool = tool_frame(tree, bodies, motions.frames, index, point)
         rate = rate_at(tree, velocities_of(tree, motions, v, xp), index, tool[..., 3])
-        return rate if frame == "world" else in_axes(tool, rate[..., None])[..., 0]
+        return rate if frame == "world" else in_axes(tool[..., :3], rate[..., None])[..., 0]
 
 
 def prepared(tree: KinematicTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
@@ -220,11 +216,3 @@ def rate_at(tree: KinematicTree, velocities: Velocities, index: int, place: Any)
         return xp.concatenate([xp.zeros_like(place)] * 2, axis=-1)
     v, w, linear, angular = (leaf[..., body, :] for leaf in velocities)
     return xp.concatenate([linear + cross(angular, place) + cross(w, v + cross(w, place)), angular], axis=-1)
-
-
-def in_axes(frame: Any, twists: Any) -> Any:
-    """Return the columns of ``twists`` (..., 6, n) in the axes of frames (..., 3, 4)."""
-    xp, columns = namespace(frame, twists), namespace(twists).moveaxis(twists, -1, -2)
-    turn = frame[..., None, :, :3]
-    halves = [unrotate(turn, columns[..., :3]), unrotate(turn, columns[..., 3:])]
-    return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
