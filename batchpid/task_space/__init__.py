@@ -4,6 +4,7 @@ Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a po
 twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
 """
 
+from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.operational_space import advance, init, reset, step
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
@@ -12,6 +13,8 @@ from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, i
 from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
 
 __all__ = [
+    "IKResult",
+    "InverseKinematicsWarning",
     "KinematicTree",
     "OSCParams",
     "OSCState",
@@ -23,6 +26,7 @@ __all__ = [
     "gravity",
     "init",
     "inverse_dynamics",
+    "inverse_kinematics",
     "jacobian",
     "jacobian_rate",
     "link_poses",

@@ -147,7 +147,7 @@ class KinematicTree:
         Raises
         ------
         InvalidArgumentError
-            A link of another name; the message names the nearest.
+            The link is unknown; the message names the nearest.
         """
         if isinstance(link, str) and link in self.links:
             return self.links.index(link)

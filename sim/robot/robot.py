@@ -199,7 +199,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         options
-            ``armature`` (dof,) [kg m^2 or kg], by default the armature of :attr:`actuators`, and ``gravity`` (3,) [m/s^2].
+            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity`` (3,) [m/s^2].
 
         Raises
         ------
