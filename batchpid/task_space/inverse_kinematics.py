@@ -117,7 +117,7 @@ def inverse_kinematics(
                 began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
                 found = search.solve(np.tile(goal[left], (len(drawn), 1)), began)
                 for number, part in enumerate(np.arange(len(began)).reshape(len(drawn), -1), start=first + 1):
-                    _replace(best, left, IKResult(*(leaf[part] for leaf in found)), number, tolerance)
+                    _replace(best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance)
     if how != "return" and not best.success.all():
         _report(best, how)
     return best
