@@ -6,7 +6,7 @@ With the error e (position, rotation vector) of a pose, the Jacobian J, and E = 
 
 T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on
 Robotics 27 (2011). Joints that a step would carry past a limit go to that limit, and the others make up for the rest of
-the error with what is left of J: an active set. Where the steps end away from the pose, the search starts again.
+the error: an active set. A search that ends away from the pose is followed by others, from other poses.
 """
 
 from __future__ import annotations

@@ -33,7 +33,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from batchpid.arrays.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
@@ -86,13 +89,20 @@ def step(
     wrench
         Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame; None: 0.
     feedforward
-        Effort added (envs, dof), such as that of viscous damping; None: 0.
+        Effort added (envs, dof), such as the effort of viscous damping; None: 0.
 
     Raises
     ------
     InvalidArgumentError
-        The link is unknown, or qpos, qvel or the point have a wrong shape.
+        The link is unknown, or an array has a wrong shape.
     """
+    setpoints = {
+        "setpoint": (setpoint, 7),
+        "twist": (twist, 6),
+        "acceleration": (acceleration, 6),
+        "wrench": (wrench, 6),
+    }
+    _check_shapes(params, setpoints | {"feedforward": (feedforward, tree.dof)}, qpos)
     dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
     return advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms=terms)
 
@@ -114,6 +124,19 @@ def advance(
     """Compute the efforts with given dynamics, such as an engine's; otherwise as :func:`step`."""
     with quiet():
         return _advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms)
+
+
+def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: Any) -> None:
+    """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
+    envs = np.shape(qpos)[0]
+    for name, (value, size) in arrays.items():
+        if value is not None and np.shape(value) not in ((envs, size), (1, size)):
+            problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
+            raise InvalidArgumentError(name, problem, remedy="give one row for each env")
+    for name, leaf in params._asdict().items():
+        if hasattr(leaf, "shape") and leaf.shape[0] not in (1, envs):
+            problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
+            raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")
 
 
 def _advance(
@@ -196,7 +219,7 @@ def _selected_inverse(mobility: Any, axes: Any, smallest: Any, xp: Any) -> tuple
         return bounded_inverse(mobility, smallest)
     both = axes[..., :, None] * axes[..., None, :] > 0
     free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
-    # An axis that is not selected is a unit of its own, which no bound below 1 touches.
+    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
     alone = free * xp.maximum(smallest, 1.0)[..., None, None]
     inverse, near = bounded_inverse(xp.where(both, mobility, alone), smallest)
     return xp.where(both, inverse, xp.zeros_like(inverse)), near

@@ -21,7 +21,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class PartialDecoupling(Choice):
-    """Positions and rotations have inertias of their own, without the coupling between them."""
+    """The inertias of positions and of rotations, without the coupling between the two."""
 
 
 class NoDecoupling(Choice):
@@ -63,7 +63,7 @@ class OSCParams(NamedTuple):
     axes: Any = None
     """1.0 for the axes whose motion is controlled (1 | envs, 6); None for all."""
     force_axes: Any = None
-    """1.0 for the axes that the posture must not act on, beside those (1 | envs, 6)."""
+    """1.0 for further axes that the posture must not act on (1 | envs, 6)."""
     effort_min: Any = None
     """(1 | envs, dof) [N m or N]."""
     effort_max: Any = None

@@ -84,14 +84,14 @@ def test_the_posture_does_not_move_the_tool():
             assert np.abs(terms.posture).max() > 1
 
 
-def run(tree, link, params, qpos, goal, steps, change=lambda d: d, dt=DT):
+def run(tree, link, params, qpos, goal, steps, change=lambda d, q: d, dt=DT):
     """Return the errors of the pose (steps, envs, 6) and the efforts of a closed loop, exact but for its time step."""
     q, v, state = qpos.copy(), np.zeros_like(qpos), ts.init(params, qpos)
     errors, efforts = [], []
     for n in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
         target = goal(n) if callable(goal) else goal
-        _, effort = ts.advance(params, state, change(d), target, q, v)
+        _, effort = ts.advance(params, state, change(d, q), target, q, v)
         errors.append(frames.pose_error(target, d.pose))
         efforts.append(effort)
         v = v + dt * accelerations(d, effort)[0]
@@ -111,11 +111,10 @@ def test_moves_are_those_of_unit_masses_on_springs():
     goal[:, :3] += way
     tilt = frames.matrix_of(np.array([0.8, 0.0, 0.6, 0.0]))
     goal[6, 3:] = frames.wxyz_of(frames.multiply(tilt, frames.matrix_of(goal[6, 3:])))
-    held = ts.gravity(tree, START)
 
-    def change(d):  # env 4 without J' q', env 5 without Coriolis and centrifugal forces
+    def change(d, q):  # env 4 without J' q', env 5 without Coriolis and centrifugal forces
         rate, bias = d.jacobian_rate.copy(), d.bias.copy()
-        rate[4], bias[5] = 0.0, held
+        rate[4], bias[5] = 0.0, ts.gravity(tree, q[5])
         return d._replace(jacobian_rate=rate, bias=bias)
 
     params = ts.make_osc_params(tree, position_error_limit=np.inf, rotation_error_limit=np.inf)
@@ -269,6 +268,24 @@ def test_jax_computes_the_same(x64):
     with jax.numpy_rank_promotion("allow"):
         found = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
     np.testing.assert_allclose(found, step(*inputs), atol=1e-9)
+
+
+def test_inputs_of_a_step_are_checked():
+    tree, qpos = planar(), np.zeros((2, 2))
+    goal, params = ts.link_poses(tree, qpos, ["tip"])[:, 0], ts.make_osc_params(tree)
+    state = ts.init(params, qpos)
+    for change, message in (
+        ({"setpoint": goal[:, :6]}, r"setpoint: has shape \(2, 6\), not \(2, 7\)"),
+        ({"setpoint": goal[0]}, "setpoint: has shape"),
+        ({"twist": np.zeros(6)}, "twist: has shape"),
+        ({"wrench": np.zeros((3, 6))}, "wrench: has shape"),
+        ({"feedforward": np.zeros((2, 6))}, "feedforward: has shape"),
+        ({"params": ts.make_osc_params(tree, stiffness=np.ones((3, 6)))}, "params.stiffness: has rows for 3 envs"),
+        ({"link": "top"}, "did you mean 'tip'"),
+    ):
+        inputs = {"params": params, "state": state, "tree": tree, "link": "tip", "setpoint": goal} | change
+        with pytest.raises(InvalidArgumentError, match=message):
+            ts.step(**inputs, qpos=qpos, qvel=qpos)
 
 
 @pytest.mark.parametrize(
