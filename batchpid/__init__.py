@@ -17,6 +17,7 @@ Params say how to control, a state is carried from step to step, and every array
 - A simulator's drive with integral action: :func:`drive_target`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
 - Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.motors`.
+- Control of a tool: :mod:`batchpid.task_space`.
 - In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
   inertia in :mod:`batchpid.law.computed_torque`, errors in :mod:`batchpid.errors`.
 

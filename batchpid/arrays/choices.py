@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 
-class _Choice(NamedTuple):
+class Choice(NamedTuple):
     """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would all be equal."""
 
     def __eq__(self, other: object) -> bool:
@@ -21,39 +21,39 @@ class _Choice(NamedTuple):
         return hash(type(self))
 
 
-class Everywhere(_Choice):
+class Everywhere(Choice):
     """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
 
 
-class IntegrateFirst(_Choice):
+class IntegrateFirst(Choice):
     """The present error enters the integral before the effort is computed."""
 
 
-class DerivativeKick(_Choice):
+class DerivativeKick(Choice):
     """The error before the first sample counts as 0, so that the first derivative is a kick."""
 
 
-class WeightFromStart(_Choice):
+class WeightFromStart(Choice):
     """Setpoint weighting measures positions from the first measurement instead of from 0."""
 
 
-class ZeroEffort(_Choice):
+class ZeroEffort(Choice):
     """A joint with a non-finite input gets effort 0."""
 
 
-class HoldEffort(_Choice):
+class HoldEffort(Choice):
     """A joint with a non-finite input gets its last effort again."""
 
 
-class MeasuredRate(_Choice):
+class MeasuredRate(Choice):
     """The derivative takes the measured velocity instead of the difference quotient of positions."""
 
 
-class PerInertia(_Choice):
+class PerInertia(Choice):
     """Gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
 
 
-class PerMassMatrix(_Choice):
+class PerMassMatrix(Choice):
     """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
 

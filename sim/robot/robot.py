@@ -16,6 +16,7 @@ import batchpid as bp
 from batchpid import assets
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.read_only import read_only
+from batchpid.checks.keywords import check_keywords
 from batchpid.checks.validate import choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
@@ -26,8 +27,10 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
 from batchpid.sim.robot.parts import Joint, Settings
 from batchpid.sim.robot.preflight import check
+from batchpid.sim.robot.robot_tree import kinematic_tree
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from batchpid.sim.robot.urdf import read_urdf
+from batchpid.task_space.kinematic_tree import KinematicTree
 
 _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
@@ -186,6 +189,30 @@ class Robot(RobotDescription):
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
         return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)
+
+    def kinematic_tree(self, **options: Any) -> KinematicTree:
+        """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`: float64, and without an engine.
+
+        It knows every link of the URDF by name, merged ones included. Its joints move independently: it ignores mimic
+        couplings, friction and damping.
+
+        Parameters
+        ----------
+        options
+            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity`` (3,) [m/s^2].
+
+        Raises
+        ------
+        RobotError
+            The base is not fixed, or the mass of a link follows from its collision shapes, which only the engine knows.
+        InvalidArgumentError
+            An option is not one of those above, or has a wrong shape or sign.
+        """
+        check_keywords("kinematic_tree", options, ("armature", "gravity"))
+        known = {}
+        if self.actuators is not None and self.actuators.armature is not None:
+            known["armature"] = np.asarray(self.actuators.armature, float)[0]
+        return kinematic_tree(self, **(known | options))
 
     @property
     def has_tuned(self) -> bool:

@@ -138,6 +138,7 @@ class ToyEngine:
     """Engine without any capability."""
 
     name, capabilities, physics = "toy", frozenset(), {"accurate": Solver(1)}
+    group_size, shares_systems = 4, False
 
     def is_physics(self, settings):
         return False

@@ -1,0 +1,38 @@
+"""Kinematics, dynamics and control in the space of a tool: pure functions of a :class:`KinematicTree`.
+
+Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a position and a quaternion (w, x, y, z);
+twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
+"""
+
+from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.operational_space import advance, init, reset, step
+from batchpid.task_space.osc_params import OSCParams, make_osc_params
+from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, task_dynamics
+from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
+from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
+
+__all__ = [
+    "IKResult",
+    "InverseKinematicsWarning",
+    "KinematicTree",
+    "OSCParams",
+    "OSCState",
+    "OSCTerms",
+    "TaskDynamics",
+    "advance",
+    "bias",
+    "forward_dynamics",
+    "gravity",
+    "init",
+    "inverse_dynamics",
+    "inverse_kinematics",
+    "jacobian",
+    "jacobian_rate",
+    "link_poses",
+    "make_osc_params",
+    "mass_matrix",
+    "reset",
+    "step",
+    "task_dynamics",
+]

@@ -1,0 +1,113 @@
+"""Frames and rotations, batched over any leading axes, for NumPy and JAX arrays.
+
+A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7) is a position and a
+unit quaternion (w, x, y, z). Products are written as sums of elementwise products: their rounding does not depend on
+the number of rows, as a library's does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.arrays.elementwise import namespace
+
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
+def cross(a: Any, b: Any) -> Any:
+    """Return the cross product of (..., 3) and (..., 3)."""
+    return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
+
+
+def rotate(turn: Any, vector: Any) -> Any:
+    """Return the vectors (..., 3) turned by matrices (..., 3, 3): R v."""
+    return turn[..., 0] * vector[..., :1] + turn[..., 1] * vector[..., 1:2] + turn[..., 2] * vector[..., 2:3]
+
+
+def unrotate(turn: Any, vector: Any) -> Any:
+    """Return the vectors (..., 3) in the axes of matrices (..., 3, 3): R^T v."""
+    return turn[..., 0, :] * vector[..., :1] + turn[..., 1, :] * vector[..., 1:2] + turn[..., 2, :] * vector[..., 2:3]
+
+
+def in_axes(turn: Any, twists: Any) -> Any:
+    """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
+    xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
+    halves = [unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])]
+    return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
+
+
+def multiply(a: Any, b: Any) -> Any:
+    """Return the products of matrices (..., n, 3) and (..., 3, m)."""
+    return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:3] * b[..., 2:3, :]
+
+
+def turned(frame: Any, inner: Any) -> Any:
+    """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is given."""
+    xp = namespace(frame, inner)
+    product = multiply(frame[..., :3], inner)
+    shift = xp.zeros_like(frame[..., :3])
+    return product + xp.concatenate([shift, frame[..., 3:]], axis=-1)
+
+
+def matrix_of(wxyz: Any) -> Any:
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but 0."""
+    xp = namespace(wxyz)
+    w, x, y, z = (wxyz[..., k] for k in range(4))
+    s = 2 / (w * w + x * x + y * y + z * z)
+    rows = (
+        (1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
+        (s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)),
+        (s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)),
+    )
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def wxyz_of(turn: Any) -> Any:
+    """Return the unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
+
+    4 q q^T is linear in the entries of the matrix; its row with the largest diagonal entry is a multiple of q.
+    """
+    xp = namespace(turn)
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = ([turn[..., i, j] for j in range(3)] for i in range(3))
+    squares = [1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22]
+    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
+    xy, xz, yz = r10 + r01, r02 + r20, r21 + r12
+    rows = [
+        [squares[0], wx, wy, wz],
+        [wx, squares[1], xy, xz],
+        [wy, xy, squares[2], yz],
+        [wz, xz, yz, squares[3]],
+    ]
+    q, best = xp.stack(rows[0], axis=-1), squares[0]
+    for square, row in zip(squares[1:], rows[1:], strict=True):
+        better = square > best
+        q, best = xp.where(better[..., None], xp.stack(row, axis=-1), q), xp.where(better, square, best)
+    q = q / xp.sqrt((q * q).sum(-1, keepdims=True))
+    return xp.where(q[..., :1] < 0, -q, q)
+
+
+def pose_of(frame: Any) -> Any:
+    """Return the poses (..., 7) of frames (..., 3, 4)."""
+    return namespace(frame).concatenate([frame[..., 3], wxyz_of(frame[..., :3])], axis=-1)
+
+
+def rotation_error(goal: Any, wxyz: Any) -> Any:
+    """Return the rotation vectors (..., 3) [rad] from ``wxyz`` to ``goal`` (..., 4) in the world, at most pi long.
+
+    The quaternions need not have unit length: with (w, v) = goal * conjugate(wxyz) the angle is 2 atan2(|v|, w).
+    """
+    xp = namespace(goal, wxyz)
+    gw, g = goal[..., :1], goal[..., 1:]
+    qw, q = wxyz[..., :1], wxyz[..., 1:]
+    w = gw * qw + (g * q).sum(-1, keepdims=True)
+    v = qw * g - gw * q - cross(g, q)
+    w, v = xp.where(w < 0, -w, w), xp.where(w < 0, -v, v)
+    length = xp.sqrt((v * v).sum(-1, keepdims=True))
+    small = length < 1e-12 * w
+    return v * xp.where(small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length))
+
+
+def pose_error(goal: Any, pose: Any) -> Any:
+    """Return the errors (..., 6) [m, rad] from ``pose`` to ``goal`` (..., 7), in the axes of the world."""
+    turn = rotation_error(goal[..., 3:], pose[..., 3:])
+    return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)

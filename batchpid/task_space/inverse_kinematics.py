@@ -1,0 +1,241 @@
+r"""Inverse kinematics by damped least squares, with joint limits and several starts.
+
+With the error e (position, rotation vector) of a pose, the Jacobian J, and E = e^T e / 2, a step is::
+
+    dq = J^T (J J^T + (1e-5 + 0.1 E) 1)^-1 e
+
+T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on
+Robotics 27 (2011). Joints that a step would carry past a limit go to that limit, and the others make up for the rest of
+the error: an active set. A search that ends away from the pose is followed by others, from other poses.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.arrays.display import array_summary
+from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.frames import pose_error, pose_of
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.symmetric import gram, product, quiet, whitened
+from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, tool_frame
+
+Float64 = NDArray[np.float64]
+
+ON_FAILURE = ("warn", "raise", "return")
+_DAMPING, _DAMPING_PER_ERROR = 1e-5, 0.1
+_PASSES = 4  # of the active set; joints that reach a limit in later ones are clipped
+
+
+class InverseKinematicsWarning(UserWarning):
+    """Some poses were not reached."""
+
+
+class IKResult(NamedTuple):
+    """Solutions of :func:`inverse_kinematics`."""
+
+    qpos: Float64
+    """Joint positions (envs, dof) [rad or m]; the nearest found where ``success`` is False."""
+    position_error: Float64
+    """Distance to the pose (envs,) [m]."""
+    rotation_error: Float64
+    """Angle to it (envs,) [rad]."""
+    success: NDArray[np.bool_]
+    """Whether both are within the tolerances (envs,)."""
+    start: NDArray[np.intp]
+    """Number of the start that led there (envs,): 0 for the given one."""
+    iterations: NDArray[np.intp]
+    """Steps from that start (envs,)."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+def inverse_kinematics(
+    tree: KinematicTree,
+    link: str,
+    pose: ArrayLike,
+    start: ArrayLike,
+    *,
+    point: ArrayLike | None = None,
+    starts: int = 20,
+    iterations: int = 60,
+    position_tolerance: float = 1e-5,
+    rotation_tolerance: float = 1e-4,
+    seed: int = 0,
+    on_failure: str = "warn",
+) -> IKResult:
+    """Return joint positions that bring a tool to ``pose``, within the joint limits of ``tree``.
+
+    The first search starts at ``start``, others at poses drawn from ``seed``, the same for every env: the result of an
+    env does not depend on the others. Joints outside the chain to the tool stay at ``start``.
+
+    Parameters
+    ----------
+    link, point
+        Tool: a point (3,) [m] of a link, default its origin.
+    pose
+        (7,) or (envs, 7): position [m] and unit quaternion (w, x, y, z), in the world.
+    start
+        (dof,) or (envs, dof) [rad or m]; clipped to the limits.
+    starts
+        Largest number of searches per env; 1 stays near ``start``, or fails.
+    iterations
+        Largest number of steps of a search.
+    position_tolerance, rotation_tolerance
+        Largest errors of a success [m, rad].
+    on_failure
+        "warn": an :class:`InverseKinematicsWarning` names the first env that failed; "raise": an error; "return": the
+        caller checks ``success``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument has a wrong shape or range, a quaternion is not of unit length, or, with "raise", a pose was not
+        reached.
+    """
+    index, how = tree.index(link), choice("on_failure", on_failure, ON_FAILURE)
+    integer("starts", starts, 1, 10_000)
+    integer("iterations", iterations, 1, 100_000)
+    tolerances = {"position_tolerance": (position_tolerance, "m"), "rotation_tolerance": (rotation_tolerance, "rad")}
+    tolerance = np.array([positive(name, *value) for name, value in tolerances.items()])
+    goal, rows = _goals_and_starts(tree, pose, start)
+    at = None if point is None else broadcast("point", point, (3,), "give x, y, z in the link's frame [m]")
+    search = _Search(tree, index, at, tolerance, iterations)
+    rng = np.random.default_rng(integer("seed", seed, 0, 2**63))
+    shares = rng.uniform(size=(starts - 1, tree.dof))
+    with quiet():
+        best = search.solve(goal, rows)
+        for first, last in ((0, 4), (4, starts - 1)):  # most poses are reached from one of the first five
+            left, drawn = np.flatnonzero(~best.success), shares[first:last]
+            if len(left) and len(drawn):
+                began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
+                found = search.solve(np.tile(goal[left], (len(drawn), 1)), began)
+                for number, part in enumerate(np.arange(len(began)).reshape(len(drawn), -1), start=first + 1):
+                    _replace(best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance)
+    if how != "return" and not best.success.all():
+        _report(best, how)
+    return best
+
+
+class _Search:
+    """Searches for the poses of one tool."""
+
+    def __init__(
+        self, tree: KinematicTree, index: int, point: Float64 | None, tolerance: Float64, iterations: int
+    ) -> None:
+        self._tree, self._index, self._point = tree, index, point
+        self._tolerance, self._iterations = tolerance, iterations
+        self._chain = tree.chain(tree.links[index])
+
+    def drawn(self, rows: Float64, share: Float64) -> Float64:
+        """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about ``rows`` without limits."""
+        low = np.where(np.isfinite(self._tree.lower), self._tree.lower, rows - np.pi)
+        high = np.where(np.isfinite(self._tree.upper), self._tree.upper, rows + np.pi)
+        return np.where(self._chain, low + share * (high - low), rows)
+
+    def solve(self, goal: Float64, qpos: Float64) -> IKResult:
+        """Return where a search from ``qpos`` (n, dof) ends."""
+        count = len(goal)
+        found = IKResult(
+            qpos.copy(),
+            np.full(count, np.inf),
+            np.full(count, np.inf),
+            np.zeros(count, bool),
+            np.zeros(count, np.intp),
+            np.zeros(count, np.intp),
+        )
+        going, q = np.arange(count), qpos
+        for step in range(self._iterations + 1):
+            error, matrix = self._error(goal[going], q)
+            lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
+            better = _size(lengths, self._tolerance) < _size(_lengths(found, going), self._tolerance)
+            rows = going[better]
+            found.qpos[rows], found.iterations[rows] = q[better], step
+            found.position_error[rows], found.rotation_error[rows] = lengths[better].T
+            found.success[rows] = (lengths[better] <= self._tolerance).all(1)
+            if step == self._iterations:
+                break
+            stay = ~found.success[going]
+            going, q = going[stay], q[stay]
+            if not len(going):
+                break
+            q = self._stepped(q, error[stay], matrix[stay])
+        return found
+
+    def _error(self, goal: Float64, qpos: Float64) -> tuple[Float64, Float64]:
+        """Return the errors (n, 6) and Jacobians (n, 6, dof)."""
+        tree, bodies = self._tree, self._tree.bodies
+        motions = motions_of(tree, bodies, qpos, np)
+        tool = tool_frame(tree, bodies, motions.frames, self._index, self._point)
+        return pose_error(goal, pose_of(tool)), jacobian_at(tree, bodies, motions, self._index, tool[..., 3])
+
+    def _stepped(self, qpos: Float64, error: Float64, matrix: Float64) -> Float64:
+        """Return the positions after a step within the limits."""
+        damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
+        free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
+        for _ in range(_PASSES):
+            part = np.where(free[:, None], matrix, 0.0)
+            rest = error - product(matrix, np.where(free, 0.0, move))
+            right = np.concatenate([part, rest[..., None]], axis=-1)
+            factor = whitened(gram(part.swapaxes(-1, -2), part.swapaxes(-1, -2)) + damping * np.eye(6), right)
+            move = np.where(free, gram(factor[..., :-1], factor[..., -1:])[..., 0], move)
+            within = np.clip(qpos + move, self._tree.lower, self._tree.upper) - qpos
+            beyond = free & (within != move) & (qpos + move != qpos + within)
+            move = np.where(beyond, within, move)
+            free &= ~beyond
+            if not beyond.any():
+                break
+        return np.clip(qpos + move, self._tree.lower, self._tree.upper)
+
+
+def _goals_and_starts(tree: KinematicTree, pose: ArrayLike, start: ArrayLike) -> tuple[Float64, Float64]:
+    """Return checked poses (envs, 7) and starts (envs, dof)."""
+    columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    envs = max(1, *(np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2), 1)
+    goal = array("pose", pose, (envs, 7), columns, kind="entry").copy()
+    rows = array("start", start, (envs, tree.dof), tree.joint_names)
+    length = np.linalg.norm(goal[:, 3:], axis=1, keepdims=True)
+    unit = np.abs(length - 1) < 1e-3
+    entries("pose", length, unit, "has a quaternion that is not of unit length", ["qw"], remedy="normalise w, x, y, z")
+    goal[:, 3:] /= length
+    return goal, np.clip(rows, tree.lower, tree.upper)
+
+
+def _lengths(found: IKResult, rows: Any) -> Float64:
+    return np.stack([found.position_error[rows], found.rotation_error[rows]], axis=-1)
+
+
+def _size(lengths: Float64, tolerance: Float64) -> Float64:
+    """Return the larger of position and rotation error over its tolerance."""
+    return (lengths / tolerance).max(-1)
+
+
+def _replace(best: IKResult, left: Any, found: IKResult, start: int, tolerance: Float64) -> None:
+    """Write ``found`` over the rows ``left`` of ``best`` that have not succeeded, where it is nearer."""
+    nearer = _size(_lengths(found, slice(None)), tolerance) < _size(_lengths(best, left), tolerance)
+    rows = nearer & ~best.success[left]
+    for whole, part in zip(best, found, strict=True):
+        whole[left[rows]] = part[rows]
+    best.start[left[rows]] = start
+
+
+def _report(found: IKResult, how: str) -> None:
+    """Warn, or raise, for the first env that failed."""
+    failed = np.flatnonzero(~found.success)
+    env = int(failed[0])
+    problem = (
+        f"was not reached in {len(failed)} of {len(found.success)} envs: {found.position_error[env] * 1e3:.3g} mm and "
+        f"{found.rotation_error[env] * 1e3:.3g} mrad are left"
+    )
+    error = InvalidArgumentError(
+        "pose", problem, env=env, remedy="check that it is in reach, or give more starts or larger tolerances"
+    )
+    if how == "raise":
+        raise error
+    warnings.warn(str(error), InverseKinematicsWarning, stacklevel=3)

@@ -1,0 +1,237 @@
+"""Kinematic tree of one robot: links, joints, inertias, as float64 arrays.
+
+Links are listed parents first. A joint's frame is placed in the frame of its parent link; its child link's frame is
+that frame, turned about the axis by q (revolute) or shifted along it by q (prismatic). Links that fixed joints connect
+are one rigid body: each link keeps its name and its frame, and the bodies have the sums of the inertias (Huygens and
+Steiner). There is one body for each degree of freedom, and the base, whose motion and inertia play no part.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.arrays.display import summary
+from batchpid.checks.validate import choice, entries, names, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.frames import matrix_of, turned
+
+Float64 = NDArray[np.float64]
+
+JOINT_TYPES = ("fixed", "revolute", "prismatic")
+
+
+class Bodies(NamedTuple):
+    """Bodies of a tree, one for each degree of freedom, and the frames of its links in them.
+
+    The frame of body j in its parent's is ``at_zero + sin(q) sine + (1 - cos(q)) cosine + q slide``, each (3, 4):
+    rotation and position. This is Rodrigues' formula with the placement of the joint multiplied in.
+    """
+
+    at_zero: Any
+    sine: Any
+    cosine: Any
+    slide: Any
+    axis: Any
+    """Axis of the joint in the body's frame (dof, 3)."""
+    slides: Any
+    """1.0 for a prismatic joint, else 0.0 (dof, 1)."""
+    mass: Any
+    """(dof, 1) [kg]."""
+    center: Any
+    """Center of mass in the body's frame (dof, 3) [m]."""
+    tensor: Any
+    """Inertia tensor about it, in the body's axes (dof, 3, 3) [kg m^2]."""
+    moves: Any
+    """1.0 where joint i moves body j (dof j, dof i)."""
+    link_frames: Any
+    """Frames of the links in their bodies (links, 3, 4)."""
+    armature: Any
+    gravity: Any
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class KinematicTree:
+    """Kinematic tree of a robot on a fixed base. Arrays are copied and read-only; the degrees of freedom are the
+    joints that move, in the order of their links.
+
+    :meth:`batchpid.sim.Robot.kinematic_tree` makes one from a robot.
+
+    Raises
+    ------
+    InvalidArgumentError
+        A name repeats, a shape is wrong, a parent does not come first, or an inertia is not positive.
+    """
+
+    links: tuple[str, ...]
+    """Names of the links, parents first; the first is the base."""
+    parent: NDArray[np.intp]
+    """Index of each link's parent (links,), -1 for the base."""
+    joint_types: tuple[str, ...]
+    """Type of the joint above each link (links,): "fixed", "revolute" or "prismatic"; "fixed" for the base."""
+    joint_names: tuple[str, ...]
+    """Names of the joints that move (dof,)."""
+    position: Float64
+    """Position of each joint in its parent link's frame (links, 3) [m]; of the base in the world."""
+    wxyz: Float64
+    """Orientation there, unit quaternions (links, 4)."""
+    axis: Float64
+    """Axes in the joint's frame (links, 3), normalised here; unused for fixed joints."""
+    mass: Float64
+    """Masses of the links (links,) [kg]."""
+    center: Float64
+    """Centers of mass in the link's frame (links, 3) [m]."""
+    inertia: Float64
+    """Inertia tensors about them, in the link's axes (links, 3, 3) [kg m^2]."""
+    _: KW_ONLY
+    armature: ArrayLike = 0.0
+    """Reflected inertia of the motors (dof,) [kg m^2 or kg], added to the diagonal of the mass matrix."""
+    lower: ArrayLike = -np.inf
+    """Lower position limits (dof,) [rad or m], for inverse kinematics."""
+    upper: ArrayLike = np.inf
+    gravity: ArrayLike = (0.0, 0.0, -9.81)
+    """Acceleration of free fall in the world (3,) [m/s^2]."""
+
+    def __post_init__(self) -> None:
+        links = tuple(names("links", list(self.links)))
+        count = len(links)
+        types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
+        if len(types) != count or types[:1] != ("fixed",):
+            problem = f"has {len(types)} entries for {count} links, or does not begin with 'fixed', for the base"
+            raise InvalidArgumentError("joint_types", problem, remedy="give the type of the joint above each link")
+        moving = tuple(names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types)))
+        parent = np.array(_array("parent", self.parent, (count,)), np.intp)
+        first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
+        entries("parent", parent, first, "does not come before its child", links, kind="entry")
+        shapes = {"position": (3,), "wxyz": (4,), "axis": (3,), "mass": (), "center": (3,), "inertia": (3, 3)}
+        tables: dict[str, NDArray[Any]] = {
+            name: _array(name, getattr(self, name), (count, *shape)) for name, shape in shapes.items()
+        }
+        for name in ("armature", "lower", "upper"):
+            given: Any = np.asarray(getattr(self, name))
+            tables[name] = _array(name, given if given.shape else np.full(len(moving), given), (len(moving),))
+        tables["gravity"] = _array("gravity", self.gravity, (3,))
+        for name, table in tables.items():
+            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (name in ("lower", "upper"))
+            of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
+            entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
+        for name in ("mass", "armature"):
+            entries(name, tables[name], tables[name] >= 0, "must be >= 0", (links, moving)[name == "armature"])
+        lengths = {name: np.linalg.norm(tables[name], axis=1) for name in ("wxyz", "axis")}
+        entries("wxyz", lengths["wxyz"], np.abs(lengths["wxyz"] - 1) < 1e-6, "is not a unit quaternion", links)
+        pointing = (lengths["axis"] > 0) | (np.array(types) == "fixed")
+        entries("axis", lengths["axis"], pointing, "has no direction", links)
+        tables["wxyz"] /= lengths["wxyz"][:, None]
+        tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
+        for table in (parent, *tables.values()):
+            table.setflags(write=False)
+        vars(self).update(tables, links=links, joint_types=types, joint_names=moving, parent=parent)
+
+    def __repr__(self) -> str:
+        parts = [f"{len(self.links)} links", f"{self.dof} joints", f"{self.mass.sum():.4g} kg"]
+        return summary(type(self).__name__, [*parts, "links " + " ".join(self.links)])
+
+    @property
+    def dof(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.joint_names)
+
+    def index(self, link: str) -> int:
+        """Return the index of a link.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The link is unknown; the message names the nearest.
+        """
+        if isinstance(link, str) and link in self.links:
+            return self.links.index(link)
+        near = difflib.get_close_matches(str(link), self.links, 1)
+        remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(self.links)}"
+        raise InvalidArgumentError("link", "unknown link", value=link, remedy=remedy)
+
+    def chain(self, link: str) -> NDArray[np.bool_]:
+        """Return the mask (dof,) of the joints between the base and ``link``."""
+        body = self.link_bodies[self.index(link)]
+        return self.bodies.moves[body] > 0 if body >= 0 else np.zeros(self.dof, bool)
+
+    @property
+    def link_bodies(self) -> tuple[int, ...]:
+        """Body of each link (links,): the index of the joint that moves it, -1 for the base."""
+        return self._structure[0]
+
+    @property
+    def body_parents(self) -> tuple[int, ...]:
+        """Index of the parent of each body (dof,), -1 for the base."""
+        return self._structure[1]
+
+    @property
+    def bodies(self) -> Bodies:
+        """Bodies in float64."""
+        return self._structure[2]
+
+    @cached_property
+    def _structure(self) -> tuple[tuple[int, ...], tuple[int, ...], Bodies]:
+        body, parents, links_of = list[int](), list[int](), list[list[int]]()
+        frames = np.zeros((len(self.links), 3, 4))
+        local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
+        moves, slides = np.zeros((self.dof, self.dof)), np.zeros((self.dof, 1))
+        axes = np.zeros((self.dof, 3))
+        for link, above in enumerate(self.parent):
+            frames[link] = np.column_stack([matrix_of(self.wxyz[link]), self.position[link]])
+            if link:
+                frames[link] = turned(frames[above], frames[link])
+            if self.joint_types[link] == "fixed":
+                body.append(body[above] if link else -1)
+                if body[-1] >= 0:
+                    links_of[body[-1]].append(link)
+                continue
+            joint, place, axis = len(parents), frames[link].copy(), self.axis[link]
+            x, y, z = axis
+            across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            local[0, joint], axes[joint] = place, axis
+            if self.joint_types[link] == "revolute":
+                local[1, joint, :, :3] = place[:, :3] @ across
+                local[2, joint, :, :3] = place[:, :3] @ across @ across
+            else:
+                local[3, joint, :, 3], slides[joint] = place[:, :3] @ axis, 1.0
+            parents.append(body[above])
+            moves[joint, joint] = 1.0
+            if parents[-1] >= 0:
+                moves[joint] += moves[parents[-1]]
+            body.append(joint)
+            links_of.append([link])
+            frames[link] = np.eye(3, 4)
+        mass, center, tensor = self._inertias(links_of, frames)
+        leaves = *local, axes, slides, mass, center, tensor, moves, frames, self.armature, self.gravity
+        for leaf in leaves:
+            leaf.setflags(write=False)
+        return tuple(body), tuple(parents), Bodies(*leaves)
+
+    def _inertias(self, links_of: list[list[int]], frames: Float64) -> tuple[Float64, Float64, Float64]:
+        """Return mass, center of mass and inertia tensor of the bodies, in their frames."""
+        masses, centers, tensors = np.zeros((self.dof, 1)), np.zeros((self.dof, 3)), np.zeros((self.dof, 3, 3))
+        for joint, links in enumerate(links_of):
+            turn, shift, mass = frames[links, :, :3], frames[links, :, 3], self.mass[links]
+            at = shift + (turn @ self.center[links][..., None])[..., 0]
+            masses[joint] = mass.sum()
+            centers[joint] = mass @ at / mass.sum() if mass.sum() else at[0]
+            d = at - centers[joint]
+            spread = (d * d).sum(1)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]
+            own = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
+            tensors[joint] = (own + mass[:, None, None] * spread).sum(0)
+        return masses, centers, tensors
+
+
+def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
+    """Return a copy of ``value`` as float64."""
+    table = np.array(read_array(name, value), np.float64)
+    if table.shape != shape:
+        problem = f"has shape {table.shape}, not {shape}"
+        raise InvalidArgumentError(name, problem, remedy="give one row for each link, or one entry for each joint")
+    return table

@@ -1,0 +1,252 @@
+r"""Operational-space control: the tool as decoupled unit masses on springs, pure functions on (envs, ...) arrays.
+
+With the tool's Jacobian J and pose, the mass matrix M and the bias h at present, the joints c of the chain to the tool
+and the other joints o, the setpoint's pose, twist V and acceleration V', and the gains kp, kd of the task and kp_n,
+kd_n of the posture::
+
+    e     = position and rotation vector from the pose to the setpoint, each shortened to its limit
+    a     = kp e + kd (V - J q') + V'                           acceleration of the task
+    A     = J M_cc^-1 J^T
+    L     = (S A S^T)^-1, bounded                               its inertia, in the selected axes S
+    F     = L (a - J' q') + wrench                              decoupling "full"; F = a + wrench with "none"
+    a_n   = kp_n (posture - q) - kd_n q'                        acceleration of the posture
+    task  = J^T F
+    null  = M_cc a_n - J^T L_n J a_n                            = N^T M_cc a_n, with J M_cc^-1 N^T = 0
+    u_c   = h + M_co a_o + s1 task + s2 null + feedforward      a_o = a_n of the other joints
+    u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
+
+The other joints, such as fingers, are controlled by computed torque: in the task they would move with the hand. L_n is
+the inertia over the axes of motion and force, with full decoupling. With "partial" the blocks of A between positions
+and rotations are left out of L. A bounded inverse turns an eigenvalue s into 1/s, or s/s0^2 below s0: near a
+singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the motion
+returns from it.
+
+Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with which all joints are
+within their limits, and s2 the largest share of the posture in the room that is left. A joint whose u is out of limits
+with neither is clipped, and left out of both.
+
+O. Khatib, "A unified approach for motion and force control of robot manipulators: the operational space formulation",
+IEEE Journal on Robotics and Automation 3 (1987).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from batchpid.arrays.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.frames import in_axes, matrix_of, pose_error
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
+from batchpid.task_space.symmetric import bounded_inverse, gram, product, quiet, whitened
+
+
+def init(params: OSCParams, qpos: Any) -> OSCState:
+    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m]."""
+    xp = namespace(*params, qpos)
+    return OSCState(posture=xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos)
+
+
+def reset(params: OSCParams, state: OSCState, qpos: Any, mask: Any) -> OSCState:
+    """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
+    xp = namespace(*state, qpos, mask)
+    return OSCState(posture=xp.where(xp.asarray(mask)[:, None], init(params, qpos).posture, state.posture))
+
+
+def step(
+    params: OSCParams,
+    state: OSCState,
+    tree: KinematicTree,
+    link: str,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    *,
+    point: Any = None,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+    terms: bool = False,
+) -> Any:
+    """Compute the efforts (envs, dof) [N m or N]; return ``(state, effort)``, with ``terms`` also :class:`OSCTerms`.
+
+    A row does not depend on the others, to the last bit under NumPy; NaN stays in its env.
+
+    Parameters
+    ----------
+    link, point
+        Tool: a point (3,) [m] of a link, default its origin.
+    setpoint
+        Poses (envs, 7): position [m] and quaternion (w, x, y, z) of any length, in the world.
+    qpos, qvel
+        (envs, dof) [rad or m, rad/s or m/s].
+    twist, acceleration
+        V and V' of the setpoint (envs, 6) [m/s, rad/s, ...], in the axes of the world; None: 0.
+    wrench
+        Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame; None: 0.
+    feedforward
+        Effort added (envs, dof), such as the effort of viscous damping; None: 0.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The link is unknown, or an array has a wrong shape.
+    """
+    setpoints = {
+        "setpoint": (setpoint, 7),
+        "twist": (twist, 6),
+        "acceleration": (acceleration, 6),
+        "wrench": (wrench, 6),
+    }
+    _check_shapes(params, setpoints | {"feedforward": (feedforward, tree.dof)}, qpos)
+    dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
+    return advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms=terms)
+
+
+def advance(
+    params: OSCParams,
+    state: OSCState,
+    dynamics: TaskDynamics,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+    *,
+    terms: bool = False,
+) -> Any:
+    """Compute the efforts with given dynamics, such as an engine's; otherwise as :func:`step`."""
+    with quiet():
+        return _advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms)
+
+
+def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: Any) -> None:
+    """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
+    envs = np.shape(qpos)[0]
+    for name, (value, size) in arrays.items():
+        if value is not None and np.shape(value) not in ((envs, size), (1, size)):
+            problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
+            raise InvalidArgumentError(name, problem, remedy="give one row for each env")
+    for name, leaf in params._asdict().items():
+        if hasattr(leaf, "shape") and leaf.shape[0] not in (1, envs):
+            problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
+            raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")
+
+
+def _advance(
+    k: OSCParams,
+    state: OSCState,
+    d: TaskDynamics,
+    setpoint: Any,
+    q: Any,
+    v: Any,
+    twist: Any,
+    acceleration: Any,
+    wrench: Any,
+    feedforward: Any,
+    terms: bool,
+) -> Any:
+    xp = namespace(*k, *state, *d, setpoint, q, v, twist, acceleration, wrench, feedforward)
+    error = pose_error(setpoint, d.pose)
+    if k.frame is not None:
+        turn = matrix_of(d.pose[..., 3:])
+        error, twist, acceleration = (
+            None if x is None else in_axes(turn, x[..., None])[..., 0] for x in (error, twist, acceleration)
+        )
+        d = in_tool_axes(d)
+    j, m = d.jacobian, d.mass_matrix
+    limits = (k.position_error_limit, k.rotation_error_limit)
+    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
+    rate = -product(j, v) if twist is None else twist - product(j, v)
+    a = k.stiffness * xp.concatenate(near, axis=-1) + k.damping * rate
+    a = a if acceleration is None else a + acceleration
+
+    chain, eye = d.chain, xp.eye(m.shape[-1], dtype=m.dtype)
+    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
+    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
+    task_inertia, null_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
+    f = product(task_inertia, a - d.jacobian_rate) if task_inertia is not None else _selected(k.axes, a)
+    f = f if wrench is None else f + wrench
+    task = gram(j, f[..., None])[..., 0]
+
+    a_n = k.posture_stiffness * (state.posture - q) - k.posture_damping * v
+    a_c, a_o = a_n * chain, a_n * (1 - chain)
+    null = product(m, a_c) - gram(j, product(null_inertia, product(j, a_c))[..., None])[..., 0]
+    null = null * chain
+    base = d.bias + product(m, a_o)
+    base = base if feedforward is None else base + feedforward
+
+    s1, s2 = _shares(base, task, null, k, xp)
+    driven = s1[..., None] * task + s2[..., None] * null
+    inverse_root = y[..., 6:]
+    a_c = chain * gram(inverse_root, product(inverse_root, driven)[..., None])[..., 0]
+    others = (1 - chain) * product(m, a_c)
+    effort = clip(base + driven + others, k.effort_min, k.effort_max, xp)
+    if not terms:
+        return state, effort
+    whole = base + task + null + others
+    return state, effort, OSCTerms(error, f, task, null, whole, effort.copy(), s1, s2, singular)
+
+
+def _inertias(k: OSCParams, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
+    """Return L, None with decoupling "none", and L_n of the mobility A (envs, 6, 6), and where either is bounded."""
+    s0 = k.smallest_eigenvalue[..., 0]
+    allowed = k.axes
+    if k.force_axes is not None and k.axes is not None:
+        allowed = xp.maximum(k.axes, k.force_axes)
+    null, near = _selected_inverse(mobility, allowed, s0, xp)
+    if isinstance(k.decoupling, NoDecoupling):
+        return None, null, near
+    partial = isinstance(k.decoupling, PartialDecoupling)
+    if allowed is k.axes and not partial:
+        return null, null, near
+    if partial:
+        half = xp.asarray([1.0] * 3 + [0.0] * 3, dtype=mobility.dtype)
+        mobility = mobility * (half[:, None] * half + (1 - half)[:, None] * (1 - half))
+    task, bounded = _selected_inverse(mobility, k.axes, s0, xp)
+    return task, null, near | bounded
+
+
+def _selected_inverse(mobility: Any, axes: Any, smallest: Any, xp: Any) -> tuple[Any, Any]:
+    """Return S^T (S A S^T)^-1 S, bounded, for the selected ``axes`` (1 | envs, 6), and where it is bounded."""
+    if axes is None:
+        return bounded_inverse(mobility, smallest)
+    both = axes[..., :, None] * axes[..., None, :] > 0
+    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
+    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
+    alone = free * xp.maximum(smallest, 1.0)[..., None, None]
+    inverse, near = bounded_inverse(xp.where(both, mobility, alone), smallest)
+    return xp.where(both, inverse, xp.zeros_like(inverse)), near
+
+
+def _selected(axes: Any, vector: Any) -> Any:
+    return vector if axes is None else axes * vector
+
+
+def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
+    """Return vectors (envs, 3), at most ``limit`` (1 | envs, 1) long."""
+    length = xp.sqrt((vector * vector).sum(-1, keepdims=True))
+    long = length > limit
+    return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
+
+
+def _shares(base: Any, task: Any, null: Any, k: OSCParams, xp: Any) -> tuple[Any, Any]:
+    """Return s1 and s2 (envs,)."""
+    low = -xp.inf if k.effort_min is None else k.effort_min
+    high = xp.inf if k.effort_max is None else k.effort_max
+    able = (base >= low) & (base <= high)
+
+    def share(effort: Any, at: Any) -> Any:
+        room = xp.maximum(xp.where(effort > 0, high - at, at - low), 0.0)
+        size = xp.abs(effort)
+        limited = able & (size > room)
+        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1)
+
+    s1 = share(task, base)
+    return s1, share(null, base + s1[..., None] * task)

@@ -1,0 +1,211 @@
+"""Parameters of operational-space control: build, broadcast, validate."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.arrays.choices import Choice
+from batchpid.arrays.display import array_summary
+from batchpid.checks.keywords import known_keywords
+from batchpid.checks.validate import array, choice, entries, instance, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.tree_dynamics import check_masses
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Names of the axes of a task."""
+
+
+class PartialDecoupling(Choice):
+    """The inertias of positions and of rotations, without the coupling between the two."""
+
+
+class NoDecoupling(Choice):
+    """Gains are forces and moments: stiffness in N/m and N m/rad."""
+
+
+class ToolFrame(Choice):
+    """Gains, selected axes and wrenches are in the axes of the tool."""
+
+
+TASK_CHOICES: dict[str, dict[str, Any]] = {
+    "decoupling": {"full": None, "partial": PartialDecoupling(), "none": NoDecoupling()},
+    "frame": {"world": None, "tool": ToolFrame()},
+}
+"""Options chosen by name, and the entries of the params; the first is the default."""
+
+
+class OSCParams(NamedTuple):
+    """Parameters of operational-space control, for one tool of one kind of robot. Build it with
+    :func:`make_osc_params`.
+
+    Every leaf is a float64 array of one row or one per env; None is off.
+    """
+
+    stiffness: Any
+    """kp (1 | envs, 6) [1/s^2]; with decoupling "none" [N/m, N m/rad]."""
+    damping: Any
+    """kd (1 | envs, 6) [1/s]; with decoupling "none" [N s/m, N m s/rad]."""
+    posture_stiffness: Any
+    """(1 | envs, dof) [1/s^2]."""
+    posture_damping: Any
+    """(1 | envs, dof) [1/s]."""
+    position_error_limit: Any
+    """(1 | envs, 1) [m]."""
+    rotation_error_limit: Any
+    """(1 | envs, 1) [rad]."""
+    smallest_eigenvalue: Any
+    """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
+    axes: Any = None
+    """1.0 for the axes whose motion is controlled (1 | envs, 6); None for all."""
+    force_axes: Any = None
+    """1.0 for further axes that the posture must not act on (1 | envs, 6)."""
+    effort_min: Any = None
+    """(1 | envs, dof) [N m or N]."""
+    effort_max: Any = None
+    decoupling: Any = None
+    """None for "full", or a choice without fields."""
+    frame: Any = None
+    """None for "world", or a choice without fields."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "axes")
+
+
+@known_keywords
+def make_osc_params(
+    tree: KinematicTree,
+    *,
+    stiffness: ArrayLike = 150.0,
+    damping_ratio: ArrayLike = 1.0,
+    damping: ArrayLike | None = None,
+    axes: ArrayLike | None = None,
+    force_axes: ArrayLike | None = None,
+    posture_stiffness: ArrayLike = 10.0,
+    posture_damping_ratio: ArrayLike = 1.0,
+    position_error_limit: ArrayLike = 0.1,
+    rotation_error_limit: ArrayLike = 0.5,
+    smallest_eigenvalue: ArrayLike = 0.02,
+    effort_limit: ArrayLike | None = None,
+    effort_min: ArrayLike | None = None,
+    effort_max: ArrayLike | None = None,
+    decoupling: str = "full",
+    frame: str = "world",
+) -> OSCParams:
+    """Build validated :class:`OSCParams` for a tool of ``tree``.
+
+    A number may be a scalar, one per axis (6,) or joint (dof,), or one per env as well, (envs, 6) or (envs, dof).
+
+    Parameters
+    ----------
+    stiffness, damping_ratio, damping
+        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry, rz. With decoupling
+        "none" they are forces and moments, and ``damping`` is required.
+    axes
+        Bools: the axes whose motion is controlled; the posture moves the others. None: all.
+    force_axes
+        Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not act.
+    posture_stiffness, posture_damping_ratio
+        Gains of the joints towards their posture: within the null space of the task for the joints of the chain to the
+        tool, fully for others, such as fingers [1/s^2].
+    position_error_limit, rotation_error_limit
+        Largest norm of the error that enters the law [m, rad]; inf for none.
+    smallest_eigenvalue
+        s0 > 0 of the bounded inverse (:func:`batchpid.task_space.symmetric.bounded_inverse`): below it, directions near
+        a singularity lose stiffness [1/kg, 1/(kg m^2)].
+    effort_limit, effort_min, effort_max
+        Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
+    decoupling
+        "full": accelerations of all axes are independent; "partial": positions and rotations are decoupled within
+        themselves only, as in robosuite by default; "none": gains are forces.
+    frame
+        "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Naming the option, axis or joint, env and value.
+    """
+    check_masses(instance("tree", tree, KinematicTree, "pass robot.kinematic_tree()"))
+    joints = tree.joint_names
+    kp = _rows("stiffness", stiffness, AXES)
+    if choice("decoupling", decoupling, TASK_CHOICES["decoupling"]) == "none" and damping is None:
+        problem = "is missing: with decoupling 'none' no mass relates it to the stiffness"
+        raise InvalidArgumentError("damping", problem, remedy="give forces per velocity [N s/m, N m s/rad]")
+    kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
+    posture = _rows("posture_stiffness", posture_stiffness, joints)
+    motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
+    if force is not None:
+        both = force * (np.ones((1, 6)) if motion is None else motion)
+        entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
+    if effort_limit is not None:
+        if effort_min is not None or effort_max is not None:
+            problem = "is given together with effort_min or effort_max"
+            raise InvalidArgumentError("effort_limit", problem, remedy="give the symmetric limit, or the two ends")
+        effort_max = _rows("effort_limit", effort_limit, joints, infinite=True)
+        effort_min = -effort_max
+    low, high = (
+        None if end is None else _rows(name, end, joints, -math.inf, infinite=True)
+        for name, end in (("effort_min", effort_min), ("effort_max", effort_max))
+    )
+    if low is not None and high is not None:
+        ends = np.broadcast_arrays(low, high)
+        entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
+    above = {"above": True, "infinite": True}
+    params = OSCParams(
+        stiffness=kp,
+        damping=kd if damping is None else _rows("damping", damping, AXES),
+        posture_stiffness=posture,
+        posture_damping=2 * _rows("posture_damping_ratio", posture_damping_ratio, joints) * np.sqrt(posture),
+        position_error_limit=_rows("position_error_limit", position_error_limit, ("norm",), **above),
+        rotation_error_limit=_rows("rotation_error_limit", rotation_error_limit, ("norm",), **above),
+        smallest_eigenvalue=_rows("smallest_eigenvalue", smallest_eigenvalue, ("s0",), above=True),
+        axes=motion,
+        force_axes=force,
+        effort_min=low,
+        effort_max=high,
+        decoupling=TASK_CHOICES["decoupling"][decoupling],
+        frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
+    )
+    _check_rows(params)
+    return params
+
+
+def _rows(
+    name: str,
+    value: ArrayLike,
+    columns: tuple[str, ...],
+    low: float = 0.0,
+    *,
+    above: bool = False,
+    infinite: bool = False,
+) -> NDArray[np.float64]:
+    """Return ``value`` as read-only rows (1 | envs, columns), each entry >= ``low``, or > it."""
+    given = read_array(name, value)
+    shape = (len(given) if given.ndim == 2 else 1, len(columns))
+    if len(columns) == 1 and given.ndim == 1:  # one number per env
+        given = given[:, None]
+        shape = given.shape
+    rows = array(name, given, shape, columns, finite=False, kind="entry").copy()
+    good = ((rows > low) if above else (rows >= low)) & (infinite | np.isfinite(rows))
+    entries(name, rows, good, f"must be {'>' if above else '>='} {low:g}{'' if infinite else ' and finite'}", columns)
+    rows.setflags(write=False)
+    return rows
+
+
+def _mask(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:
+    """Return a mask of axes as read-only rows of 1.0 and 0.0; None where it is left out."""
+    return None if value is None else _rows(name, read_array(name, value, "b").astype(float), AXES)
+
+
+def _check_rows(params: OSCParams) -> None:
+    """Raise InvalidArgumentError if options have rows for different numbers of envs."""
+    most = max((leaf.shape[0], name) for name, leaf in params._asdict().items() if isinstance(leaf, np.ndarray))
+    for name, leaf in params._asdict().items():
+        if isinstance(leaf, np.ndarray) and leaf.shape[0] not in (1, most[0]):
+            problem = f"has rows for {leaf.shape[0]} envs, but {most[1]} for {most[0]}"
+            raise InvalidArgumentError(name, problem, remedy="give one row, or one for each env")

@@ -1,0 +1,105 @@
+"""Inputs, state and terms of operational-space control."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+from batchpid.task_space.frames import in_axes, matrix_of, pose_of
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.symmetric import quiet
+from batchpid.task_space.tree_dynamics import effort_of, mass_matrix_of
+from batchpid.task_space.tree_kinematics import (
+    jacobian_at,
+    motions_of,
+    prepared,
+    rate_at,
+    tool_frame,
+    velocities_of,
+)
+
+
+class TaskDynamics(NamedTuple):
+    """Dynamics of a robot and its tool at present positions and velocities, from :func:`task_dynamics` or an engine."""
+
+    pose: Any
+    """Of the tool (envs, 7): position [m] and quaternion (w, x, y, z)."""
+    jacobian: Any
+    """J of the tool (envs, 6, dof), in the axes of the world."""
+    jacobian_rate: Any
+    """J' q' (envs, 6)."""
+    mass_matrix: Any
+    """M (envs, dof, dof) [kg m^2 or kg]."""
+    bias: Any
+    """h (envs, dof): gravity, Coriolis and centrifugal forces [N m or N]."""
+    chain: Any
+    """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
+
+
+class OSCState(NamedTuple):
+    """State of the law, arrays (envs, dof)."""
+
+    posture: Any
+    """Positions that the joints are drawn to, by the posture gains [rad or m]."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+class OSCTerms(NamedTuple):
+    """Terms of one step."""
+
+    error: Any
+    """Error of the pose (envs, 6) [m, rad], in the axes of the params' frame, before its norms are limited."""
+    wrench: Any
+    """Wrench F of the task (envs, 6) [N, N m], in these axes, before saturation."""
+    task: Any
+    """Efforts of F, J^T F (envs, dof)."""
+    posture: Any
+    """Efforts of the posture, before saturation (envs, dof)."""
+    unsaturated: Any
+    """Sum of all efforts (envs, dof) [N m or N]."""
+    effort: Any
+    """Efforts after saturation (envs, dof)."""
+    task_share: Any
+    """s1 (envs,): share of F that the limits allow."""
+    posture_share: Any
+    """s2 (envs,): share of the posture's efforts."""
+    near_singular: Any
+    """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True for NaN."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "joints")
+
+
+def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None) -> TaskDynamics:
+    """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
+
+    ``qpos`` and ``qvel`` are (envs, dof).
+
+    Raises
+    ------
+    InvalidArgumentError
+        The link is unknown, or a shape is wrong.
+    """
+    index = tree.index(link)
+    (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    with quiet():
+        motions = motions_of(tree, bodies, q, xp)
+        velocities = velocities_of(tree, motions, v, xp)
+        tool = tool_frame(tree, bodies, motions.frames, index, point)
+        return TaskDynamics(
+            pose=pose_of(tool),
+            jacobian=jacobian_at(tree, bodies, motions, index, tool[..., 3]),
+            jacobian_rate=rate_at(tree, velocities, index, tool[..., 3]),
+            mass_matrix=mass_matrix_of(tree, bodies, motions, xp),
+            bias=effort_of(tree, bodies, motions, velocities, xp),
+            chain=xp.asarray(tree.chain(link), dtype=q.dtype),
+        )
+
+
+def in_tool_axes(dynamics: TaskDynamics) -> TaskDynamics:
+    """Return ``dynamics`` with J and J' q' in the axes of the tool."""
+    turn = matrix_of(dynamics.pose[..., 3:])
+    rate = in_axes(turn, dynamics.jacobian_rate[..., None])[..., 0]
+    return dynamics._replace(jacobian=in_axes(turn, dynamics.jacobian), jacobian_rate=rate)

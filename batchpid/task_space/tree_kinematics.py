@@ -1,0 +1,218 @@
+r"""Poses, Jacobians and velocity products of a kinematic tree.
+
+With the axis a_j and the place o_j of joint j in the world, a point p of a link that joint j moves has the velocity::
+
+    (v, w) = J q'      J_j = (a_j x (p - o_j), a_j), or (a_j, 0) for a prismatic joint; 0 for a joint that moves it not
+    (v', w') = J q'' + J' q'
+
+J' q' is the acceleration at q'' = 0. With the velocity (v_o, w) and the acceleration (A_o, A_w) of a body, as fields
+about the origin, accumulated from the base to the tips with the motions s_j of the joints::
+
+    V_j = V_above + s_j q'_j        A_j = A_above + V_j x s_j q'_j
+    J' q' = (A_o + A_w x p + w x (v_o + w x p), A_w)
+
+R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), sections 2.11 and 5.3. Twists and Jacobians are
+(linear, angular). Arrays have any leading axes; an env's result does not depend on the others, to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.arrays.elementwise import namespace
+from batchpid.checks.validate import choice, is_traced, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.frames import cross, in_axes, pose_of, rotate, turned
+from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
+from batchpid.task_space.symmetric import quiet
+
+FRAMES = ("world", "tool")
+"""Axes of Jacobians and accelerations: the axes of the world or of the link."""
+
+
+class Motions(NamedTuple):
+    """Frames of the bodies and motions of the joints at some positions, in the world."""
+
+    frames: Any
+    """(..., dof, 3, 4)."""
+    linear: Any
+    """Velocity of the point of the body at the origin, per rate of its joint (..., dof, 3)."""
+    angular: Any
+    """Angular velocity per rate of the joint (..., dof, 3)."""
+
+
+class Velocities(NamedTuple):
+    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin (..., dof, 3)."""
+
+    linear: Any
+    angular: Any
+    linear_rate: Any
+    angular_rate: Any
+
+
+def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None) -> Any:
+    """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
+
+    Raises
+    ------
+    InvalidArgumentError
+        A link is unknown, or the shape is wrong.
+    """
+    chosen = tree.links if links is None else tuple(links)
+    if isinstance(links, str):
+        raise InvalidArgumentError("links", "must be a list of names", value=links, remedy=f"pass [{links!r}]")
+    indices = [tree.index(link) for link in chosen]
+    (q,), bodies, xp = prepared(tree, qpos=qpos)
+    frames = frames_of_bodies(tree, bodies, q, xp)
+    with quiet():
+        return xp.stack([pose_of(frame_of_link(tree, bodies, frames, index)) for index in indices], axis=-2)
+
+
+def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
+    """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
+
+    Parameters
+    ----------
+    point
+        Point in the link's frame, (3,) or (..., 3) [m]; default its origin.
+    frame
+        Axes of the twist: "world" or "tool", the axes of the link.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The link or the frame is unknown, or a shape is wrong.
+    """
+    index, _ = tree.index(link), choice("frame", frame, FRAMES)
+    (q,), bodies, xp = prepared(tree, qpos=qpos)
+    with quiet():
+        motions = motions_of(tree, bodies, q, xp)
+        tool = tool_frame(tree, bodies, motions.frames, index, point)
+        matrix = jacobian_at(tree, bodies, motions, index, tool[..., 3])
+        return matrix if frame == "world" else in_axes(tool[..., :3], matrix)
+
+
+def jacobian_rate(
+    tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, frame: str = "world"
+) -> Any:
+    """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by velocities alone.
+
+    ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
+    arguments and errors as in :func:`jacobian`.
+    """
+    index, _ = tree.index(link), choice("frame", frame, FRAMES)
+    (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    with quiet():
+        motions = motions_of(tree, bodies, q, xp)
+        tool = tool_frame(tree, bodies, motions.frames, index, point)
+        rate = rate_at(tree, velocities_of(tree, motions, v, xp), index, tool[..., 3])
+        return rate if frame == "world" else in_axes(tool[..., :3], rate[..., None])[..., 0]
+
+
+def prepared(tree: KinematicTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
+    """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their namespace."""
+    xp = namespace(*arrays.values())
+    checked, shape = [], None
+    for name, value in arrays.items():
+        array = value if xp is not np or is_traced(value) else read_array(name, value).astype(np.float64, copy=False)
+        if array.ndim < 1 or array.shape[-1] != tree.dof:
+            remedy = f"the last axis counts the joints {', '.join(tree.joint_names)}"
+            raise InvalidArgumentError(name, f"has shape {array.shape}, not (..., {tree.dof})", remedy=remedy)
+        if shape is not None and array.shape != shape:
+            remedy = "give both for the same envs"
+            raise InvalidArgumentError(name, f"has shape {array.shape}, but the first has {shape}", remedy=remedy)
+        shape = array.shape
+        checked.append(array)
+    if xp is np:
+        return checked, tree.bodies, xp
+    dtype = xp.result_type(*checked)
+    return [a.astype(dtype) for a in checked], Bodies(*(xp.asarray(leaf, dtype) for leaf in tree.bodies)), xp
+
+
+def frames_of_bodies(tree: KinematicTree, bodies: Bodies, qpos: Any, xp: Any) -> Any:
+    """Return the frames (..., dof, 3, 4) of the bodies in the world."""
+    with quiet():
+        q = qpos[..., None, None]
+        local = bodies.at_zero + xp.sin(q) * bodies.sine + (1 - xp.cos(q)) * bodies.cosine + q * bodies.slide
+        frames: list[Any] = []
+        for joint, above in enumerate(tree.body_parents):
+            own = local[..., joint, :, :]
+            frames.append(own if above < 0 else turned(frames[above], own))
+        return xp.stack(frames, axis=-3)
+
+
+def motions_of(tree: KinematicTree, bodies: Bodies, qpos: Any, xp: Any) -> Motions:
+    """Return the frames of the bodies and the motions of the joints."""
+    frames = frames_of_bodies(tree, bodies, qpos, xp)
+    axis = rotate(frames[..., :3], bodies.axis)
+    turning = axis * (1 - bodies.slides)
+    return Motions(frames, cross(frames[..., 3], turning) + axis * bodies.slides, turning)
+
+
+def velocities_of(tree: KinematicTree, motions: Motions, qvel: Any, xp: Any) -> Velocities:
+    """Return the velocities of the bodies, and their accelerations at q'' = 0."""
+    linear, angular = motions.linear * qvel[..., None], motions.angular * qvel[..., None]
+    v, w = from_base(tree, linear, xp), from_base(tree, angular, xp)
+    return Velocities(
+        v, w, from_base(tree, cross(w, linear) + cross(v, angular), xp), from_base(tree, cross(w, angular), xp)
+    )
+
+
+def from_base(tree: KinematicTree, steps: Any, xp: Any) -> Any:
+    """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
+    sums: list[Any] = []
+    for joint, above in enumerate(tree.body_parents):
+        sums.append(steps[..., joint, :] if above < 0 else sums[above] + steps[..., joint, :])
+    return xp.stack(sums, axis=-2)
+
+
+def from_tips(tree: KinematicTree, parts: Any, xp: Any) -> Any:
+    """Return the sums of ``parts`` (..., dof, k) over the bodies that each joint moves."""
+    sums = [parts[..., joint, :] for joint in range(tree.dof)]
+    for joint, above in reversed(list(enumerate(tree.body_parents))):
+        if above >= 0:
+            sums[above] = sums[above] + sums[joint]
+    return xp.stack(sums, axis=-2)
+
+
+def frame_of_link(tree: KinematicTree, bodies: Bodies, frames: Any, index: int) -> Any:
+    """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
+    body, own = tree.link_bodies[index], bodies.link_frames[index]
+    if body >= 0:
+        return turned(frames[..., body, :, :], own)
+    return own + namespace(frames).zeros_like(frames[..., 0, :, :])
+
+
+def tool_frame(tree: KinematicTree, bodies: Bodies, frames: Any, index: int, point: Any) -> Any:
+    """Return the frame (..., 3, 4) of a link with its origin at ``point`` (..., 3) of the link."""
+    frame = frame_of_link(tree, bodies, frames, index)
+    if point is None:
+        return frame
+    xp = namespace(frame, point)
+    at = read_array("point", point).astype(np.float64, copy=False) if xp is np else xp.asarray(point, frame.dtype)
+    if at.shape not in ((3,), (*frame.shape[:-2], 3)):
+        problem = f"has shape {at.shape}, not (3,) or {(*frame.shape[:-2], 3)}"
+        raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
+    place = rotate(frame[..., :3], at + xp.zeros_like(frame[..., 3])) + frame[..., 3]
+    return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
+
+
+def jacobian_at(tree: KinematicTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:
+    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world."""
+    xp, body = namespace(place), tree.link_bodies[index]
+    linear = motions.linear + cross(motions.angular, place[..., None, :])
+    columns = xp.concatenate([linear, motions.angular], axis=-1)
+    moved = bodies.moves[body][:, None] > 0 if body >= 0 else xp.asarray(False)
+    return xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2)
+
+
+def rate_at(tree: KinematicTree, velocities: Velocities, index: int, place: Any) -> Any:
+    """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
+    xp, body = namespace(place), tree.link_bodies[index]
+    if body < 0:
+        return xp.concatenate([xp.zeros_like(place)] * 2, axis=-1)
+    v, w, linear, angular = (leaf[..., body, :] for leaf in velocities)
+    return xp.concatenate([linear + cross(angular, place) + cross(w, v + cross(w, place)), angular], axis=-1)

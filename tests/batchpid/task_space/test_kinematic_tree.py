@@ -1,0 +1,230 @@
+"""Kinematic trees: against MuJoCo, against differences of their own, and the errors of their arguments."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from quick_jit import quick_jit
+from trees import NAMES, planar, robot_of, states, tool_of, tree_of
+
+import batchpid.task_space as ts
+from batchpid.errors import InvalidArgumentError, RobotError
+from batchpid.sim import Robot
+from batchpid.task_space import frames
+
+POINT = np.array([0.1, -0.2, 0.3])
+
+
+@pytest.fixture(params=NAMES, ids=str)
+def case(request):
+    return tree_of(request.param), tool_of(request.param), robot_of(request.param)
+
+
+def relative(found, wanted):
+    return np.abs(found - wanted).max() / max(np.abs(wanted).max(), 1e-9)
+
+
+def test_mujoco_computes_the_same(case):
+    mujoco = pytest.importorskip("mujoco")
+    tree, tool, robot = case
+    spec = mujoco.MjSpec.from_string(robot.urdf)
+    spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
+    model = spec.compile()
+    data, columns = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in tree.joint_names]
+    body, dof = model.body(tool).id, tree.dof
+    qpos, qvel = states(tree, 100)
+    found = (
+        ts.jacobian(tree, qpos, tool, point=POINT),
+        ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT),
+        ts.mass_matrix(tree, qpos),
+        ts.bias(tree, qpos, qvel),
+        ts.link_poses(tree, qpos, [tool])[:, 0],
+    )
+    for row, (q, v) in enumerate(zip(qpos, qvel, strict=True)):
+        data.qpos[columns], data.qvel[columns] = q, v
+        mujoco.mj_forward(model, data)
+        mass, (jp, jr, rate_p, rate_r) = np.zeros((dof, dof)), np.zeros((4, 3, dof))
+        mujoco.mj_fullM(model, data, mass)
+        place = data.xpos[body] + data.xmat[body].reshape(3, 3) @ POINT
+        mujoco.mj_jac(model, data, jp, jr, place, body)
+        mujoco.mj_jacDot(model, data, rate_p, rate_r, place, body)
+        pose = np.hstack([data.xpos[body], data.xquat[body] * np.copysign(1, data.xquat[body][0])])
+        wanted = (
+            np.vstack([jp, jr])[:, columns],
+            np.vstack([rate_p, rate_r])[:, columns] @ v,
+            mass[np.ix_(columns, columns)],
+            data.qfrc_bias[columns],
+            pose,
+        )
+        for ours, theirs in zip(found, wanted, strict=True):
+            assert relative(ours[row], theirs) < 1e-12
+
+
+def test_jacobian_and_its_rate_are_derivatives(case):
+    tree, tool, _ = case
+    qpos, qvel = states(tree, 10)
+    step = 1e-5
+
+    def moved(sign):
+        return ts.jacobian(tree, qpos + sign * step * qvel, tool, point=POINT)
+
+    def place(sign):
+        pose = ts.link_poses(tree, qpos + sign * step * qvel, [tool])[:, 0]
+        turn = frames.matrix_of(pose[:, 3:])
+        return np.concatenate([turn, (pose[:, :3] + frames.rotate(turn, POINT))[..., None]], axis=-1)
+
+    velocity = (ts.jacobian(tree, qpos, tool, point=POINT) * qvel[:, None]).sum(-1)
+    rate = ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT)
+    np.testing.assert_allclose(rate, ((moved(1) - moved(-1)) / (2 * step) * qvel[:, None]).sum(-1), atol=1e-7)
+    between = frames.pose_error(frames.pose_of(place(1)), frames.pose_of(place(-1))) / (2 * step)
+    np.testing.assert_allclose(velocity, between, atol=1e-7)
+    turn = frames.matrix_of(ts.link_poses(tree, qpos, [tool])[:, 0, 3:])
+    for world, in_tool in (
+        (velocity, (ts.jacobian(tree, qpos, tool, point=POINT, frame="tool") * qvel[:, None]).sum(-1)),
+        (rate, ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT, frame="tool")),
+    ):
+        np.testing.assert_allclose(frames.rotate(turn, in_tool[:, :3]), world[:, :3], atol=1e-12)
+        np.testing.assert_allclose(frames.rotate(turn, in_tool[:, 3:]), world[:, 3:], atol=1e-12)
+
+
+def test_efforts_are_those_of_the_energies(case):
+    """Lagrange: d/dt (M q') - dT/dq + dU/dq = h at q'' = 0, with T = q' M q' / 2 and U the work against gravity."""
+    tree, _, _ = case
+    qpos, qvel = states(tree, 5)
+    step = 1e-5
+    nudges = step * np.eye(tree.dof)
+
+    def kinetic(q):
+        return (qvel[:, None] * ts.mass_matrix(tree, q) * qvel[:, :, None]).sum((1, 2)) / 2
+
+    rate = (ts.mass_matrix(tree, qpos + step * qvel) - ts.mass_matrix(tree, qpos - step * qvel)) / (2 * step)
+    slope = np.stack([(kinetic(qpos + n) - kinetic(qpos - n)) / (2 * step) for n in nudges], axis=-1)
+    coriolis = ts.bias(tree, qpos, qvel) - ts.gravity(tree, qpos)
+    wanted = (rate * qvel[:, None]).sum(-1) - slope
+    np.testing.assert_allclose(coriolis, wanted, atol=1e-8 * np.abs(wanted).max())
+    centers = [ts.link_poses(tree, qpos + sign * n) for n in nudges for sign in (1, -1)]
+    place = [frames.rotate(frames.matrix_of(p[..., 3:]), tree.center) + p[..., :3] for p in centers]
+    energy = np.stack([-(p @ tree.gravity * tree.mass).sum(-1) for p in place], axis=-1)
+    np.testing.assert_allclose(ts.gravity(tree, qpos), (energy[:, ::2] - energy[:, 1::2]) / (2 * step), atol=1e-6)
+
+
+def test_inverse_and_forward_dynamics_undo_each_other(case):
+    tree, _, _ = case
+    tree = dataclasses.replace(tree, armature=np.linspace(0.1, 0.3, tree.dof))
+    qpos, qvel = states(tree, 20)
+    effort = np.random.default_rng(1).normal(size=qpos.shape)
+    acceleration = ts.forward_dynamics(tree, qpos, qvel, effort)
+    back = ts.inverse_dynamics(tree, qpos, qvel, acceleration)
+    np.testing.assert_allclose(back, effort, atol=1e-11 * np.abs(ts.bias(tree, qpos, qvel)).max())
+    matrix = ts.mass_matrix(tree, qpos)
+    np.testing.assert_allclose(back, (matrix * acceleration[:, None]).sum(-1) + ts.bias(tree, qpos, qvel), atol=1e-10)
+
+
+def functions(tree, tool):
+    return (
+        lambda q, v: ts.link_poses(tree, q),
+        lambda q, v: ts.jacobian(tree, q, tool, frame="tool"),
+        lambda q, v: ts.jacobian_rate(tree, q, v, tool),
+        lambda q, v: ts.mass_matrix(tree, q),
+        lambda q, v: ts.bias(tree, q, v),
+        lambda q, v: ts.inverse_dynamics(tree, q, v, v),
+        lambda q, v: ts.forward_dynamics(tree, q, v, v),
+    )
+
+
+def test_a_row_does_not_depend_on_the_others_to_the_last_bit(case):
+    tree, tool, _ = case
+    qpos, qvel = states(tree, 37)
+    qpos[3], qvel[5], qpos[7] = np.nan, np.inf, np.inf
+    for function in functions(tree, tool):
+        whole = function(qpos, qvel)
+        for rows in (slice(4, 5), slice(6, 7), slice(8, 30), slice(36, 37)):
+            np.testing.assert_array_equal(function(qpos[rows], qvel[rows]), whole[rows])
+        np.testing.assert_array_equal(function(qpos[10], qvel[10]), whole[10])
+        grid = function(qpos[8:32].reshape(4, 6, -1), qvel[8:32].reshape(4, 6, -1))
+        np.testing.assert_array_equal(grid.reshape(24, *grid.shape[2:]), whole[8:32])
+
+
+def test_jax_computes_the_same(x64):
+    tree = planar()  # small: XLA takes seconds for a panda
+    inputs = states(tree, 3)
+
+    def all_of_them(qpos, qvel):
+        return [function(qpos, qvel) for function in functions(tree, "tip")]
+
+    with jax.numpy_rank_promotion("allow"):
+        found = quick_jit(all_of_them)(*map(jax.numpy.asarray, inputs))
+    for ours, wanted in zip(found, all_of_them(*inputs), strict=True):
+        np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_merged_links_are_known_by_name():
+    robot = robot_of(0)
+    assert robot.merge_fixed
+    tree = tree_of(0)
+    assert set(tree.links) == {link.name for link in robot.links}
+    moving = {joint.child_link for joint in robot.joints}
+    fixed = next(link for link in tree.links[1:] if link not in moving)
+    assert ts.link_poses(tree, robot.start, [fixed]).shape == (1, 7)
+
+
+def test_the_dynamics_are_those_of_the_engine():
+    robot, tree = robot_of("panda"), tree_of("panda")
+    qpos, qvel = states(tree, 5)
+    wanted = robot.dynamics().inverse_dynamics(qpos, qvel, 0 * qpos)
+    np.testing.assert_allclose(ts.bias(tree, qpos, qvel), wanted, atol=2e-4)  # SAPIEN rounds masses to float32
+    np.testing.assert_allclose(ts.mass_matrix(tree, qpos), robot.mass_matrix(qpos), atol=1e-5)
+
+
+def test_errors_name_the_argument_and_the_remedy():
+    tree, tool = tree_of("panda"), "panda_hand"
+    q = np.zeros((2, 9))
+    with pytest.raises(InvalidArgumentError, match=r"link: unknown link .*did you mean 'panda_hand'"):
+        ts.jacobian(tree, q, "pandahand")
+    with pytest.raises(InvalidArgumentError, match="qpos: has shape"):
+        ts.mass_matrix(tree, q[:, :7])
+    with pytest.raises(InvalidArgumentError, match="qvel: has shape"):
+        ts.bias(tree, q, q[:1])
+    with pytest.raises(InvalidArgumentError, match="frame"):
+        ts.jacobian(tree, q, tool, frame="body")
+    with pytest.raises(InvalidArgumentError, match="point: has shape"):
+        ts.jacobian(tree, q, tool, point=[0.1])
+    with pytest.raises(InvalidArgumentError, match="links"):
+        ts.link_poses(tree, q, tool)
+    for change, message in (
+        ({"parent": [-1, 0, 2, 2]}, "entry 'link2'.*does not come before"),
+        ({"mass": [0, 1, -1, 0]}, "mass, joint 'link2'"),
+        ({"wxyz": np.ones((4, 4))}, "unit quaternion"),
+        ({"axis": np.zeros((4, 3))}, "no direction"),
+        ({"joint_names": ("a",)}, "has 1 names, needs 2"),
+        ({"joint_types": ("revolute",) * 4}, "for the base"),
+        ({"center": np.full((4, 3), np.nan)}, "center.*not finite"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            dataclasses.replace(planar(), **change)
+    massless = dataclasses.replace(planar(), mass=[0, 1, 0, 0], inertia=np.zeros((4, 3, 3)))
+    with pytest.raises(InvalidArgumentError, match=r"joint 'joint2'.*moves no mass"):
+        ts.forward_dynamics(massless, np.zeros(2), np.zeros(2), np.zeros(2))
+
+
+def test_a_robot_whose_masses_only_the_engine_knows_is_refused(tmp_path):
+    from tiny_urdf import joint, link, robot, write
+
+    box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
+    text = robot(link("base"), link("arm", box), joint("hinge", "base", "arm"))
+    with pytest.raises(RobotError, match="link 'arm' has no <inertial>"):
+        Robot.load(write(tmp_path, text)).kinematic_tree()
+    with pytest.raises(RobotError, match="fixed_base=True"):
+        Robot.load("panda", fixed_base=False).kinematic_tree()
+    with pytest.raises(InvalidArgumentError, match="did you mean 'gravity'"):
+        robot_of("panda").kinematic_tree(gravty=0)
+
+
+def test_it_does_not_change():
+    tree = planar()
+    with pytest.raises(ValueError, match="read-only"):
+        tree.mass[0] = 1.0
+    assert "2 joints" in repr(tree)

@@ -1,0 +1,315 @@
+"""Operational-space control: the accelerations it asks for, closed loops, singular poses, saturation."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from quick_jit import quick_jit
+from trees import planar, states, tree_of
+
+import batchpid.task_space as ts
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space import frames
+
+DT = 1 / 2000
+START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
+HAND = "panda_hand"
+
+
+def accelerations(d, effort):
+    """Return q'' = M^-1 (u - h), and the acceleration of the tool."""
+    qacc = np.linalg.solve(d.mass_matrix, (effort - d.bias)[..., None])[..., 0]
+    return qacc, (d.jacobian * qacc[:, None]).sum(-1) + d.jacobian_rate
+
+
+def moved_by(d, chain, effort):
+    """Return the acceleration J M_cc^-1 u of the tool by efforts of the chain, where the other joints are held."""
+    mass = d.mass_matrix[:, chain][:, :, chain]
+    return (d.jacobian[..., chain] @ np.linalg.solve(mass, effort[:, chain, None]))[..., 0]
+
+
+def goals(tree, link, seed=3):
+    """Return poses of the tool at other random states than :func:`states` gives."""
+    return lambda rows: ts.link_poses(tree, states(tree, rows, seed)[0], [link])[:, 0]
+
+
+@pytest.mark.parametrize(("name", "link"), [("panda", HAND), ("jaco2", "j2s7s300_link_7")])
+@pytest.mark.parametrize("frame", ["world", "tool"])
+def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
+    tree, rows = tree_of(name), 20
+    qpos, qvel = states(tree, rows)
+    rng = np.random.default_rng(1)
+    goal, twist, acceleration = goals(tree, link)(rows), *rng.normal(size=(2, rows, 6))
+    stiffness, damping, limit = rng.uniform(50, 200, (rows, 6)), rng.uniform(10, 20, (rows, 6)), 1e-6
+    options = {"stiffness": stiffness, "damping": damping, "smallest_eigenvalue": limit, "frame": frame}
+    params = ts.make_osc_params(tree, posture_stiffness=30.0, **options)
+    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
+    d = ts.task_dynamics(tree, qpos, qvel, link)
+    inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5), "terms": True}
+    _, effort, terms = ts.advance(params, state, d, goal, qpos, qvel, **inputs)
+    qacc, tool = accelerations(d, effort - 0.5)
+    error = frames.pose_error(goal, d.pose)
+    for part, most in ((error[:, :3], 0.1), (error[:, 3:], 0.5)):
+        part *= np.minimum(1, most / np.linalg.norm(part, axis=1, keepdims=True))
+    rate = twist - (d.jacobian * qvel[:, None]).sum(-1)
+    turn = frames.matrix_of(d.pose[:, 3:])
+    if frame == "tool":
+        vectors = np.stack([error, rate, acceleration, tool], axis=-1)
+        error, rate, acceleration, tool = np.moveaxis(frames.in_axes(turn, vectors), -1, 0)
+    wanted = stiffness * error + damping * rate + acceleration
+    np.testing.assert_allclose(tool, wanted, atol=1e-8 * np.abs(wanted).max())
+    others = ~tree.chain(link)
+    a_n = 30 * (state.posture - qpos) - 2 * np.sqrt(30) * qvel
+    np.testing.assert_allclose(qacc[:, others], a_n[:, others], atol=1e-8)
+    assert not terms.near_singular.any()
+    assert (terms.task_share == 1).all()
+
+
+def test_the_posture_does_not_move_the_tool():
+    tree = tree_of("panda")
+    qpos, qvel = states(tree, 50)
+    for axes in (None, [True] * 3 + [False] * 3, [False, True, True, True, False, True]):
+        params = ts.make_osc_params(tree, axes=axes, smallest_eigenvalue=1e-9)
+        d = ts.task_dynamics(tree, qpos, qvel, HAND)
+        for decoupling in ("full", "partial", "none"):
+            chosen = params._replace(decoupling=ts.osc_params.TASK_CHOICES["decoupling"][decoupling])
+            state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
+            terms = ts.advance(chosen, state, d, goal, qpos, qvel, terms=True)[2]
+            moved = moved_by(d, tree.chain(HAND), terms.posture)
+            moved = moved if axes is None else moved[:, axes]
+            assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
+            assert np.abs(terms.posture).max() > 1
+
+
+def run(tree, link, params, qpos, goal, steps, change=lambda d, q: d, dt=DT):
+    """Return the errors of the pose (steps, envs, 6) and the efforts of a closed loop, exact but for its time step."""
+    q, v, state = qpos.copy(), np.zeros_like(qpos), ts.init(params, qpos)
+    errors, efforts = [], []
+    for n in range(steps):
+        d = ts.task_dynamics(tree, q, v, link)
+        target = goal(n) if callable(goal) else goal
+        _, effort = ts.advance(params, state, change(d, q), target, q, v)
+        errors.append(frames.pose_error(target, d.pose))
+        efforts.append(effort)
+        v = v + dt * accelerations(d, effort)[0]
+        q = q + dt * v
+    return np.array(errors), np.array(efforts)
+
+
+def test_moves_are_those_of_unit_masses_on_springs():
+    """10 cm under kp = 150 and damping ratio 1: e = e0 (1 + w t) exp(-w t). Each part of the law is needed."""
+    tree, steps = tree_of("panda"), 1000
+    rng = np.random.default_rng(0)
+    qpos = np.tile(START, (7, 1))
+    way = rng.normal(size=(7, 3))
+    way *= 0.1 / np.linalg.norm(way, axis=1, keepdims=True)
+    way[4:6] = way[3]
+    goal = ts.link_poses(tree, qpos, [HAND])[:, 0]
+    goal[:, :3] += way
+    tilt = frames.matrix_of(np.array([0.8, 0.0, 0.6, 0.0]))
+    goal[6, 3:] = frames.wxyz_of(frames.multiply(tilt, frames.matrix_of(goal[6, 3:])))
+
+    def change(d, q):  # env 4 without J' q', env 5 without Coriolis and centrifugal forces
+        rate, bias = d.jacobian_rate.copy(), d.bias.copy()
+        rate[4], bias[5] = 0.0, ts.gravity(tree, q[5])
+        return d._replace(jacobian_rate=rate, bias=bias)
+
+    params = ts.make_osc_params(tree, position_error_limit=np.inf, rotation_error_limit=np.inf)
+    errors, _ = run(tree, HAND, params, qpos, goal, steps, change)
+    w, t = np.sqrt(150), np.arange(steps)[:, None, None] * DT
+    share = (1 + w * t) * np.exp(-w * t)
+    off = np.abs(errors[..., :3] - share * way).max((0, 2))
+    assert off[[0, 1, 2, 3, 6]].max() < 0.25e-3
+    assert off[4] > 1e-3
+    assert off[5] > 1e-3
+    assert np.abs(errors[:, :4, 3:]).max() < 1e-4  # the others hold their rotation
+    turn = errors[0, 6, 3:]
+    assert np.linalg.norm(turn) > 1.2
+    # With the time step's own recursion, most of what is left goes, for rotations too.
+    e, rate, exact = 1.0, 0.0, np.empty((steps, 1))
+    for n in range(steps):
+        exact[n] = e
+        rate -= DT * (150 * e + 2 * w * rate)
+        e += DT * rate
+    np.testing.assert_allclose(errors[:, 6, 3:], exact * turn, atol=4e-4)
+    np.testing.assert_allclose(errors[:, :4, :3], exact[:, None] * way[:4], atol=1e-4)
+
+
+def test_a_straight_elbow_neither_chatters_nor_holds_the_tool():
+    """A setpoint leaves the reach of an arm of 2 m at 0.5 m/s, waits outside, and comes back."""
+    tree, link, dt = planar(), "tip", 1 / 250
+    qpos = np.array([[0.3, 0.8], [0.2, -0.9]])
+    params = ts.make_osc_params(tree, axes=[True, True, *[False] * 4])
+    back = ts.link_poses(tree, qpos, [link])[:, 0]
+    radius = np.linalg.norm(back[:, :2], axis=1, keepdims=True)
+
+    def goal(n):
+        out = np.interp(n, [0, 200, 375, 500], [0.0, 0.39, 0.39, 0.0])
+        pose = back.copy()
+        pose[:, :2] *= 1 + out / radius
+        return pose
+
+    errors, efforts = run(tree, link, params, qpos, goal, 700, dt=dt)
+    assert np.linalg.norm(errors[374, :, :2], axis=1).min() > 0.15  # straight, and too short
+    chatter = np.abs(np.diff(efforts[250:370], n=2, axis=0)).max()
+    assert chatter < 0.4  # N m per step; an inverse that truncates small eigenvalues makes tens
+    assert np.linalg.norm(errors[-1, :, :2], axis=1).max() < 3e-4
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**31), tight=st.sampled_from([0.3, 1.0, 3.0]))
+def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
+    tree, rows = tree_of("panda"), 6
+    rng = np.random.default_rng(seed)
+    qpos, qvel = states(tree, rows, seed)
+    goal, state = goals(tree, HAND, seed + 1)(rows), ts.OSCState(qpos + rng.normal(size=qpos.shape))
+    d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
+    limit = np.abs(d.bias).max() * tight * rng.uniform(0.5, 2, (rows, tree.dof))
+    params = ts.make_osc_params(tree, effort_limit=limit)
+    _, effort, terms = ts.advance(params, state, d, goal, qpos, 0.1 * qvel, terms=True)
+    chain = tree.chain(HAND)
+    base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
+    task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, effort, limit))
+    s1, s2 = terms.task_share[:, None], terms.posture_share[:, None]
+    able = (np.abs(base) <= limit).all(1)
+    assert (np.abs(effort) <= limit * (1 + 1e-12)).all()
+    assert ((s1 >= 0) & (s1 <= 1) & (s2 >= 0) & (s2 <= 1)).all()
+    # not joint by joint: the direction of each part stays
+    np.testing.assert_allclose(effort[able], (base + s1 * task + s2 * posture)[able], atol=1e-9)
+    # and no share could be larger
+    with_task = np.abs(base + s1 * task)
+    full = np.isclose(np.abs(base + s1 * task), limit).any(1)
+    assert (full | (s1[:, 0] == 1))[able].all()
+    assert (np.isclose(np.abs(effort), limit).any(1) | (s2[:, 0] == 1) | full)[able].all()
+    assert (with_task <= limit * (1 + 1e-9))[able].all()
+
+
+def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
+    tree, rows = tree_of("panda"), 24
+    qpos, qvel = states(tree, rows)
+    qpos[2], qvel[3] = np.nan, np.inf
+    goal, state = goals(tree, HAND)(rows), ts.OSCState(qpos + 0.1)
+    goal[5, 0] = np.nan
+    for options in ({}, {"decoupling": "partial", "frame": "tool"}, {"axes": [True] * 3 + [False] * 3}):
+        params = ts.make_osc_params(tree, effort_limit=60.0, smallest_eigenvalue=0.05, **options)
+
+        def efforts(chosen, params=params):
+            part = ts.OSCState(state.posture[chosen])
+            return ts.step(params, part, tree, HAND, goal[chosen], qpos[chosen], qvel[chosen], terms=True)[1:]
+
+        effort, terms = efforts(slice(None))
+        bad = [2, 3, 5]
+        assert np.isnan(effort[bad]).any(1).all()
+        assert np.isfinite(np.delete(effort, bad, 0)).all()
+        assert terms.near_singular[6:].any()
+        assert not terms.near_singular[6:].all()
+        for chosen in (slice(0, 1), slice(4, 5), slice(6, 7), slice(6, 23)):
+            alone, of_alone = efforts(chosen)
+            np.testing.assert_array_equal(alone, effort[chosen])
+            for part, whole in zip(of_alone, terms, strict=True):
+                np.testing.assert_array_equal(part, whole[chosen])
+
+
+def test_a_selected_force_is_that_of_the_wrench():
+    """The posture does not act on an axis of force; on an axis that is free it does."""
+    tree, rows = tree_of("panda"), 10
+    qpos, _ = states(tree, rows)
+    d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
+    axes = np.array([True, True, False, True, True, False])
+    wrench, chain = np.array([0.0, 0.0, -20.0, 0.0, 0.0, 0.0]), tree.chain(HAND)
+    for frame in ("world", "tool"):
+        params = ts.make_osc_params(tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame)
+        inputs = params, ts.OSCState(qpos + 0.3 * chain), d, d.pose, qpos, 0 * qpos
+        _, _, terms = ts.advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
+        np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)
+        tool = moved_by(d, chain, terms.posture)
+        turn = frames.matrix_of(d.pose[:, 3:])
+        tool = tool if frame == "world" else frames.in_axes(turn, tool[..., None])[..., 0]
+        assert np.abs(tool[~terms.near_singular, :5]).max() < 1e-9
+        assert np.abs(tool[:, 5]).max() > 0.1
+
+
+def test_without_decoupling_gains_are_forces():
+    tree = tree_of("panda")
+    qpos, qvel = states(tree, 5)
+    params = ts.make_osc_params(tree, decoupling="none", stiffness=400.0, damping=30.0, posture_stiffness=0.0)
+    d = ts.task_dynamics(tree, qpos, qvel, HAND)
+    goal = d.pose.copy()
+    goal[:, 0] += 0.05
+    effort = ts.step(params, ts.init(params, qpos), tree, HAND, goal, qpos, 0 * qvel)[1]
+    chain = tree.chain(HAND)
+    wanted = ts.gravity(tree, qpos)[:, chain] + 20.0 * d.jacobian[:, 0, chain]
+    np.testing.assert_allclose(effort[:, chain], wanted, atol=1e-9)
+
+
+def test_the_state_is_the_posture_and_rows_of_it_reset():
+    tree = planar()
+    params = ts.make_osc_params(tree)
+    state = ts.init(params, np.zeros((3, 2)))
+    again = ts.reset(params, state, np.ones((3, 2)), np.array([False, True, False]))
+    np.testing.assert_array_equal(again.posture, [[0, 0], [1, 1], [0, 0]])
+    assert "3 envs" in repr(again)
+    assert "stiffness 150" in repr(params)
+
+
+def test_jax_computes_the_same(x64):
+    tree, link = planar((1.0, 0.8)), "tip"
+    qpos, qvel = states(tree, 4)
+    params = ts.make_osc_params(tree, axes=[True, True, *[False] * 4], effort_limit=20.0)
+    goal = ts.link_poses(tree, qpos + 0.1, [link])[:, 0]
+    inputs = params, ts.init(params, qpos), goal, qpos, qvel
+
+    def step(params, state, *rest):
+        return ts.step(params, state, tree, link, *rest)[1]
+
+    with jax.numpy_rank_promotion("allow"):
+        found = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
+    np.testing.assert_allclose(found, step(*inputs), atol=1e-9)
+
+
+def test_inputs_of_a_step_are_checked():
+    tree, qpos = planar(), np.zeros((2, 2))
+    goal, params = ts.link_poses(tree, qpos, ["tip"])[:, 0], ts.make_osc_params(tree)
+    state = ts.init(params, qpos)
+    for change, message in (
+        ({"setpoint": goal[:, :6]}, r"setpoint: has shape \(2, 6\), not \(2, 7\)"),
+        ({"setpoint": goal[0]}, "setpoint: has shape"),
+        ({"twist": np.zeros(6)}, "twist: has shape"),
+        ({"wrench": np.zeros((3, 6))}, "wrench: has shape"),
+        ({"feedforward": np.zeros((2, 6))}, "feedforward: has shape"),
+        ({"params": ts.make_osc_params(tree, stiffness=np.ones((3, 6)))}, "params.stiffness: has rows for 3 envs"),
+        ({"link": "top"}, "did you mean 'tip'"),
+    ):
+        inputs = {"params": params, "state": state, "tree": tree, "link": "tip", "setpoint": goal} | change
+        with pytest.raises(InvalidArgumentError, match=message):
+            ts.step(**inputs, qpos=qpos, qvel=qpos)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stiffness": [1.0, 2.0]}, r"stiffness: has shape \(2,\).*rz"),
+        ({"stiffness": [1, 1, -1, 1, 1, 1]}, "stiffness, .* 'z'"),
+        ({"damping_ratio": np.nan}, "damping_ratio, .* 'x'"),
+        ({"axes": [1, 0, 1, 1, 1, 1]}, "axes: cannot be read as an array of bools"),
+        ({"axes": [True] * 6, "force_axes": [True] + [False] * 5}, "force_axes, entry 'x': is an axis of motion"),
+        ({"posture_stiffness": [1.0] * 3}, "posture_stiffness: has shape .*joint1"),
+        ({"effort_min": 1.0, "effort_max": 0.0}, "effort_min, joint 'joint1': exceeds effort_max"),
+        ({"effort_limit": 1.0, "effort_max": 2.0}, "given together"),
+        ({"smallest_eigenvalue": 0.0}, "smallest_eigenvalue, .*must be > 0"),
+        ({"position_error_limit": -1.0}, "position_error_limit"),
+        ({"decoupling": "half"}, "decoupling: unknown option"),
+        ({"decoupling": "none"}, "damping: is missing"),
+        ({"frame": "body"}, "frame: unknown option"),
+        ({"stifness": 1.0}, "did you mean 'stiffness'"),
+        ({"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))}, "effort_m.*rows for 2 envs"),
+    ],
+)
+def test_options_are_checked(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        ts.make_osc_params(planar(), **options)
+    with pytest.raises(InvalidArgumentError, match="tree: must be a KinematicTree"):
+        ts.make_osc_params("panda")
