@@ -28,7 +28,7 @@ from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
-from batchpid.sim.engine.mujoco.model_builder import _add_links, _add_shapes, _set_options, principal_inertia
+from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.mujoco.solver import SOLVERS
 from batchpid.sim.engine.sapien.body_inertias import body_inertias
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -87,13 +87,9 @@ def to_mjcf(
         merge_fixed=robot.merge_fixed,
         engine="mujoco",
     )
-    scene = mujoco.MjSpec()
-    scene.modelname = robot.name
-    _set_options(scene, spec)
-    scene.option.disableflags = 0
     inertias = body_inertias(spec)
-    names = _add_links(scene, spec, inertias)
-    _add_shapes(scene, spec, names)
+    scene, names = robot_spec(spec, inertias)
+    scene.modelname, scene.option.disableflags = robot.name, 0
     for link, name in names.items():
         found += _set_inertia(scene.body(name), inertias[link], link)
     friction = added_friction(own_friction(spec), found.actuators)

@@ -69,12 +69,8 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     RobotError
         SAPIEN's loader or MuJoCo's compiler refuses the description.
     """
-    scene = mujoco.MjSpec()
-    _set_options(scene, spec)
     inertias = body_inertias(spec)
-    names = _add_links(scene, spec, inertias)
-    if spec.collisions:
-        _add_shapes(scene, spec, names)
+    scene, names = robot_spec(spec, inertias)
     if drives:
         _add_drives(scene, spec)
     try:
@@ -88,6 +84,19 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     joints = [model.joint(joint.name) for joint in spec.joints]
     qpos, qvel = (np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr"))
     return RobotMj(model, qpos, qvel, bodies)
+
+
+def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
+    """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
+
+    ``inertias`` are those of the links, of which it has mass and center; the tensors are placeholders.
+    """
+    scene = mujoco.MjSpec()
+    _set_options(scene, spec)
+    names = _add_links(scene, spec, inertias)
+    if spec.collisions:
+        _add_shapes(scene, spec, names)
+    return scene, names
 
 
 def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
