@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import mujoco
@@ -177,29 +177,23 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
     shapes = link_shapes(spec)
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
     ignored = {frozenset(pair) for pair in spec.ignored}
-    solid = [link for link in owners if owners[link]]
-    excluded, split = [], set()
-    for number, first in enumerate(solid):
-        for second in solid[:number]:
-            pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
-            if all(pairs):
-                excluded.append((names[first], names[second]))
-            elif any(pairs):
-                split |= {first, second}
+    solid, split = [link for link in owners if owners[link]], set[str]()
+    for first, second in combinations(solid, 2):
+        pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
+        if any(pairs) and not all(pairs):
+            split |= {first, second}
+    bodies = {owner: names[link] for link in solid for owner in owners[link]}
     for link in split:
         for owner in owners[link]:
-            scene.body(names[link]).add_body(name=_part(owner))
-    for pair in ignored:
-        holders = [next((link for link in split if owner in owners[link]), None) for owner in pair]
-        if None not in holders and len(set(holders)) == 2:
-            first, second = pair
-            excluded.append((_part(first), _part(second)))
-    for first, second in excluded:
+            bodies[owner] = f"{owner} (shapes)"
+            scene.body(names[link]).add_body(name=bodies[owner])
+    pairs_of_bodies = {frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)}
+    for first, second in sorted(sorted(pair) for pair in pairs_of_bodies if len(pair) == 2):
         scene.add_exclude(bodyname1=first, bodyname2=second)
     meshes: dict[bytes, str] = {}
-    for link, of_link in shapes.items():
+    for of_link in shapes.values():
         for shape in of_link:
-            _add_shape(scene, scene.body(_part(shape.owner) if link in split else names[link]), shape, meshes, spec)
+            _add_shape(scene, scene.body(bodies[shape.owner]), shape, meshes, spec)
     if spec.ground:
         scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
 
@@ -212,10 +206,6 @@ def _add_drives(scene: Any, spec: SceneSpec) -> None:
         actuator = scene.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
-
-
-def _part(owner: str) -> str:
-    return f"{owner} (shapes)"
 
 
 def _add_shape(scene: Any, body: Any, shape: LinkShape, meshes: dict[bytes, str], spec: SceneSpec) -> None:
