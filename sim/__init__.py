@@ -30,7 +30,7 @@ from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo
-from batchpid.sim.options import Controller, RunnerOptions
+from batchpid.sim.options import Controller, RunnerKeywords, RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray
@@ -70,6 +70,7 @@ __all__ = [
     "Rollout",
     "RunInfo",
     "Runner",
+    "RunnerKeywords",
     "RunnerOptions",
     "SetpointWarning",
     "Snapshot",

@@ -9,10 +9,11 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
+from inspect import Parameter, Signature, signature
 from operator import methodcaller
 from pathlib import Path
 from time import strftime
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,21 +31,8 @@ from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FARTHEST, Fault, FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
-from batchpid.sim.options import (
-    Backend,
-    Compensation,
-    Controller,
-    ControlMode,
-    FaultAction,
-    InvalidInputAction,
-    PhysicsPreset,
-    Precision,
-    RunnerOptions,
-    default_params,
-)
+from batchpid.sim.options import IDEAL, RunnerKeywords, RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.randomization.draws import NOTHING, Draws
-from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.limits import SetpointCheck
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.robot.robot import Robot
@@ -62,9 +50,6 @@ from batchpid.sim.workers.requests import (
     SetParams,
     TakeSnapshot,
 )
-
-if TYPE_CHECKING:
-    from batchpid.sim.engine.sapien.physics import Physics
 
 
 class TickRecorder(Protocol):
@@ -113,7 +98,7 @@ class Runner(SingleOwner):
     params
         PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`.
     workers, timestep, ...
-        See the fields of :class:`batchpid.sim.RunnerOptions`.
+        See :class:`batchpid.sim.RunnerKeywords`.
 
     Raises
     ------
@@ -121,6 +106,7 @@ class Runner(SingleOwner):
         An argument is out of range; raised before any process starts.
     """
 
+    __signature__: ClassVar[Signature]
     instead = "make another Runner with the same options, and restore a runner.snapshot() in it"
 
     def __init__(
@@ -129,91 +115,44 @@ class Runner(SingleOwner):
         num_envs: int,
         *,
         params: bp.PIDParams | None = None,
-        workers: int | None = None,
-        timestep: float = 1 / 2000,
-        substeps: int = 20,
-        control: ControlMode | Controller = "pid",
-        backend: Backend = "numpy",
-        dtype: Precision = "float64",
-        compensate: Compensation = "gravity+coriolis+friction",
-        physics: PhysicsPreset | Physics = "accurate",
-        ground: bool | None = None,
-        collisions: bool = True,
-        build: Callable[[Any, int], Any] | None = None,
-        pack_size: int | None = None,
-        on_fault: FaultAction = "hold",
-        speed_limit: ArrayLike | None = None,
-        actuators: bp.Actuators | None = None,
-        randomization: Randomization | None = None,
-        guard: bool | bp.Guard = False,
-        on_invalid_input: InvalidInputAction = "raise",
-        recover: bool = True,
-        checkpoint_steps: int | None = 8000,
-        timeout: float = 60.0,
-        cluster: Literal["ray"] | Ray | None = None,
+        **options: Unpack[RunnerKeywords],
     ) -> None:
         self._ledger: Ledger[_Books] | None = None
-        self.options = RunnerOptions(
-            robot,
-            num_envs,
-            workers=workers,
-            timestep=timestep,
-            substeps=substeps,
-            control=control,
-            backend=backend,
-            dtype=dtype,
-            compensate=compensate,
-            physics=physics,
-            ground=ground,
-            collisions=collisions,
-            build=build,
-            pack_size=pack_size,
-            on_fault=on_fault,
-            speed_limit=speed_limit,
-            actuators=actuators,
-            randomization=randomization,
-            guard=guard,
-            on_invalid_input=on_invalid_input,
-            recover=recover,
-            checkpoint_steps=checkpoint_steps,
-            timeout=timeout,
-            cluster=cluster,
-        )
+        self.options = checked = RunnerOptions(robot, num_envs, **options)
         """Options, checked."""
-        options = self.options
-        self.robot, self.num_envs, self.control = options.robot, options.num_envs, options.control
-        self.timestep, self.substeps = options.timestep, options.substeps
-        params = options.check_params(default_params(robot, control) if params is None else params)
+        self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
+        self.timestep, self.substeps = checked.timestep, checked.substeps
+        params = checked.check_params(default_params(robot, checked.control) if params is None else params)
         self._shape, self._joint_names = (self.num_envs, robot.dof), robot.joint_names
-        own = options.own_command
-        of_command: _Axis = ("joint" if own is None else "entry", options.command.names)
+        own = checked.own_command
+        of_command: _Axis = ("joint" if own is None else "entry", checked.command.names)
         self._axes: tuple[_Axis, ...] = (of_command, of_command, ("joint", robot.joint_names))
         """Last axis of each array of a command: its kind, and the names of its columns."""
-        self._finite = options.on_invalid_input == "raise"
+        self._finite = checked.on_invalid_input == "raise"
         self._limits = SetpointCheck(robot)
         self._stability = StabilityCheck(robot, self.timestep) if self.control == "pid" else None
-        self._checks_setpoints = options.sets_positions and options.guard is False
+        self._checks_setpoints = checked.sets_positions and checked.guard is None
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._has_warned = self._has_warned_of_contact = False
         entry_names = None if own is None else own.names
-        faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, options.on_fault, entry_names)
+        faults = FaultLog(self.num_envs, robot.joint_names, self.timestep, checked.on_fault, entry_names)
         contacts = None
-        if not options.collisions:
-            engine = options.load_engine()
+        if not checked.collisions:
+            engine = checked.load_engine()
             contacts = MissedContactLog(
                 self.num_envs, self.timestep, lambda qpos: engine.robot_dynamics(robot).nearest_links(qpos)
             )
-        self._pool = WorkerPool(options, params)
-        randomization = options.randomization
+        self._pool = WorkerPool(checked, params)
+        randomization = checked.randomization
         draws = NOTHING if randomization is None else randomization.first(robot, self.num_envs)
-        books = _Books(params, faults, draws, actuators=options.actuators, contacts=contacts)
+        books = _Books(params, faults, draws, actuators=checked.actuators, contacts=contacts)
         self._ledger = Ledger(self._pool, books)
         try:
             self._pool.open()
             self.reset(seed=None if randomization is None else 0)
             if self._stability is not None:
-                self._stability.check(params, options.actuators)
+                self._stability.check(params, checked.actuators)
         except BaseException:
             self.close()
             raise
@@ -466,7 +405,7 @@ class Runner(SingleOwner):
         def commit(books: _Books, results: list[Any]) -> tuple[_Books, Snapshot]:
             episodes = None if self.options.randomization is None else books.draws.episodes
             states = EnvStates.join(results)
-            about = self.options.about()
+            about = self.options.describe()
             snapshot = Snapshot(about, books.steps, books.params, states, books.actuators, episodes)
             self._pool.start_replay_from(Restore(snapshot, books.draws))
             return books._replace(steps_since_checkpoint=0), snapshot
@@ -484,18 +423,18 @@ class Runner(SingleOwner):
         """
         self._received("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        snapshot.check(self.options.about())
+        snapshot.check(self.options.describe())
         snapshot = replace(snapshot, params=self.options.check_params(snapshot.params))
         sizes = [size for part in self._execute(ReadStateSizes(), _read) for size in part]
         controller = initial_state(self.options, snapshot.params)
-        acting = actuators = self.options.check_actuators(snapshot.actuators)
+        acting = actuators = self.options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
         draws, randomization = NOTHING, self.options.randomization
         if randomization is not None and snapshot.episodes is not None:
             draws = randomization.draw(self.robot, snapshot.episodes)
             acting = randomization.randomized_actuators(actuators, draws, self.robot)
         motors = initial_actuators(acting, *self._shape, self.timestep)
         stiction = self.options.has_stiction(acting)
-        guarded = self.options.guard is not False
+        guarded = self.options.guard is not None
         size = self.command.size
         snapshot.states.check(self.num_envs, self.robot.dof, controller, stiction, motors, guarded, sizes, size)
         request = Restore(replace(snapshot, actuators=actuators), draws)
@@ -528,24 +467,18 @@ class Runner(SingleOwner):
     @property
     def info(self) -> RunInfo:
         """Robot, options and origin of a run that starts now."""
+        randomized = self.options.randomization is not None
         return self.robot.run_info(
-            timestep=self.timestep,
-            substeps=self.substeps,
-            control=self.options.control_name,
+            **self.options.values_for("recording"),
             own_command=self.options.own_command,
-            compensate=self.options.compensate,
-            physics=str(self.options.physics),
-            collisions=self.options.collisions,
-            ground=self.options.ground,
             params=self.params,
             actuators=self.actuators,
             start=self.observe().qpos,
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
             faults=self.faults,
-            randomization=None if self.options.randomization is None else self.options.randomization.to_dict(),
-            draws=None if self.options.randomization is None else self.draws,
-            episodes=None if self.options.randomization is None else self.episodes,
+            draws=self.draws if randomized else None,
+            episodes=self.episodes if randomized else None,
         )
 
     @property
@@ -777,6 +710,10 @@ class Runner(SingleOwner):
         if self._finite:
             return within(name, rows, FARTHEST, self._joint_names)
         return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
+
+
+_NAMED = [each for each in signature(Runner).parameters.values() if each.kind != Parameter.VAR_KEYWORD]
+Runner.__signature__ = Signature(_NAMED + keyword_parameters())
 
 
 def _copy(arrays: Arrays) -> Observation:

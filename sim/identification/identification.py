@@ -120,7 +120,7 @@ def identify(
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
     settings = {
-        **robot.about(),
+        **robot.describe(),
         "logs": [log.source for log in found],
         "data": digest([replace(log, source="") for log in found]),
         "command": kind,

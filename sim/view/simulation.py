@@ -103,7 +103,7 @@ class LiveSimulation(SingleOwner):
                 for control, gains in self.gains.items()
             ]
             self._resources = stack.pop_all()
-        self.ground = bool(self._runners[0].options.ground)
+        self.ground = self._runners[0].options.ground
         """True if the scenes have a ground at height 0."""
         self._info = robot.run_info(ground=self.ground)
         self.reset()

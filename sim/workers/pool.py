@@ -13,7 +13,6 @@ Longer than 300 lines because all that can happen to a worker during a request i
 
 from __future__ import annotations
 
-import os
 import select
 import time
 from collections.abc import Callable
@@ -78,7 +77,7 @@ class WorkerPool(SingleOwner):
         self.messages: dict[type[Warning], str] = {}
         """Latest message of each category, for warnings."""
         self._first_env, num_envs, ticks = share or (0, options.num_envs, None)
-        count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
+        count = 1 if options.workers is None else options.workers
         self.is_local = not count
         """True if the loop runs in this process."""
         self._make_worker: Callable[[Start, SharedArrays], Worker] = ProcessWorker if count else LocalWorker
