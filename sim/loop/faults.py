@@ -96,10 +96,9 @@ class FaultLog:
         log._steps = steps.copy()
         return log
 
-    def noting(self, arrays: Arrays) -> FaultLog:
+    def with_faults(self, arrays: Arrays) -> FaultLog:
         """Return a log with the faults of ``arrays`` that this one does not know."""
-        ok = arrays.observation.ok
-        if np.count_nonzero(ok) == ok.size:  # a third of the time of ok.all()
+        if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
             return self
         fault = arrays.fault
         log = self.restored(fault.step)

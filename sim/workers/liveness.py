@@ -18,11 +18,7 @@ class Liveness:
     """
 
     def __init__(self, stat: Path, max_gap: float = 0.2) -> None:
-        self._stat, self._max_gap = stat, max_gap
-        self.begin()
-
-    def begin(self) -> None:
-        """Reset the times: a request begins."""
+        self._stat, self._max_gap = str(stat), max_gap
         self.idle = 0.0
         """Seconds for which it has been asleep or stopped in every sample, without processor time between them."""
         self.busy = 0.0
@@ -31,10 +27,16 @@ class Liveness:
         """Stopped, as by SIGSTOP."""
         self._last: tuple[float, float] | None = None
 
-    def sample(self, now: float) -> None:
-        """Update the times at time ``now`` [s]."""
+    def sample(self, now: float, is_first: bool = False) -> None:
+        """Update the times at time ``now`` [s]; the first sample of a request resets them."""
+        if is_first:
+            self.idle, self.busy, self._last = 0.0, 0.0, None
         try:
-            fields = self._stat.read_text().rpartition(")")[2].split()
+            descriptor = os.open(self._stat, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                fields = os.read(descriptor, 4096).rpartition(b")")[2].decode().split()
+            finally:
+                os.close(descriptor)
         except OSError:
             return  # it has ended; its socket reports that
         state, cpu = fields[_STATE], sum(map(int, fields[_CPU])) / _CLOCK
