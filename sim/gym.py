@@ -23,10 +23,11 @@ from batchpid.checks.validate import AxisKind, array, choice, entries, env_mask,
 from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError, MissingDependencyError
 from batchpid.sim.command import CommandSpec, own_command
 from batchpid.sim.observation import Observation
-from batchpid.sim.options import RunnerKeywords, RunnerOptions
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import RunnerKeywords
 
 try:
     import gymnasium

@@ -20,8 +20,9 @@ from batchpid.sim.loop.contact_log import MissedContact
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo
-from batchpid.sim.options import RunnerKeywords, RunnerOptions, default_params, keyword_parameters
+from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import RunnerKeywords
 from batchpid.sim.session import Session, TickRecorder
 from batchpid.sim.workers.node import NodeInfo
 

@@ -1,4 +1,7 @@
-"""Commands of a Runner as transactions, with their checkpoints, recording and warnings."""
+"""Commands of a Runner as transactions, with their checkpoints, recording and warnings.
+
+Longer than 300 lines because all commands are here, each with the change of state that it brings.
+"""
 
 from __future__ import annotations
 
@@ -151,7 +154,7 @@ class Session:
         command = self._arguments.tick(setpoint, setpoint_rate, feedforward)
         self._transactions.run(*self._ticks(command, count))
         self._warn(stacklevel=4)
-        return Observation._make(map(_COPY, self.pool.present.observation))
+        return Observation._make(map(_COPY, self.pool.present.observation))  # a tick has few calls (test_hops.py)
 
     def send(
         self,

@@ -35,8 +35,8 @@ from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import rows_of
-from batchpid.sim.options import Compensation
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import Compensation
 
 Float64 = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.control_step import Measured
-from batchpid.sim.options import FaultAction
+from batchpid.sim.runner_keywords import FaultAction
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
 """Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too fast, or the array of

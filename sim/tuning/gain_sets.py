@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.options import ControlMode
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import ControlMode
 
 NAMES = ("tuned", "designed", "tutorial", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""

@@ -17,10 +17,11 @@ import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import choice, integer, number
 from batchpid.sim.observation import Observation, Rollout
-from batchpid.sim.options import ControlMode, RunnerOptions
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import ControlMode
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS
