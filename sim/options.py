@@ -103,8 +103,8 @@ class RunnerOptions:
         default="accurate",
         metadata=_in(snapshot="solver_settings", recording="physics_name", scene="solver"),
     )
-    ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
+    ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
     build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene"))
     pack_size: int = _DERIVED
     on_fault: FaultAction = "hold"

@@ -87,13 +87,13 @@ class RunnerKeywords(TypedDict, total=False):
     physics: PhysicsPreset | Physics
     """``"accurate"`` (the default: SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
     :class:`batchpid.sim.Physics`."""
-    ground: bool | None
-    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
-    so low that other links reach the ground at its start pose."""
     collisions: bool
     """Default True. With False robots have no collision shapes, and there is no ground: for free motion only. Masses,
     inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched
     something."""
+    ground: bool | None
+    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
+    so low that other links reach the ground at its start pose."""
     build: Callable[[Any, int], Any] | None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
