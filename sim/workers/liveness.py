@@ -33,7 +33,7 @@ class Liveness:
         if is_first:
             self.idle, self.busy, self._last = 0.0, 0.0, None
         try:
-            with io.FileIO(self._stat) as file:  # Path.read_text takes nine calls of Python
+            with _File(self._stat) as file:  # Path.read_text takes nine calls of Python
                 fields = file.read().rpartition(b")")[2].decode().split()
         except OSError:
             return  # it has ended; its socket reports that
@@ -44,3 +44,10 @@ class Liveness:
             self.idle = self.idle + passed if state in _IDLE and not ran else 0.0
             self.busy += ran if state == _RUNNABLE else max(ran, passed)
         self._last = now, cpu
+
+
+class _File(io.FileIO):
+    """File that is closed with its last reference, as after an interrupt."""
+
+    def __del__(self) -> None:
+        self.close()  # without the ResourceWarning of its base
