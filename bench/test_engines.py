@@ -16,8 +16,10 @@ import pytest
 pytest.importorskip("mujoco")
 mujoco_batch = pytest.importorskip("mujoco.batch")
 
-from batchpid.sim import Robot, Runner  # noqa: E402
+from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
 from batchpid.sim.benchmark.workload import Workload  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.options import default_params  # noqa: E402
 
 TICKS, ROUNDS, SUBSTEPS = 20, 5, 20
@@ -35,12 +37,14 @@ def seconds_per_env_step(runner: Runner, workload: Workload, ticks: int) -> floa
     return seconds / (ticks * SUBSTEPS * runner.num_envs)
 
 
-def bare_engine(runner: Runner, ticks: int) -> float:
+def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
     """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under fixed efforts."""
-    pack: Any = runner._pool._slots[0].worker._loop.groups[0].pack
-    batch = mujoco_batch.Batch(pack._robot.model, runner.num_envs, nthread=1, persistent=True)
+    options: dict[str, Any] = {"ground": robot.has_ground, "merge_fixed": robot.merge_fixed, "engine": "mujoco"}
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options)
+    built = robot_model(spec)
+    batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
     qpos = batch.bind("qpos")
-    qpos[:, pack._robot.qpos] = pack.read_qpos()
+    qpos[:, built.qpos] = robot.start
     before = qpos.copy()
     batch.bind("qfrc_applied")[...] = 0.1
     began = time.process_time()
@@ -48,7 +52,7 @@ def bare_engine(runner: Runner, ticks: int) -> float:
         batch.step()
     seconds = time.process_time() - began
     assert np.abs(qpos - before).max() > 1e-3, "the robots did not move"
-    return seconds / (ticks * SUBSTEPS * runner.num_envs)
+    return seconds / (ticks * SUBSTEPS * num_envs)
 
 
 @pytest.mark.parametrize("gains", GAINS)
@@ -72,7 +76,7 @@ def test_speed_over_sapien(benchmark, report, compare, most, name, num_envs, gai
             rows = []
             for _ in range(rounds + 1):
                 row = [seconds_per_env_step(runner, workload, ticks) for runner in runners]
-                rows.append([*row, bare_engine(mujoco, ticks)])
+                rows.append([*row, bare_engine(robot, num_envs, ticks)])
         return rows[1:]
 
     rows = benchmark.pedantic(measure, rounds=1)

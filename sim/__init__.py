@@ -31,7 +31,7 @@ from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
-from batchpid.sim.options import Controller, RunnerOptions
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray
@@ -42,6 +42,7 @@ from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.limits import SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import Controller, RunnerKeywords
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver
@@ -73,6 +74,7 @@ __all__ = [
     "Rollout",
     "RunInfo",
     "Runner",
+    "RunnerKeywords",
     "RunnerOptions",
     "SetpointWarning",
     "Snapshot",

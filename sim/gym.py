@@ -27,6 +27,7 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import RunnerKeywords
 
 try:
     import gymnasium
@@ -346,7 +347,7 @@ def _finite_bounds(command: CommandSpec) -> tuple[NDArray[np.float64], NDArray[n
 
 OWN_OPTIONS = tuple(inspect.signature(ReachVectorEnv).parameters)[:-1]
 """Arguments of :class:`ReachVectorEnv`, without the options of the runner."""
-RUNNER_OPTIONS = tuple({*inspect.signature(Runner).parameters} - {"robot", "num_envs", "substeps"})
+RUNNER_OPTIONS = tuple({"params", *RunnerKeywords.__annotations__} - {"substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
 
 

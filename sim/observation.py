@@ -124,6 +124,8 @@ class RunInfo:
     """Names and units of setpoints that are not one number for each joint."""
     compensate: str | None = None
     """Efforts added by the runner: "gravity+coriolis+friction", "gravity+coriolis", "gravity" or "none"."""
+    engine: str | None = None
+    """Physics engine: "sapien"."""
     physics: str | None = None
     """Solver settings: "accurate", "fast", "free", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None

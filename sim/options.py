@@ -1,21 +1,26 @@
-"""Options of a runner: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots, recordings and commands.
+"""Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
 
-Longer than 300 lines because every option is documented here.
+Longer than 300 lines because the checks of all options are here; :mod:`batchpid.sim.runner_keywords` documents them.
 """
 
 from __future__ import annotations
 
+import copy
+import os
 from collections.abc import Callable
-from dataclasses import KW_ONLY, astuple, dataclass
+from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
+from inspect import Parameter
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
-from numpy.typing import ArrayLike, NDArray
+import numpy as np
+from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.digest import digest
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
+from batchpid.checks.keywords import check_keywords
 from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
@@ -28,215 +33,163 @@ from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
+from batchpid.sim.runner_keywords import (
+    Backend,
+    Compensation,
+    Controller,
+    ControlMode,
+    EngineName,
+    FaultAction,
+    InvalidInputAction,
+    PhysicsPreset,
+    Precision,
+    RunnerKeywords,
+)
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver
     from batchpid.sim.engine.sapien.physics import Physics
 
-ControlMode = Literal["pid", "drive", "effort"]
-
-
-class Controller(Protocol):
-    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), in SAPIEN's order, SI units.
-
-    It is called at every sim step, in the worker processes, for some of the envs at a time: the effort of an env must
-    depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
-
-    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
-    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
-    """
-
-    def init(self, robot: Robot, num_envs: int) -> Any:
-        """Return the state of so many envs at their start: None, an array, or tuples and dicts of these.
-
-        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots. Later states have
-        the same structure, shapes and dtypes.
-        """
-
-    def __call__(
-        self,
-        state: Any,
-        setpoint: NDArray[Any],
-        qpos: NDArray[Any],
-        qvel: NDArray[Any],
-        passive: NDArray[Any],
-    ) -> tuple[Any, Any]:
-        """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
-
-        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros within its bounds.
-        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward. The
-        arrays are read-only copies, which the controller may keep.
-        """
-
-
-Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-Backend = Literal["numpy", "jax"]
-Precision = Literal["float64", "float32"]
-EngineName = Literal["sapien", "mujoco"]
-PhysicsPreset = Literal["accurate", "fast", "free"]
-FaultAction = Literal["hold", "reset"]
-InvalidInputAction = Literal["raise", "contain"]
+Place = Literal["snapshot", "recording", "scene"]
+IDEAL = bp.Actuators()
+"""Actuators without any effect."""
 PACK_SIZE = {True: 4, False: 64}
 """Default of ``pack_size``, with collisions and without, where packs need no isolation (docs/performance.md)."""
 
 
-@dataclass(frozen=True, eq=False)
+_DERIVED: Any = None
+"""Default that depends on the robot or on other options."""
+
+
+def _in(*places: Place, **sources: str) -> dict[str, str | None]:
+    """Return the metadata of an option that is kept in ``places``: see :meth:`RunnerOptions.values_for`.
+
+    Where a place keeps another value than the option itself, ``sources`` names the attribute that holds it.
+    """
+    return {**dict.fromkeys(places), **sources}
+
+
+@dataclass(frozen=True, eq=False, init=False)
 class RunnerOptions:
-    """Options of a :class:`batchpid.sim.Runner`, checked when they are constructed.
+    """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each default. Immutable.
+
+    Parameters
+    ----------
+    robot
+        From :meth:`batchpid.sim.Robot.load`.
+    num_envs
+        Number of robots, one in each scene.
+    workers, timestep, ...
+        See :class:`RunnerKeywords`. The attribute of each has the same name.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range.
+        An option is out of range, or no option has this name.
     """
 
     robot: Robot
-    """From :meth:`batchpid.sim.Robot.load`."""
-    num_envs: int
-    """Number of robots, one in each scene."""
-    _: KW_ONLY
+    num_envs: int = field(metadata=_in("snapshot"))
     workers: int | None = None
-    """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
-    pinned to its core. Results are bit-identical for any number of workers."""
-    timestep: float = 1 / 2000
-    """Time step of simulation and control [s]."""
-    substeps: int = 20
-    """Sim steps of one tick, all under the same setpoint; the control runs at every one of them."""
-    control: ControlMode | Controller = "pid"
-    """``"pid"``; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and damping;
-    ``"effort"``: the setpoint is the joint effort; or a :class:`Controller`."""
-    backend: Backend = "numpy"
-    """Library of the law: ``"numpy"``, or ``"jax"``, which runs law and sim steps of a tick as one program of XLA on
-    the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors, the last
-    bits of results differ."""
-    dtype: Precision = "float64"
-    """Floating-point type of the law under backend ``"jax"``."""
-    compensate: Compensation = "gravity+coriolis+friction"
-    """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step. Under control
-    "effort" friction is not compensated."""
-    engine: EngineName = "sapien"
-    """Physics engine: ``"sapien"``, the reference, or ``"mujoco"``, which is several times as fast (extra ``mujoco``;
-    docs/two-engines.md)."""
-    physics: PhysicsPreset | Physics | MujocoSolver = "accurate"
-    """Solver: ``"accurate"`` (SAPIEN's own settings), ``"fast"``, ``"free"`` (for motion without contact), or a
-    :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""
-    ground: bool | None = None
-    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
-    so low that other links reach the ground at its start pose."""
-    collisions: bool = True
-    """With False robots have no collision shapes, and there is no ground: for free motion only. Masses, inertias and
-    joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched something."""
-    build: Callable[[Any, int], Any] | None = None
-    """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
-    that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
-    reports. A
-    reset puts the content back to where ``build`` left it."""
-    pack_size: int | None = None
-    """Largest number of scenes that share a PhysX system; affects speed alone. Default: 4, or 64 without collisions.
-    A robot gets its own system before something touches it, so that results do not depend on the other envs
-    (docs/reliability.md)."""
+    """None on a cluster."""
+    timestep: float = field(default=1 / 2000, metadata=_in("snapshot", "recording", "scene"))
+    substeps: int = field(default=20, metadata=_in("recording"))
+    control: ControlMode | Controller = field(
+        default="pid", metadata=_in(snapshot="control_name", recording="control_name")
+    )
+    backend: Backend = field(default="numpy", metadata=_in("snapshot"))
+    dtype: Precision = field(default="float64", metadata=_in("snapshot"))
+    compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
+    engine: EngineName = field(default="sapien", metadata=_in("scene", snapshot="engine_name", recording="engine_name"))
+    physics: PhysicsPreset | Physics | MujocoSolver = field(
+        default="accurate",
+        metadata=_in(snapshot="solver_settings", recording="physics_name", scene="solver"),
+    )
+    collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
+    ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
+    build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene"))
+    pack_size: int = _DERIVED
     on_fault: FaultAction = "hold"
-    """``"hold"`` an env that fails at rest in its last valid state, with ``ok`` False until it is reset; or ``"reset"``
-    it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite, when a position is
-    beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
-    speed_limit: ArrayLike | None = None
-    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    speed_limit: NDArray[np.float64] | None = None
     actuators: bp.Actuators | None = None
-    """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
-    row per env. Default those of the robot, under control "drive" their friction and armature. The control sees
-    measured positions and velocities; observations hold the true ones, and the effort that was delivered."""
-    randomization: Randomization | None = None
-    """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
-    (docs/randomization.md); default none."""
-    guard: bool | bp.Guard = False
-    """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
-    :func:`batchpid.make_guard`.
-    ``obs.guarded`` tells which setpoints were changed."""
+    """None if every effect is off."""
+    randomization: Randomization | None = field(
+        default=None, metadata=_in(snapshot="distributions", recording="distributions")
+    )
+    guard: bp.Guard | None = field(default=None, metadata=_in(snapshot="guard_digest"))
     on_invalid_input: InvalidInputAction = "raise"
-    """``"raise"`` an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"`` it: the env that
-    it is for fails."""
     recover: bool = True
-    """Replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to those of an
-    undisturbed run. Otherwise :class:`batchpid.errors.WorkerError` is raised."""
     checkpoint_steps: int | None = 8000
-    """Sim steps between checkpoints, from which a replay starts; None: one replay from the start, for which all
-    commands are kept. After contacts the last bits of the results depend on it."""
     timeout: float = 60.0
-    """Seconds, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A worker that is
-    stopped or asleep within a tick counts as stuck within a second."""
+    cluster: Ray | None = None
 
-    cluster: Literal["ray"] | Ray | None = None
-    """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical
-    results
-    (docs/cluster.md)."""
-
-    def __post_init__(self) -> None:
-        robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
-        checked: dict[str, Any] = {
-            "num_envs": integer("num_envs", self.num_envs, 1, 1_000_000),
+    def __init__(self, robot: Robot, num_envs: int, **options: Unpack[RunnerKeywords]) -> None:
+        check_keywords("Runner", options, [*RunnerKeywords.__annotations__, "params"])
+        instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
+        given: dict[str, Any] = {each.name: each.default for each in fields(self)} | options
+        vars(self).update(given | {"robot": robot, "num_envs": integer("num_envs", num_envs, 1, 1_000_000)})
+        own = vars(self)
+        own |= {
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "control": _control(self.control),
             "backend": choice("backend", self.backend, get_args(Backend)),
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
-            "collisions": flag("collisions", self.collisions),
-            "ground": self.collisions and robot.has_ground if self.ground is None else flag("ground", self.ground),
-            "pack_size": PACK_SIZE[bool(self.collisions)]
-            if self.pack_size is None
-            else integer("pack_size", self.pack_size, 1, 65535),
+            "collisions": (collisions := flag("collisions", self.collisions)),
+            "ground": collisions and robot.has_ground if given["ground"] is None else flag("ground", self.ground),
             "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
             "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
             "recover": flag("recover", self.recover),
             "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
         }
-        if self.cluster is not None:
-            checked["cluster"] = Ray() if self.cluster == "ray" else self.cluster
-            instance("cluster", checked["cluster"], Ray, "pass 'ray' or Ray(...)")
-            if self.workers is not None:
-                raise InvalidArgumentError(
-                    "workers", "is not for a cluster", value=self.workers, remedy="pass cluster=Ray(cpus_per_node=...)"
-                )
+        own["pack_size"] = self._checked_pack_size(given["pack_size"])
+        own["workers"], own["cluster"] = _places(given["workers"], given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
             raise InvalidArgumentError(
                 "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
             )
-        if self.workers is not None:
-            checked["workers"] = integer("workers", self.workers, 0, 1024)
-        engine = self.load_engine()
-        if not engine.is_physics(self.physics):
-            choice("physics", self.physics, engine.physics)
-        if self.pack_size is not None and not engine.shares_systems:
-            problem = f"has no meaning for the engine {engine.name!r}, whose robots share nothing"
-            raise InvalidArgumentError("pack_size", problem, value=self.pack_size, remedy="leave it out")
-        needed: dict[Capability, tuple[str, bool]] = {
-            "drive": ("control", checked["control"] == "drive"),
-            "build": ("build", self.build is not None),
-            "missed_contacts": ("collisions", not checked["collisions"]),
-            "sapien_dissipation": ("robot", robot.dissipation == "sapien"),
-        }
-        for capability, (argument, needs) in needed.items():
-            if needs:
-                require(engine, capability, argument)
+        self._check_engine()
         if self.build is not None and not callable(self.build):
             raise InvalidArgumentError(
                 "build", "must be a function", value=self.build, remedy="define build(scene, env)"
             )
-        if self.speed_limit is not None:
-            limit = joint_speeds("speed_limit", self.speed_limit, robot.joint_names)
-            checked["speed_limit"] = read_only(limit.copy())
+        if given["speed_limit"] is not None:
+            limit = joint_speeds("speed_limit", given["speed_limit"], robot.joint_names)
+            own["speed_limit"] = read_only(limit.copy())
         if self.checkpoint_steps is not None:
-            checked["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
+            own["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
-        vars(self).update(checked)
-        vars(self)["guard"] = fit_guard(self.guard, robot, checked["num_envs"], self.control_name, self.sets_positions)
-        actuators = robot.actuators if self.actuators is None else self.actuators
-        if self.actuators is None and actuators is not None and self.control == "drive":
-            actuators = actuators.joint_side()
-        vars(self)["actuators"] = self.check_actuators(actuators)
+        own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
+        own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
+
+    def _checked_pack_size(self, given: Any) -> int:
+        """Return the number of scenes that may share a system, by default the engine's; 1 where none is shared."""
+        engine = self.load_engine()
+        if not engine.shares_systems and given not in (None, 1):
+            problem = f"has no meaning for the engine {engine.name!r}, whose robots share nothing"
+            raise InvalidArgumentError("pack_size", problem, value=given, remedy="leave it out")
+        if given is not None:
+            return integer("pack_size", given, 1, 65535)
+        return PACK_SIZE[self.collisions] if engine.shares_systems else 1
+
+    def _check_engine(self) -> None:
+        """Raise InvalidArgumentError for options that the physics engine does not have."""
+        engine = self.load_engine()
+        if not engine.is_physics(self.physics):
+            choice("physics", self.physics, engine.physics)
+        needed: dict[Capability, tuple[str, bool]] = {
+            "drive": ("control", self.control == "drive"),
+            "build": ("build", self.build is not None),
+            "missed_contacts": ("collisions", not self.collisions),
+            "sapien_dissipation": ("robot", self.robot.dissipation == "sapien"),
+        }
+        for capability, (argument, needs) in needed.items():
+            if needs:
+                require(engine, capability, argument)
 
     def _check_collisions(self) -> None:
         """Raise InvalidArgumentError for options that have no meaning without collisions."""
@@ -255,7 +208,15 @@ class RunnerOptions:
         return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
 
     def load_engine(self) -> Engine:
-        """Return the physics engine of the robots, with its packages imported."""
+        """Return the physics engine of the robots, with its packages imported.
+
+        Raises
+        ------
+        InvalidArgumentError
+            No engine has this name.
+        MissingDependencyError
+            The engine's package is not installed.
+        """
         return load_engine(self.engine)
 
     @property
@@ -286,9 +247,6 @@ class RunnerOptions:
         where :mod:`batchpid.sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to
         miss: any number of workers get equal shares, and pack these.
         """
-        assert self.pack_size is not None
-        if not self.load_engine().shares_systems:
-            return 1
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
 
     @property
@@ -337,38 +295,79 @@ class RunnerOptions:
         """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does; None if every effect
         is off.
 
+        None stands for the robot's own, of which control "drive" has the friction and armature.
+
         Raises
         ------
         InvalidArgumentError
             They do not fit.
         """
-        fitted = None if actuators is None else fit_actuators(actuators, self.robot, self.num_envs, self.control)
+        if actuators is None:
+            actuators = self.robot.actuators or IDEAL
+            actuators = actuators.joint_side() if self.control == "drive" else actuators
+        fitted: bp.Actuators | None = fit_actuators(actuators, self.robot, self.num_envs, self.control)
         fitted = None if fitted is None or fitted.is_ideal else fitted
         if self.randomization is not None:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
         return None if fitted is None else frozen(fitted)
 
-    def about(self) -> dict[str, Any]:
-        """Return the options that two runners must share to restore each other's snapshots, as plain values."""
-        robot = self.robot
+    def with_values(self, **values: Any) -> RunnerOptions:
+        """Return a copy with other ``values``, as the attributes hold them: they are not checked."""
+        changed = copy.copy(self)
+        vars(changed).update(values)
+        return changed
+
+    def values_for(self, place: Place) -> dict[str, Any]:
+        """Return the options that are marked with ``place``, by name.
+
+        - "snapshot": plain values, which two runners must share to restore each other's snapshots;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`;
+        - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
+        """
+        marked = [each for each in fields(self) if place in each.metadata]
+        return {each.name: getattr(self, each.metadata[place] or each.name) for each in marked}
+
+    def describe(self) -> dict[str, Any]:
+        """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""
+        robot, own = self.robot, self.own_command
         return {
-            **robot.about(),
+            **robot.describe(),
             "joints": list(robot.joint_names),
-            "engine": self.load_engine().name,
-            "num_envs": self.num_envs,
-            "timestep": self.timestep,
-            "control": self.control_name,
-            "backend": self.backend,
-            "dtype": self.dtype,
-            "compensate": self.compensate,
-            "physics": list(astuple(self.solver)),
-            "collisions": self.collisions,
-            "ground": self.ground,
+            **self.values_for("snapshot"),
             "ignored_pairs": digest(robot.ignored_pairs),
-            "guard": digest(self.guard),
-            "command": self.own_command and list(self.own_command.names),
-            "randomization": None if self.randomization is None else self.randomization.to_dict(),
+            "command": None if own is None else list(own.names),
         }
+
+    @property
+    def engine_name(self) -> str:
+        """Name by which the engine calls itself."""
+        return self.load_engine().name
+
+    @property
+    def physics_name(self) -> str:
+        """Preset of the solver settings, or the settings as text."""
+        return str(self.physics)
+
+    @property
+    def solver_settings(self) -> list[Any]:
+        """Values of :attr:`solver`."""
+        return list(astuple(self.solver))
+
+    @property
+    def guard_digest(self) -> str:
+        """Digest of the setpoint guard."""
+        return digest(self.guard is not None and self.guard)
+
+    @property
+    def distributions(self) -> dict[str, Any] | None:
+        """The randomization as plain values."""
+        return None if self.randomization is None else self.randomization.to_dict()
+
+
+def keyword_parameters() -> list[Parameter]:
+    """Return the parameters that :class:`RunnerKeywords` stands for, for the signatures that interpreters show."""
+    types, default = RunnerKeywords.__annotations__, {each.name: each.default for each in fields(RunnerOptions)}
+    return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
 def _control(value: object) -> Any:
@@ -376,6 +375,17 @@ def _control(value: object) -> Any:
         own_command(value)  # raises for one that is none
         return value
     return choice("control", value, get_args(ControlMode))
+
+
+def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
+    """Return the options ``workers`` and ``cluster``, of which a runner has one."""
+    if cluster is None:
+        return len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024), None
+    cluster = instance("cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)")
+    if workers is not None:
+        remedy = "pass cluster=Ray(cpus_per_node=...)"
+        raise InvalidArgumentError("workers", "is not for a cluster", value=workers, remedy=remedy)
+    return None, cluster
 
 
 def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> bp.PIDParams:

@@ -135,7 +135,11 @@ def broadcast(
     remedy: str = "give one value, one per joint, or one per env and joint",
 ) -> NDArray[np.float64]:
     """Return ``value`` as float64, broadcast to ``shape``."""
-    result = read_array(argument, value).astype(np.float64, copy=False)
+    return _broadcast(argument, read_array(argument, value), shape, remedy)
+
+
+def _broadcast(argument: str, result: NDArray[Any], shape: tuple[int, ...], remedy: str) -> NDArray[np.float64]:
+    result = result.astype(np.float64, copy=False)
     if result.shape == shape:
         return result
     try:
@@ -167,9 +171,9 @@ def array(
     result = read_array(argument, value)
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
-    given, result = result, broadcast(argument, result, shape, remedy)
-    # The sum of squares first: it costs a third, and is finite for most.
-    if finite and not math.isfinite(np.vdot(given, given)) and not (good := np.isfinite(result)).all():
+    given, result = result.reshape(-1), _broadcast(argument, result, shape, remedy)
+    # The sum of squares first: it costs a third, and is finite for most. (np.vdot is a call of Python, too.)
+    if finite and not math.isfinite(given.dot(given)) and not (good := np.isfinite(result)).all():
         entries(argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers")
     return result
 

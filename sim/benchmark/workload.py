@@ -14,9 +14,9 @@ from batchpid.errors import BatchPIDError
 from batchpid.sim.benchmark.tutorial import tutorial_settings
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.options import PhysicsPreset
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import PhysicsPreset
 
 Float64 = NDArray[np.float64]
 TIMESTEP = 1 / 2000

@@ -35,8 +35,8 @@ from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import rows_of
-from batchpid.sim.options import Compensation
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import Compensation
 
 Float64 = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def identify(
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
     settings = {
-        **robot.about(),
+        **robot.describe(),
         "logs": [log.source for log in found],
         "data": digest([replace(log, source="") for log in found]),
         "command": kind,

@@ -70,7 +70,7 @@ class Subject(NamedTuple):
     @classmethod
     def of(cls, robot: Robot, joints: tuple[int, ...], drive: Drive) -> Subject:
         """Return the subject with its digest."""
-        return cls(robot, joints, drive, digest(robot.about(), joints, drive))
+        return cls(robot, joints, drive, digest(robot.describe(), joints, drive))
 
 
 _kept = local()

@@ -14,7 +14,7 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
         return "coupled joints take constraint efforts of NumPy"
     if options.randomization is not None or actuators is not None or options.robot.actuators is not None:
         return "actuators and randomizations are in NumPy"
-    if options.guard is not False:
+    if options.guard is not None:
         return "the guard of setpoints is in NumPy"
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"

@@ -35,7 +35,7 @@ class MissedContact(NamedTuple):
 
 
 class MissedContactLog:
-    """Missed contacts of a runner's envs, the last 10 000. It is not changed: methods return a log that is.
+    """Last 10 000 missed contacts of a runner's envs. Immutable; methods return a modified copy.
 
     ``links`` returns the names of the links that overlap most at a pose (dof,).
     """
@@ -46,7 +46,7 @@ class MissedContactLog:
         self._timestep, self._links = timestep, links
         self._steps = np.zeros(num_envs, np.int64)
 
-    def noting(self, arrays: Arrays) -> MissedContactLog:
+    def with_contacts(self, arrays: Arrays) -> MissedContactLog:
         """Return a log with the contacts of ``arrays`` that this one does not know."""
         steps = arrays.fault.missed_contact
         new = np.flatnonzero((steps != 0) & (steps != self._steps)).tolist()

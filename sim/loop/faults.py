@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.control_step import Measured
-from batchpid.sim.options import FaultAction
+from batchpid.sim.runner_keywords import FaultAction
 
 CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
 """Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too fast, or the array of
@@ -96,10 +96,9 @@ class FaultLog:
         log._steps = steps.copy()
         return log
 
-    def noting(self, arrays: Arrays) -> FaultLog:
+    def with_faults(self, arrays: Arrays) -> FaultLog:
         """Return a log with the faults of ``arrays`` that this one does not know."""
-        ok = arrays.observation.ok
-        if np.count_nonzero(ok) == ok.size:  # a third of the time of ok.all()
+        if np.logical_and.reduce(arrays.observation.ok):  # ok.all() takes a call of Python
             return self
         fault = arrays.fault
         log = self.restored(fault.step)

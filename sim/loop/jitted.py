@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.options import Precision
+from batchpid.sim.runner_keywords import Precision
 
 ROWS = 16
 """Number of which the rows in a JAX program are a multiple, for any number of envs in a group.

@@ -51,15 +51,10 @@ class Loop:
             urdf=robot.urdf,
             ignored=robot.ignored_pairs,
             joints=robot.joints,
-            timestep=options.timestep,
-            physics=options.solver,
             dissipation=robot.dissipation,
-            ground=bool(options.ground),
             fixed_base=robot.fixed_base,
             merge_fixed=robot.merge_fixed,
-            collisions=options.collisions,
-            build=options.build,
-            engine=options.engine,
+            **options.values_for("scene"),
         )
         self._steps = 0
         count, pack_size = envs.stop - envs.start, options.scenes_per_system

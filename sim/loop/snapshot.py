@@ -145,7 +145,7 @@ class Snapshot:
     """State of all envs of a runner at one moment. It can be pickled, or kept in a file: :meth:`save`, :meth:`load`."""
 
     about: dict[str, Any]
-    """Options that a runner must share to restore it: :meth:`batchpid.sim.RunnerOptions.about`."""
+    """Options that a runner must share to restore it: :meth:`batchpid.sim.RunnerOptions.describe`."""
     steps: int
     """Sim steps up to this moment."""
     params: bp.PIDParams

@@ -47,7 +47,7 @@ def make_constants(
     law, damping = PIDLaw.of(params), np.array([joint.damping for joint in scene.joints])
     damping = damping if known is None else damping + known.viscous
     acting = acting_gains(params, coupling_of(scene.joints))
-    if isinstance(options.guard, bp.Guard):
+    if options.guard is not None:
         guard = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
     constants = Constants(
         timestep=scene.timestep,

@@ -262,7 +262,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
         raise ValueError("its attributes are damaged: the checksum differs")
     names = tuple(map(str, known["joint_names"]))
-    texts = ("robot", "urdf", "dissipation", "control", "compensate", "physics", "begun")
+    texts = ("robot", "urdf", "dissipation", "control", "compensate", "engine", "physics", "begun")
     decode: dict[str, Callable[[Any], Any]] = {
         **dict.fromkeys(texts, str),
         **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),

@@ -280,7 +280,7 @@ class RobotDescription(Urdf):
         """True if scenes have a ground by default; False if the base is fixed so low that links dip into it at rest."""
         return not self.self_contact.reaches_ground
 
-    def about(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return a description of the simulated robot as plain values, equal for robots of equal content.
 
         The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot are given by their

@@ -33,10 +33,10 @@ class SetpointCheck:
 
         One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) masks those to check.
         """
-        below, above = positions < self._low, positions > self._high
-        if not (np.count_nonzero(below) or np.count_nonzero(above)):
+        outside = (positions < self._low) | (positions > self._high)
+        if not np.logical_or.reduce(outside, axis=None):  # outside.any() takes a call of Python
             return
-        outside = (below | above) & np.isfinite(positions)
+        outside &= np.isfinite(positions)
         if envs is not None:
             outside &= envs[:, None]
         new = [

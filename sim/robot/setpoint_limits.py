@@ -55,8 +55,8 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
     )
 
 
-def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bool | bp.Guard:
-    """Return the guard that an option of a runner stands for, False for none.
+def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bp.Guard | None:
+    """Return the guard that an option of a runner stands for, None for none.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
         It does not fit the robot or the control.
     """
     if guard is False or guard is None:
-        return False
+        return None
     if not sets_positions:
         problem, remedy = "limits positions of joints, which this control does not take", "use control 'pid' or 'drive'"
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)

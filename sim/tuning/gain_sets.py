@@ -12,8 +12,8 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
 from batchpid.io import documents
-from batchpid.sim.options import ControlMode
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import ControlMode
 
 NAMES = ("tuned", "designed", "tutorial", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""

@@ -159,7 +159,7 @@ def tune(
     # One iteration is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
     settings: dict[str, Any] = {
-        **robot.about(),
+        **robot.describe(),
         "seed": seed,
         "population": population,
         "actuators": None if robot.actuators is None else digest(robot.actuators),

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import at_least, broadcast, choice, integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.options import ControlMode, RunnerOptions, default_params
+from batchpid.sim.options import RunnerOptions, default_params
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import ControlMode
 
 Float64 = NDArray[np.float64]
 

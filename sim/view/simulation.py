@@ -17,10 +17,11 @@ import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import choice, integer, number
 from batchpid.sim.observation import Observation, Rollout
-from batchpid.sim.options import ControlMode, RunnerOptions
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import ControlMode
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS
@@ -103,7 +104,7 @@ class LiveSimulation(SingleOwner):
                 for control, gains in self.gains.items()
             ]
             self._resources = stack.pop_all()
-        self.ground = bool(self._runners[0].options.ground)
+        self.ground = self._runners[0].options.ground
         """True if the scenes have a ground at height 0."""
         self._info = robot.run_info(ground=self.ground)
         self.reset()

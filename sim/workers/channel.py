@@ -52,10 +52,13 @@ class Channel:
             The other side is closed.
         """
         if not self._unread:
-            self._unread = self._receive(_MIN_READ)
-            if _is_one_message(self._unread):  # the hot path
-                message, self._unread = self._unread[_HEAD.size :], b""
-                return message
+            try:
+                self._unread = data = self._socket.recv(_MIN_READ)
+            except BlockingIOError:
+                self._unread = data = self._receive(_MIN_READ)
+            if len(data) >= _HEAD.size and _HEAD.unpack_from(data)[0] == len(data) - _HEAD.size:  # nearly always
+                self._unread = b""
+                return data[_HEAD.size :]
         (count,) = _HEAD.unpack(self._read(_HEAD.size))
         return self._read(count)
 
@@ -89,7 +92,3 @@ class Channel:
         poll.register(self._socket, event)
         if not poll.poll(1e3 * _WAIT_INTERVAL) and self._on_wait is not None:
             self._on_wait()
-
-
-def _is_one_message(data: bytes) -> bool:
-    return len(data) >= _HEAD.size and _HEAD.unpack_from(data)[0] == len(data) - _HEAD.size

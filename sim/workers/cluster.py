@@ -60,7 +60,7 @@ class Cluster:
     def __init__(
         self, options: RunnerOptions, params: bp.PIDParams, pool_type: Any, messages: dict[type[Warning], str]
     ) -> None:
-        assert isinstance(options.cluster, Ray)
+        assert options.cluster is not None
         self.options, self.messages, self.pool_type = options.cluster, messages, pool_type
         self.canonical = params.for_envs(slice(0, 1))
         """Params of the canonical episode."""

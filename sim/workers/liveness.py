@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
@@ -18,11 +19,7 @@ class Liveness:
     """
 
     def __init__(self, stat: Path, max_gap: float = 0.2) -> None:
-        self._stat, self._max_gap = stat, max_gap
-        self.begin()
-
-    def begin(self) -> None:
-        """Reset the times: a request begins."""
+        self._stat, self._max_gap = str(stat), max_gap
         self.idle = 0.0
         """Seconds for which it has been asleep or stopped in every sample, without processor time between them."""
         self.busy = 0.0
@@ -31,10 +28,13 @@ class Liveness:
         """Stopped, as by SIGSTOP."""
         self._last: tuple[float, float] | None = None
 
-    def sample(self, now: float) -> None:
-        """Update the times at time ``now`` [s]."""
+    def sample(self, now: float, is_first: bool = False) -> None:
+        """Update the times at time ``now`` [s]; the first sample of a request resets them."""
+        if is_first:
+            self.idle, self.busy, self._last = 0.0, 0.0, None
         try:
-            fields = self._stat.read_text().rpartition(")")[2].split()
+            with _File(self._stat) as file:  # Path.read_text takes nine calls of Python
+                fields = file.read().rpartition(b")")[2].decode().split()
         except OSError:
             return  # it has ended; its socket reports that
         state, cpu = fields[_STATE], sum(map(int, fields[_CPU])) / _CLOCK
@@ -44,3 +44,10 @@ class Liveness:
             self.idle = self.idle + passed if state in _IDLE and not ran else 0.0
             self.busy += ran if state == _RUNNABLE else max(ran, passed)
         self._last = now, cpu
+
+
+class _File(io.FileIO):
+    """File that is closed with its last reference, as after an interrupt."""
+
+    def __del__(self) -> None:
+        self.close()  # without the ResourceWarning of its base

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +69,7 @@ class Node:
     def _start(self, message: tuple[Any, Start, int, bp.PIDParams], workers: int, address: str) -> NodeInfo:
         pool_type, start, ticks, canonical = message
         # The caller replaces a node that has lost a worker: it keeps the requests to replay.
-        options = replace(start.options, workers=workers, cluster=None, recover=False)
+        options = start.options.with_values(workers=workers, cluster=None, recover=False)
         envs = start.envs
         self._pool = pool_type(options, start.params, Share(envs.start, envs.stop - envs.start, ticks))
         self._pool.open()

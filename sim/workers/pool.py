@@ -13,12 +13,12 @@ Longer than 300 lines because all that can happen to a worker during a request i
 
 from __future__ import annotations
 
-import os
 import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import Any, Literal
 
 import batchpid as bp
@@ -43,6 +43,8 @@ _POLL_INTERVAL = 0.1  # seconds between two checks of workers that do not answer
 _MAX_STEPS = 8000
 """Sim steps times envs of one request to a worker, at most, unless a tick has more: a fifth of a second."""
 
+_QUEUE, _RESULT, _FAILURE = map(attrgetter, ("queue", "result", "failure"))  # C functions, for the path of a tick
+
 
 class RecoveryWarning(UserWarning):
     """A worker was lost and replaced."""
@@ -57,13 +59,17 @@ class _Slot:
     queue: list[Request] = field(default_factory=list)
     phase: Literal["idle", "transfer", "waiting"] = "transfer"
     """Phase of the first request. An interrupt during a transfer leaves the worker unusable."""
+    limit: float = 0.0
+    """Seconds that the first request may take, known after the first check."""
     result: Any = None
     failure: Failure | None = None
     losses: int = 0
     cause: str = ""
     lost_at: float = 0.0
+    descriptor: int | None = None
+    """Of the worker's results."""
     poller: select.poll = field(default_factory=select.poll)
-    """Of the worker's file descriptor."""
+    """Of the descriptor."""
 
 
 class WorkerPool(SingleOwner):
@@ -78,7 +84,7 @@ class WorkerPool(SingleOwner):
         self.messages: dict[type[Warning], str] = {}
         """Latest message of each category, for warnings."""
         self._first_env, num_envs, ticks = share or (0, options.num_envs, None)
-        count = len(os.sched_getaffinity(0)) if options.workers is None else options.workers
+        count = 1 if options.workers is None else options.workers
         self.is_local = not count
         """True if the loop runs in this process."""
         self._make_worker: Callable[[Start, SharedArrays], Worker] = ProcessWorker if count else LocalWorker
@@ -97,6 +103,7 @@ class WorkerPool(SingleOwner):
         self._slots: list[_Slot] = []
         self._poller = select.poll()
         self._request: Request | None = None
+        self._next_check = 0.0
         self.closed = False
         """True if the running call is to end, and no other to begin."""
         self.failure: Failure | None = None
@@ -112,6 +119,8 @@ class WorkerPool(SingleOwner):
         """Input and output of each tick."""
         self.present = self.ticks[0]
         """The tick that holds the present observation."""
+        self.completed: list[Arrays] = []
+        """The ticks that all envs completed in the last request that observes."""
 
     def open(self) -> None:
         """Start the workers and wait until all are ready."""
@@ -144,10 +153,7 @@ class WorkerPool(SingleOwner):
         WorkerError
             A worker was lost for good.
         """
-        self._enqueue(request)
-        for slot in self._slots:
-            if slot.queue and slot.phase == "idle":
-                self._attempt(slot, self._send)
+        self._serve(request, wait=False)
 
     def run(self, request: Request) -> list[Any]:
         """Let every worker execute its part of ``request``; return their results, if there is no :attr:`failure`.
@@ -161,15 +167,17 @@ class WorkerPool(SingleOwner):
         ClosedError
             The pool was closed meanwhile.
         """
-        self._enqueue(request)
-        self._serve()
-        if self.failure is None:
+        self._serve(request)
+        tick = request.observed_tick
+        if self.failure is not None:
+            self.completed = self.ticks.first(self.failure.ticks if request.counts_ticks else 0)
+        else:
             if request.changes_loop and self._options.recover and not (self._replay and self._replay[-1] is request):
                 self._replay.append(request)
-            tick = request.observed_tick
             if tick is not None:
-                self.present = self.ticks[tick]
-        return [slot.result for slot in self._slots]
+                self.completed = self.ticks.first(tick + 1)
+                self.present = self.completed[tick]
+        return list(map(_RESULT, self._slots))
 
     def start_replay_from(self, request: Request) -> None:
         """Drop the requests kept so far: ``request`` brings a new worker to the present state."""
@@ -197,47 +205,40 @@ class WorkerPool(SingleOwner):
 
     # -- one request, until every worker has executed it -----------------------------------------------------------
 
-    def _enqueue(self, request: Request) -> None:
-        """Make ``request`` the one that every worker is to execute, unless it is that already."""
-        if self._request is not request:
+    def _serve(self, request: Request | None = None, wait: bool = True) -> None:
+        """Serve the queues until all are empty, first with ``request``, unless every worker is to execute it already.
+
+        Without ``wait`` return when the first request of each queue is sent.
+        """
+        if request is not None and self._request is not request:
             for slot in self._slots:
                 slot.queue, slot.failure = [request], None
             self._request = request  # nothing is sent before
-
-    def _serve(self) -> None:
-        """Serve the queues until all are empty."""
-        next_check = time.monotonic() + _POLL_INTERVAL
-        while not self.closed and (busy := [slot for slot in self._slots if slot.queue]):
+        self._next_check = time.monotonic() + _POLL_INTERVAL
+        while not self.closed and (busy := list(filter(_QUEUE, self._slots))):
             for slot in busy:
                 if slot.phase == "transfer":
                     self._replace(slot, None)
-                if slot.phase == "idle":
-                    self._attempt(slot, self._send)
-            answered = self._wait(busy)
-            for slot in answered:
-                self._attempt(slot, self._receive)
-            if time.monotonic() > next_check:
+            try:
                 for slot in busy:
-                    if slot.phase == "waiting" and slot not in answered:
-                        self._attempt(slot, self._check_alive)
-                next_check = time.monotonic() + _POLL_INTERVAL
+                    if slot.phase == "idle":
+                        self._send(slot)
+                if not wait:
+                    return
+                for slot in self._wait(busy):
+                    self._receive(slot)
+            except WorkerLost as error:
+                self._replace(slot, error)
+            except Exception as error:
+                if self.closed:
+                    raise ClosedError("this Runner was closed during a call") from error
+                raise  # a signal handler raised it
         if self.closed:
             raise ClosedError("this Runner was closed during a call")
-        failures = [slot.failure for slot in self._slots if slot.failure is not None]
-        self.failure = min(failures, key=order, default=None)
-
-    def _attempt(self, slot: _Slot, act: Callable[[_Slot], None]) -> None:
-        try:
-            act(slot)
-        except WorkerLost as error:
-            self._replace(slot, error)
-        except Exception as error:
-            if self.closed:
-                raise ClosedError("this Runner was closed during a call") from error
-            raise  # a signal handler raised it
+        self.failure = min(filter(None, map(_FAILURE, self._slots)), key=order, default=None)
 
     def _send(self, slot: _Slot) -> None:
-        slot.phase = "transfer"
+        slot.phase, slot.limit = "transfer", 0.0
         slot.worker.send(slot.queue[0])
         slot.phase = "waiting"
 
@@ -255,26 +256,43 @@ class WorkerPool(SingleOwner):
             slot.losses = 0
         slot.phase = "idle"
 
-    def _check_alive(self, slot: _Slot) -> None:
-        request, envs = slot.queue[0], slot.start.envs
-        slot.worker.check_alive(request.idle_limit, self._options.timeout + request.limit(envs.stop - envs.start))
-
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
-        """Wait briefly; return the busy slots whose worker has answered or died."""
-        waiting = [slot for slot in busy if slot.phase == "waiting"]
+        """Wait until workers have answered or died, or the pool is closed; return their slots.
+
+        The others are checked every 0.1 s; if one is lost, it is replaced, and there may be no answer.
+        """
         if self.is_local:
-            return waiting
-        left = 1e3 * _POLL_INTERVAL
-        if all(len(slot.queue) == 1 for slot in waiting):
-            # For all, one after another: to wake up for the first takes the core of one that still runs.
-            end = time.monotonic() + _POLL_INTERVAL
-            for slot in waiting:
-                if not slot.poller.poll(left):
+            return busy
+        answered = list[_Slot]()
+        while not (answered or self.closed):
+            left = 1e3 * _POLL_INTERVAL
+            for slot in busy:
+                if len(slot.queue) > 1:  # it catches up: to be given its next request at once
                     break
-                left = 1e3 * max(0.0, end - time.monotonic())
-            left = 0.0
-        readable = {descriptor for descriptor, _ in self._poller.poll(left)}
-        return [slot for slot in waiting if slot.worker.fileno() in readable]
+            else:
+                # For all, one after another: to wake up for the first takes the core of one that still runs.
+                end = time.monotonic() + _POLL_INTERVAL
+                for slot in busy:
+                    if not slot.poller.poll(left):
+                        break
+                    left = 1e3 * max(0.0, end - time.monotonic())
+                left = 0.0
+            readable = dict(self._poller.poll(left))
+            for slot in busy:
+                if slot.descriptor in readable:
+                    answered.append(slot)
+            if time.monotonic() > self._next_check:
+                self._next_check = time.monotonic() + _POLL_INTERVAL
+                for slot in busy:
+                    if slot.descriptor not in readable:
+                        request, envs = slot.queue[0], slot.start.envs
+                        slot.limit = slot.limit or self._options.timeout + request.limit(envs.stop - envs.start)
+                        try:
+                            slot.worker.check_alive(request.idle_limit, slot.limit)
+                        except WorkerLost as error:
+                            self._replace(slot, error)
+                            return answered
+        return answered
 
     # -- lost workers ----------------------------------------------------------------------------------------------
 
@@ -306,19 +324,20 @@ class WorkerPool(SingleOwner):
         slot.worker.open()
         if self._cores:
             slot.worker.pin(self._cores[slot.start.index])
-        slot.poller = _poller_of([slot.worker])
-        self._poller = _poller_of(self.workers)
+        slot.descriptor = slot.worker.fileno()
+        slot.poller = _poller_of([slot])
+        self._poller = _poller_of(self._slots)
         request, replay = self._request, self._replay
         again = [] if request is None or (replay and replay[-1] is request) else [request]
         slot.queue = [slot.start, *replay, *again]
-        slot.failure = None
+        slot.failure, slot.limit = None, 0.0
         slot.phase = "waiting"
 
 
-def _poller_of(workers: list[Worker]) -> select.poll:
+def _poller_of(slots: list[_Slot]) -> select.poll:
     """Return a poll object of the results of some workers."""
     poller = select.poll()
-    for descriptor in (worker.fileno() for worker in workers):
-        if descriptor is not None:
-            poller.register(descriptor, select.POLLIN)
+    for slot in slots:
+        if slot.descriptor is not None:
+            poller.register(slot.descriptor, select.POLLIN)
     return poller

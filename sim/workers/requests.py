@@ -6,8 +6,8 @@ import pickle
 import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass
-from operator import itemgetter, methodcaller
+from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any, Self
 
 import numpy as np
@@ -131,12 +131,6 @@ class Run(Request):
     counts_ticks = True
     idle_limit = 0.7  # it only computes
 
-    @staticmethod
-    def under(command: Command, substeps: int) -> Run:
-        """Return the run of all ticks of ``command`` (ticks, envs, dof)."""
-        setpoint, rate, feedforward = command
-        return Run(len(setpoint), substeps, rate is not None, feedforward is not None, command)
-
     @property
     def observed_tick(self) -> int:
         return self.ticks - 1
@@ -145,13 +139,7 @@ class Run(Request):
         return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
     def for_envs(self, envs: slice) -> Self:
-        return self._with(self.command.map(itemgetter((slice(None), envs))))
-
-    def copy(self) -> Self:
-        return self._with(self.command.map(methodcaller("copy")))
-
-    def _with(self, command: Command) -> Self:
-        return type(self)(self.ticks, self.substeps, self.use_rate, self.use_feedforward, command)
+        return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
 
     def write(self, arrays: Arrays, envs: slice) -> None:
         for table, rows in zip(arrays.command, self.command, strict=True):

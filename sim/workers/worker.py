@@ -146,6 +146,7 @@ class ProcessWorker(Worker):
         self._name = f"worker {start.index} (envs {start.numbers.start} to {start.numbers.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
         self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
+        self._is_unchecked = False  # since the last request was sent
         self._opening: Job[None] | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -179,7 +180,7 @@ class ProcessWorker(Worker):
 
     def send(self, request: Request) -> None:
         request.write(self._arrays, self._envs)
-        self._liveness.begin()
+        self._is_unchecked = True
         try:
             self._channel.send(request.encode(self._envs))
         except OSError as error:
@@ -197,7 +198,8 @@ class ProcessWorker(Worker):
 
     def check_alive(self, idle_limit: float, limit: float) -> None:
         liveness = self._liveness
-        liveness.sample(time.monotonic())
+        liveness.sample(time.monotonic(), self._is_unchecked)
+        self._is_unchecked = False
         if liveness.idle > (_STOP_LIMIT if liveness.stopped else idle_limit):
             state = "stopped" if liveness.stopped else "asleep"
             raise self._lost(f"is stuck: {state} for {liveness.idle:.1f} s during a request")

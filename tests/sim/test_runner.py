@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
-from dataclasses import fields
-
 import numpy as np
 import pytest
 import tiny_urdf
 
-from batchpid.sim import Robot, Runner, RunnerOptions
+from batchpid.sim import Robot, Runner
 from batchpid.sim.options import default_params
 
 
@@ -67,22 +64,6 @@ def test_a_bundled_robot_reaches_the_tutorials_target_without_params(panda):
 def test_a_floating_robot_needs_no_params():
     with Runner(Robot.load("panda", fixed_base=False), 1, workers=0) as runner:
         assert runner.step(runner.robot.start).ok.all()
-
-
-def test_the_runner_takes_every_option_by_its_name_and_default():
-    parameters = dict(inspect.signature(Runner).parameters)
-    del parameters["params"]
-    options = inspect.signature(RunnerOptions).parameters
-    assert list(parameters) == list(options) == [field.name for field in fields(RunnerOptions)]
-    for name, parameter in parameters.items():
-        assert parameter.default == options[name].default, name
-        assert parameter.kind == options[name].kind, name
-
-
-def test_options_are_plain_values_of_their_documented_type(panda):
-    options = RunnerOptions(panda, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2)
-    assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (int, int, float)
-    np.testing.assert_array_equal(options.speed_limit, np.full(panda.dof, 2.0))
 
 
 def test_its_repr_fits_two_lines(panda):

@@ -29,7 +29,9 @@ ROBOT = load_bundled("panda")
 N = 2
 SUBSTEPS = 5
 ROOT = Path(batchpid.sim.runner.__file__).parent
-MODULES = tuple(str(ROOT / part) for part in ("runner.py", "workers", "recording/recorder.py"))
+MODULES = tuple(
+    str(ROOT / part) for part in ("runner.py", "session.py", "arguments.py", "workers", "recording/recorder.py")
+)
 
 _MOMENTS = ("call", "c_call", "c_return")
 

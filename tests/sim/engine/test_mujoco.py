@@ -312,17 +312,21 @@ def test_an_env_that_fails_stays_alone(panda, on_fault):
     assert np.isfinite(with_fault.qpos).all()
 
 
-def test_a_state_that_is_not_finite_is_contained(panda):
-    with Runner(panda, 3, workers=0, engine="mujoco", control="effort", compensate="none") as runner:
+def test_a_state_that_is_not_finite_is_contained(panda, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    params = bp.make_params(panda.dof, kp=0.0, ki=0.0, kd=0.0)
+    options = {"workers": 0, "engine": "mujoco", "control": "effort", "compensate": "none", "params": params}
+    with Runner(panda, 3, **options) as runner:
         runner.reset()
-        pack = next(iter(runner._pool._slots)).worker._loop.groups[0].pack
-        pack._data[1].qvel[:] = np.nan
+        efforts = np.zeros((3, panda.dof))
+        efforts[1] = 1e30
         with pytest.warns(FaultWarning):
-            obs = runner.step(np.zeros((3, panda.dof)))
+            obs = runner.step(efforts)
         assert list(obs.ok) == [True, False, True]
-        obs = runner.reset(mask=np.array([False, True, False]))
+        runner.reset(mask=np.array([False, True, False]))
         obs = runner.step(np.zeros((3, panda.dof)))
         assert obs.ok.all()
+    assert not list(tmp_path.iterdir())  # MuJoCo's log
 
 
 # -- errors ------------------------------------------------------------------------------------------------------------

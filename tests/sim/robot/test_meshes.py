@@ -189,7 +189,7 @@ def test_a_mesh_that_changed_since_it_was_simulated_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"m\.stl: has changed since.*under another name"):
         Robot.load(path)
     mesh.write_bytes(stl())
-    assert Robot.load(path).about() == robot.about()
+    assert Robot.load(path).describe() == robot.describe()
 
 
 def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_path):
@@ -199,8 +199,9 @@ def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_pa
     first = Robot.load(path)
     (tmp_path / "other").mkdir()
     (tmp_path / "other/m.stl").write_bytes(stl())
-    assert Robot.load(write(tmp_path / "other", one_joint(arm=arm))).about() == first.about()  # but for the folder
+    moved = Robot.load(write(tmp_path / "other", one_joint(arm=arm)))
+    assert moved.describe() == first.describe(), "equal but for the folder"
     (tmp_path / "m.stl").write_bytes(ascii_stl())
-    assert Robot.load(path).about()["urdf"] != first.about()["urdf"]
+    assert Robot.load(path).describe()["urdf"] != first.describe()["urdf"]
     for name, value in (("merge_fixed", False), ("fixed_base", False), ("self_collision", "none")):
-        assert Robot.load(path, **{name: value}).about()[name] == value != first.about()[name]
+        assert Robot.load(path, **{name: value}).describe()[name] == value != first.describe()[name]

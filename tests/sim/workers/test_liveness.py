@@ -58,7 +58,7 @@ def test_work_ends_idle_time_and_is_counted(process):
     busy = process.liveness.busy
     process.spend(10.0, "R", cores=0.1)
     assert process.liveness.busy - busy == pytest.approx(1.0)
-    process.liveness.begin()
+    process.liveness.sample(process.now, is_first=True)
     assert process.liveness.busy == process.liveness.idle == 0
 
 

@@ -1,0 +1,102 @@
+"""Arguments of a Runner's commands: checked before anything changes, and returned as arrays that the caller has not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.checks.validate import AxisKind, array, env_mask, integer, read_array, within
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.faults import FARTHEST
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.limits import SetpointCheck
+
+_Axis = tuple[AxisKind, tuple[str, ...]]
+
+
+class Arguments:
+    """Checks of the arguments of a runner's commands."""
+
+    def __init__(self, options: RunnerOptions) -> None:
+        robot, own = options.robot, options.own_command
+        self._options, self._robot = options, robot
+        self._finite = options.on_invalid_input == "raise"
+        entries: _Axis = ("joint" if own is None else "entry", options.command.names)
+        self._axes: tuple[_Axis, ...] = (entries, entries, ("joint", robot.joint_names))
+        """Last axis of each array of a command: its kind, and the names of its columns."""
+        self._coupling = robot.coupling if options.sets_positions else None
+        self._limits = SetpointCheck(robot)
+        self._checks_setpoints = options.sets_positions and options.guard is None
+
+    def substeps(self, substeps: int | None) -> int:
+        """Return the sim steps of a tick, by default the runner's."""
+        return self._options.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+
+    def tick(self, setpoint: ArrayLike, setpoint_rate: ArrayLike | None, feedforward: ArrayLike | None) -> Command:
+        """Return the command (1, envs, ...) of one tick."""
+        given = {"setpoint": setpoint, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
+        command = self._read(given)
+        if self._checks_setpoints:
+            self._limits.check("setpoint", command.setpoint, stacklevel=5)
+        return command
+
+    def ticks(self, setpoints: ArrayLike, setpoint_rates: ArrayLike | None, feedforwards: ArrayLike | None) -> Command:
+        """Return the command (ticks, envs, ...) of a rollout."""
+        shape, num_envs, size = read_array("setpoints", setpoints).shape, self._options.num_envs, len(self._axes[0][1])
+        if len(shape) not in (2, 3) or shape[0] == 0:
+            raise InvalidArgumentError(
+                "setpoints",
+                f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",
+                value=shape,
+                remedy=f"repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, {size}))",
+            )
+
+        def of_ticks(name: str, value: ArrayLike | None) -> NDArray[Any] | None:
+            rows = None if value is None else read_array(name, value)
+            return rows if rows is None or rows.ndim != 2 else rows[:, None]
+
+        given = {"setpoints": setpoints, "setpoint_rates": setpoint_rates, "feedforwards": feedforwards}
+        command = self._read({name: of_ticks(name, value) for name, value in given.items()}, shape[0])
+        if self._checks_setpoints:
+            self._limits.check("setpoint", command.setpoint, stacklevel=5)
+        return command
+
+    def start(
+        self, qpos: ArrayLike | None, qvel: ArrayLike | None, mask: ArrayLike | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Return positions and velocities (envs, dof) to reset to, and the envs to reset (envs,)."""
+        position = self._pose("qpos", self._robot.start if qpos is None else qpos)
+        velocity = self._pose("qvel", 0.0 if qvel is None else qvel)
+        num_envs = self._options.num_envs
+        chosen = np.ones(num_envs, bool) if mask is None else env_mask("mask", mask, num_envs)
+        self._limits.check("qpos", self._robot.coupled(position), chosen, stacklevel=5)
+        return position, velocity, chosen
+
+    def _pose(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
+        shape = (self._options.num_envs, self._robot.dof)
+        rows = array(name, value, shape, self._robot.joint_names, finite=self._finite).copy()
+        if self._finite:
+            return within(name, rows, FARTHEST, self._robot.joint_names)
+        return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
+
+    def _read(self, given: Mapping[str, Any], ticks: int | None = None) -> Command:
+        """Return the command (ticks, envs, ...) of the arguments ``given``, of one tick if ``ticks`` is None.
+
+        Positions of followers become those that their leaders mean for them; efforts act on leaders in the loop.
+        """
+        table = (self._options.num_envs,) if ticks is None else (ticks, self._options.num_envs)
+        rows = list[Any]()
+        for (name, value), (kind, names) in zip(given.items(), self._axes, strict=True):
+            if value is None and rows:  # the setpoint, which is first, must be given
+                rows.append(None)
+                continue
+            own = array(name, value, (*table, len(names)), names, finite=self._finite, kind=kind).copy()
+            rows.append(own[None] if ticks is None else own)
+        if self._coupling is not None:
+            rows[0] = self._coupling.positions(rows[0])
+            rows[1] = None if rows[1] is None else self._coupling.rates(rows[1])
+        return Command._make(rows)

@@ -1,0 +1,139 @@
+"""Options of a Runner, as they are passed: types and documentation. :mod:`batchpid.sim.options` checks them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
+
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.ray_options import Ray
+from batchpid.sim.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.solver import MujocoSolver
+    from batchpid.sim.engine.sapien.physics import Physics
+
+ControlMode = Literal["pid", "drive", "effort"]
+
+
+class Controller(Protocol):
+    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), in SAPIEN's order, SI units.
+
+    It is called at every sim step, in the worker processes, for some of the envs at a time: the effort of an env must
+    depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
+
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
+    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
+    """
+
+    def init(self, robot: Robot, num_envs: int) -> Any:
+        """Return the state of so many envs at their start: None, an array, or tuples and dicts of these.
+
+        Every array has the envs as its first axis: states are reset by mask, and kept in snapshots. Later states have
+        the same structure, shapes and dtypes.
+        """
+
+    def __call__(
+        self,
+        state: Any,
+        setpoint: NDArray[Any],
+        qpos: NDArray[Any],
+        qvel: NDArray[Any],
+        passive: NDArray[Any],
+    ) -> tuple[Any, Any]:
+        """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
+
+        An env that has failed is given the ``neutral`` setpoint of the command, by default zeros within its bounds.
+        ``passive`` is the passive force that the runner's ``compensate`` selects, plus the caller's feedforward. The
+        arrays are read-only copies, which the controller may keep.
+        """
+
+
+Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
+Backend = Literal["numpy", "jax"]
+Precision = Literal["float64", "float32"]
+EngineName = Literal["sapien", "mujoco"]
+PhysicsPreset = Literal["accurate", "fast", "free"]
+FaultAction = Literal["hold", "reset"]
+InvalidInputAction = Literal["raise", "contain"]
+
+
+class RunnerKeywords(TypedDict, total=False):
+    """Options of a :class:`batchpid.sim.Runner`, as they are passed by keyword; all may be left out."""
+
+    workers: int | None
+    """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
+    pinned to its core. Results are bit-identical for any number of workers."""
+    timestep: float
+    """Time step of simulation and control [s]; default 1/2000."""
+    substeps: int
+    """Sim steps of one tick, all under the same setpoint; the control runs at every one of them. Default 20."""
+    control: ControlMode | Controller
+    """``"pid"``, the default; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and
+    damping; ``"effort"``: the setpoint is the joint effort; or a :class:`Controller`."""
+    backend: Backend
+    """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
+    of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,
+    the last bits of results differ."""
+    dtype: Precision
+    """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
+    compensate: Compensation
+    """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
+    ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
+    compensated."""
+    engine: EngineName
+    """Physics engine: ``"sapien"``, the default and the reference, or ``"mujoco"``, several times as fast (extra
+    ``mujoco``; docs/two-engines.md)."""
+    physics: PhysicsPreset | Physics | MujocoSolver
+    """``"accurate"`` (the default: SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
+    :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""
+    collisions: bool
+    """Default True. With False robots have no collision shapes, and there is no ground: for free motion only. Masses,
+    inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched
+    something."""
+    ground: bool | None
+    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
+    so low that other links reach the ground at its start pose."""
+    build: Callable[[Any, int], Any] | None
+    """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
+    that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
+    reports. A reset puts the content back to where ``build`` left it."""
+    pack_size: int | None
+    """Largest number of scenes that share a PhysX system; affects speed alone. Default: 4, or 64 without collisions. A
+    robot gets its own system before something touches it, so that results do not depend on the other envs
+    (docs/reliability.md)."""
+    on_fault: FaultAction
+    """``"hold"`` (the default) an env that fails at rest in its last valid state, with ``ok`` False until it is reset;
+    or ``"reset"`` it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite,
+    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
+    speed_limit: ArrayLike | None
+    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
+    actuators: bp.Actuators | None
+    """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
+    row per env. None, the default, stands for those of the robot: under control "drive" for their friction and
+    armature. ``bp.Actuators()`` is ideal. The control sees measured positions and velocities; observations hold the
+    true ones, and the effort that was delivered."""
+    randomization: Randomization | None
+    """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
+    (docs/randomization.md); default none."""
+    guard: bool | bp.Guard | None
+    """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
+    :func:`batchpid.make_guard`; default none. ``obs.guarded`` tells which setpoints were changed."""
+    on_invalid_input: InvalidInputAction
+    """``"raise"`` (the default) an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"``
+    it: the env that it is for fails."""
+    recover: bool
+    """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
+    those of an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
+    checkpoint_steps: int | None
+    """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for
+    which all commands are kept. After contacts the last bits of the results depend on it."""
+    timeout: float
+    """Seconds, by default 60, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A
+    worker that is stopped or asleep within a tick counts as stuck within a second."""
+    cluster: Literal["ray"] | Ray | None
+    """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical
+    results (docs/cluster.md)."""

@@ -1,0 +1,401 @@
+"""Commands of a Runner as transactions, with their checkpoints, recording and warnings.
+
+Longer than 300 lines because all commands are here, each with the change of state that it brings.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cached_property
+from operator import methodcaller
+from pathlib import Path
+from time import strftime
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.checks.validate import instance
+from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError
+from batchpid.io.versions import package_versions
+from batchpid.sim.arguments import Arguments
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.contact_log import MissedContactLog, MissedContactWarning
+from batchpid.sim.loop.custom import initial_state
+from batchpid.sim.loop.faults import FaultLog, FaultWarning
+from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
+from batchpid.sim.options import IDEAL, RunnerOptions
+from batchpid.sim.randomization.draws import NOTHING
+from batchpid.sim.robot.loop_stability import StabilityCheck
+from batchpid.sim.workers.pool import WorkerPool
+from batchpid.sim.workers.requests import (
+    ReadPoses,
+    ReadStateSizes,
+    Request,
+    Reset,
+    Restore,
+    Run,
+    SetActuators,
+    SetParams,
+    TakeSnapshot,
+)
+from batchpid.sim.workers.transaction import Commit, Phase, RunnerState, Transactions
+
+_COPY = methodcaller("copy")
+
+
+class TickRecorder(Protocol):
+    """Receives every tick of a runner; :class:`batchpid.sim.Recorder` is one."""
+
+    path: Path
+
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size).
+
+        After an interrupt it is called again, with the same ``observation``; it is to be recorded once.
+        """
+
+
+class Session:
+    """Commands of one :class:`batchpid.sim.Runner`, whose methods of the same names document them.
+
+    Every command first completes one that was sent or interrupted, checks its arguments, and then is one transaction
+    (:mod:`batchpid.sim.workers.transaction`). Warnings name the line that calls the runner, so the methods are called
+    by its methods directly.
+    """
+
+    def __init__(self, options: RunnerOptions, params: bp.PIDParams) -> None:
+        robot, own = options.robot, options.own_command
+        self.options = options
+        self.recorder: TickRecorder | None = None
+        """Recorder of every tick."""
+        self._arguments = Arguments(options)
+        self._stability = StabilityCheck(robot, options.timestep) if options.control == "pid" else None
+        self._has_warned = self._has_warned_of_contact = False
+        entry_names = None if own is None else own.names
+        faults = FaultLog(options.num_envs, robot.joint_names, options.timestep, options.on_fault, entry_names)
+        contacts = None
+        if not options.collisions:
+            engine = options.load_engine()
+            contacts = MissedContactLog(
+                options.num_envs, options.timestep, lambda qpos: engine.robot_dynamics(robot).nearest_links(qpos)
+            )
+        randomization = options.randomization
+        draws = NOTHING if randomization is None else randomization.first(robot, options.num_envs)
+        state = RunnerState(params, faults, draws, actuators=options.actuators, contacts=contacts)
+        self.pool = WorkerPool(options, params)
+        self._transactions = Transactions(self.pool, state, self._record)
+
+    def open(self) -> None:
+        """Start the workers, and reset all envs."""
+        self.pool.open()
+        self.reset(seed=None if self.options.randomization is None else 0)
+        if self._stability is not None:
+            self._stability.check(self.state.params, self.options.actuators, stacklevel=4)
+
+    def close(self) -> None:
+        """End the workers. May be called again, as after an interrupt."""
+        self._transactions.close()
+
+    @property
+    def state(self) -> RunnerState:
+        """State after the last command; during a call, and after the end, after the last completed one."""
+        transactions = self._transactions
+        if transactions.phase is Phase.BEGUN and not (transactions.in_use or self.pool.closed):
+            transactions.run()
+        return transactions.state
+
+    def settle(self) -> None:
+        """Complete an unfinished command, and pass on to the recorder what is not recorded, also when closed."""
+        self._transactions.run()
+
+    # -- commands --------------------------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        qpos: ArrayLike | None = None,
+        qvel: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        seed: int | ArrayLike | None = None,
+    ) -> Observation:
+        """Place robots, with a fresh state of the controller."""
+        draws = self._transactions.ready("reset").draws
+        robot, randomization = self.options.robot, self.options.randomization
+        position, velocity, chosen = self._arguments.start(qpos, qvel, mask)
+        if randomization is not None:
+            draws = randomization.redraw(robot, draws, chosen, seed)
+            position, velocity = randomization.start(position, velocity, draws, robot)
+        elif seed is not None:
+            raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
+        if (coupling := robot.coupling) is not None:
+            position, velocity = coupling.positions(position), coupling.rates(velocity)
+
+        def commit(state: RunnerState, _: list[Any]) -> tuple[RunnerState, Observation]:
+            faults = state.faults.without(chosen).with_faults(self.pool.present)
+            return state._replace(faults=faults, draws=draws), self._observation()
+
+        observation: Observation = self._execute(Reset(chosen, position, velocity, draws), commit)
+        return observation
+
+    def step(
+        self,
+        setpoint: ArrayLike,
+        setpoint_rate: ArrayLike | None,
+        feedforward: ArrayLike | None,
+        substeps: int | None,
+    ) -> Observation:
+        """Run one tick."""
+        self._transactions.ready("step")
+        count = self.options.substeps if substeps is None else self._arguments.substeps(substeps)
+        command = self._arguments.tick(setpoint, setpoint_rate, feedforward)
+        self._transactions.run(*self._ticks(command, count))
+        self._warn(stacklevel=4)
+        return Observation._make(map(_COPY, self.pool.present.observation))  # a tick has few calls (test_hops.py)
+
+    def send(
+        self,
+        setpoint: ArrayLike,
+        setpoint_rate: ArrayLike | None,
+        feedforward: ArrayLike | None,
+        substeps: int | None,
+    ) -> None:
+        """Begin a tick."""
+        self._transactions.ready("send")
+        count = self._arguments.substeps(substeps)
+        request, commit = self._ticks(self._arguments.tick(setpoint, setpoint_rate, feedforward), count)
+
+        def commit_sent(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
+            state, _ = commit(state, seconds)
+            return state._replace(sent=self._observation()), None
+
+        self._transactions.run(request, commit_sent, wait=False)
+
+    def recv(self) -> Observation:
+        """Wait for the end of the tick that was sent; return its observation."""
+        sent = self._transactions.ready().sent
+        if self._transactions.phase is not Phase.UNRECEIVED or sent is None:
+            raise CallOrderError("recv: no tick is under way; call send(setpoint) first")
+        self._transactions.phase = Phase.IDLE
+        self._warn(stacklevel=4)
+        return sent
+
+    def rollout(
+        self,
+        setpoints: ArrayLike,
+        setpoint_rates: ArrayLike | None,
+        feedforwards: ArrayLike | None,
+        progress: Callable[[Iterable[int]], Iterable[int]] | None,
+    ) -> Rollout:
+        """Run one tick for each row of ``setpoints``."""
+        steps, options = self._transactions.ready("rollout").steps, self.options
+        command = self._arguments.ticks(setpoints, setpoint_rates, feedforwards)
+        ticks = len(command.setpoint)
+        seen = empty_observation(ticks, options.num_envs, options.robot.dof)
+        times = (steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
+        info, done = self.info(), 0
+        shown = iter(range(ticks) if progress is None else progress(range(ticks)))
+        for tick in range(ticks):  # not over ``shown``, which may yield anything
+            next(shown, None)
+            if tick == done:
+                done = min(ticks, tick + self._max_ticks())
+                part = slice(tick, done)
+                rows_of_part = command.map(lambda rows, part=part: rows[part])
+                self._transactions.run(*self._ticks(rows_of_part, options.substeps))
+                self._warn(stacklevel=4)
+                for table, rows in zip(seen, self.pool.arrays.observation, strict=True):
+                    table[part] = rows[: done - tick]
+        next(shown, None)  # the end
+        info = replace(info, faults=self.state.faults.faults)
+        return Rollout(times, command.setpoint, seen, options.timestep * options.substeps, info)
+
+    def observe(self) -> Observation:
+        """Return the state of every env."""
+        self._transactions.ready()
+        return self._observation()
+
+    def poses(self) -> NDArray[np.float32]:
+        """Return the poses of the entities that ``build`` returned."""
+        self._transactions.ready()
+        rows = [row for part in self._execute(ReadPoses()) for row in part]
+        counts = [len(row) for row in rows]
+        if not rows or len(set(counts)) > 1:
+            raise InvalidArgumentError(
+                "build",
+                f"returned {sorted(set(counts))} entities, by env" if rows else "was not given",
+                remedy="let build(scene, env) return as many entities for every env",
+            )
+        return np.stack(rows)
+
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Change gains, limits and times in flight."""
+        self._transactions.ready()
+        checked = self.options.check_params(params)
+        self._execute(SetParams(checked), lambda state, _: (state._replace(params=checked), None))
+        if self._stability is not None:
+            self._stability.check(checked, self.state.actuators, stacklevel=4)
+
+    def set_actuators(self, actuators: bp.Actuators | None) -> None:
+        """Change the actuators in flight."""
+        self._transactions.ready()
+        checked = self.options.check_actuators(actuators)
+        self._execute(SetActuators(checked), lambda state, _: (state._replace(actuators=checked), None))
+
+    def snapshot(self) -> Snapshot:
+        """Return the state of all envs, from which the workers go on."""
+        self._transactions.ready()
+
+        def commit(state: RunnerState, results: list[Any]) -> tuple[RunnerState, Snapshot]:
+            episodes = None if self.options.randomization is None else state.draws.episodes
+            about, states = self.options.describe(), EnvStates.join(results)
+            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes)
+            self.pool.start_replay_from(Restore(snapshot, state.draws))
+            return state._replace(steps_since_checkpoint=0), snapshot
+
+        snapshot: Snapshot = self._execute(TakeSnapshot(), commit)
+        return snapshot
+
+    def restore(self, snapshot: Snapshot) -> Observation:
+        """Put all envs into the state of ``snapshot``."""
+        self._transactions.ready("restore")
+        options, robot = self.options, self.options.robot
+        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
+        snapshot.check(options.describe())
+        params = options.check_params(snapshot.params)
+        sizes = [size for part in self._execute(ReadStateSizes()) for size in part]
+        acting = actuators = options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
+        draws, randomization = NOTHING, options.randomization
+        if randomization is not None and snapshot.episodes is not None:
+            draws = randomization.draw(robot, snapshot.episodes)
+            acting = randomization.randomized_actuators(actuators, draws, robot)
+        snapshot.states.check(
+            options.num_envs,
+            robot.dof,
+            initial_state(options, params),
+            options.has_stiction(acting),
+            initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
+            options.guard is not None,
+            sizes,
+            options.command.size,
+        )
+        request = Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
+
+        def commit(state: RunnerState, _: list[Any]) -> tuple[RunnerState, Observation]:
+            self.pool.start_replay_from(request)
+            state = state._replace(
+                draws=draws,
+                params=params,
+                actuators=actuators,
+                steps=snapshot.steps,
+                steps_since_checkpoint=0,
+                faults=state.faults.restored(request.snapshot.states.containment["step"]),
+            )
+            return state, self._observation()
+
+        observation: Observation = self._execute(request, commit)
+        return observation
+
+    def info(self) -> RunInfo:
+        """Return robot, options and origin of a run that starts now."""
+        start, state, options = self.observe().qpos, self.state, self.options
+        draws = None if options.randomization is None else state.draws
+        return options.robot.run_info(
+            **options.values_for("recording"),
+            own_command=options.own_command,
+            params=state.params,
+            actuators=state.actuators,
+            start=start,
+            versions=dict(self._versions),
+            begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
+            faults=state.faults.faults,
+            draws=None if draws is None else {name: rows.copy() for name, rows in draws.values.items()},
+            episodes=None if draws is None else draws.episodes.copy(),
+        )
+
+    @cached_property
+    def _versions(self) -> dict[str, str]:
+        return package_versions()
+
+    # -- transactions ----------------------------------------------------------------------------------------------
+
+    def _execute(self, request: Request, *commit: Commit) -> Any:
+        """Execute a command, then warn; return its result."""
+        result = self._transactions.run(request, *commit)
+        self._warn(stacklevel=5)
+        return result
+
+    def _ticks(self, command: Command, substeps: int) -> tuple[Run, Commit]:
+        """Return the request for ticks under ``command`` (ticks, envs, ...), after a checkpoint if one is due."""
+        every, pool = self.options.checkpoint_steps, self.pool
+        if every is not None and self._transactions.state.steps_since_checkpoint >= every:
+            self.snapshot()
+        setpoint, rate, feedforward = command
+        ticks, timestep = len(setpoint), self.options.timestep
+
+        def commit(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
+            faults, contacts, unrecorded = state.faults, state.contacts, state.unrecorded
+            for done, arrays in enumerate(pool.completed, start=1):
+                faults = faults.with_faults(arrays)
+                if contacts is not None:
+                    contacts = contacts.with_contacts(arrays)
+                if self.recorder is not None:
+                    time = (state.steps + done * substeps) * timestep
+                    observation = Observation._make(map(_COPY, arrays.observation))
+                    unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
+            steps = len(pool.completed) * substeps
+            state = state._replace(
+                faults=faults,
+                contacts=contacts,
+                unrecorded=unrecorded,
+                steps=state.steps + steps,
+                steps_since_checkpoint=state.steps_since_checkpoint + steps,
+                work=state.work if pool.failure else (tuple(seconds), ticks),
+            )
+            return state, None
+
+        return Run(ticks, substeps, rate is not None, feedforward is not None, command), commit
+
+    def _max_ticks(self) -> int:
+        """Return the number of ticks that one request may have: none beyond the next checkpoint."""
+        most, every = len(self.pool.ticks), self.options.checkpoint_steps
+        if every is None:
+            return most
+        left = every - self._transactions.ready().steps_since_checkpoint % every
+        return min(most, -(-left // self.options.substeps))
+
+    def _observation(self) -> Observation:
+        """Return a copy of the present observation."""
+        return Observation._make(map(_COPY, self.pool.present.observation))
+
+    def _record(self) -> None:
+        """Pass on the ticks that are not recorded yet."""
+        transactions = self._transactions
+        while ticks := transactions.state.unrecorded:
+            try:
+                if self.recorder is not None:
+                    self.recorder.append(*ticks[0])
+            except BatchPIDError:  # the recorder cannot record any more
+                transactions.state = transactions.state._replace(unrecorded=())
+                raise
+            transactions.state = transactions.state._replace(unrecorded=ticks[1:])
+
+    def _warn(self, stacklevel: int) -> None:
+        """Warn of what the last commands brought: lost workers, faults, missed contacts."""
+        messages, state = self.pool.messages, self._transactions.state
+        while messages:
+            category, message = messages.popitem()
+            warnings.warn(message, category, stacklevel=stacklevel)
+        faults, contacts = state.faults.faults, state.contacts
+        if faults and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"{faults[0]}; see runner.faults for more, of which there is no further warning",
+                FaultWarning,
+                stacklevel=stacklevel,
+            )
+        if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
+            self._has_warned_of_contact = True
+            warnings.warn(contacts.message(), MissedContactWarning, stacklevel=stacklevel)

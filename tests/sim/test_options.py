@@ -1,0 +1,105 @@
+"""Options of a Runner: names, defaults, checked values, and the places that keep them."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import pickle
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from robots import load_bundled
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
+from batchpid.sim.engine.scene_spec import SceneSpec
+
+PANDA = load_bundled("panda")
+OWN = bp.make_actuators(PANDA.dof, coulomb=0.3, armature=0.05, command_delay=0.002)
+GEARED = dataclasses.replace(PANDA, actuators=OWN)
+
+
+def test_every_keyword_is_an_option_and_is_shown_with_its_default():
+    options = {each.name: each.default for each in fields(RunnerOptions)}
+    shown = inspect.signature(Runner).parameters
+    assert list(options) == ["robot", "num_envs", *RunnerKeywords.__annotations__]
+    assert list(shown) == ["robot", "num_envs", "params", *RunnerKeywords.__annotations__]
+    for name in RunnerKeywords.__annotations__:
+        assert shown[name].kind is inspect.Parameter.KEYWORD_ONLY
+        assert shown[name].default == options[name], name
+
+
+@pytest.mark.parametrize(
+    ("name", "near"), [("worker", "workers"), ("time_step", "timestep"), ("actuator", "actuators"), ("param", "params")]
+)
+def test_a_misspelled_option_names_the_nearest_one(name, near):
+    with pytest.raises(InvalidArgumentError, match=rf"{name}: is not an argument of Runner.*did you mean '{near}'"):
+        Runner(PANDA, 1, **{name: None})
+
+
+def test_an_unknown_engine_is_an_error_that_lists_the_known_ones():
+    with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of.*'sapien'"):
+        Runner(PANDA, 1, engine="bullet")
+
+
+def test_options_are_plain_values_of_their_documented_type():
+    options = RunnerOptions(PANDA, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2)
+    assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (int, int, float)
+    np.testing.assert_array_equal(options.speed_limit, np.full(PANDA.dof, 2.0))
+
+
+def test_defaults_are_resolved():
+    options = RunnerOptions(PANDA, 2)
+    assert isinstance(options.workers, int)
+    assert (options.ground, options.pack_size, options.guard) == (PANDA.has_ground, 4, None)
+    guarded = RunnerOptions(PANDA, 2, guard=True, collisions=False)
+    assert (guarded.ground, guarded.pack_size) == (False, 64)
+    np.testing.assert_array_equal(guarded.guard.upper, PANDA.guard().upper)
+    assert RunnerOptions(PANDA, 2, guard=False).guard is RunnerOptions(PANDA, 2, guard=None).guard is None
+
+
+def test_options_cannot_be_changed():
+    options = RunnerOptions(PANDA, 2, guard=True)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        options.timestep = 1e-3
+    other = options.with_values(workers=3)
+    assert (other.workers, other.guard, other.timestep) == (3, options.guard, options.timestep)
+    assert options.workers != 3
+
+
+def test_options_travel_to_workers_as_they_are():
+    options = RunnerOptions(GEARED, 2, actuators=bp.Actuators(), guard=True)
+    received = pickle.loads(pickle.dumps(options))
+    assert received.actuators is None
+    assert received.describe() == options.describe()
+
+
+def test_marked_options_are_fields_of_what_keeps_them():
+    options = RunnerOptions(PANDA, 2)
+    assert options.values_for("scene").keys() <= {each.name for each in fields(SceneSpec)}
+    assert options.values_for("recording").keys() <= {each.name for each in fields(RunInfo)}
+    assert options.values_for("snapshot").keys() <= options.describe().keys()
+    assert {"timestep", "collisions", "ground"} <= options.values_for("scene").keys()
+
+
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_no_actuators_are_those_of_the_robot_at_construction_and_when_assigned(control):
+    expected = OWN.joint_side() if control == "drive" else OWN
+
+    def check(actuators):
+        assert (actuators.command_delay is None) == (expected.command_delay is None)
+        np.testing.assert_array_equal(actuators.coulomb, expected.coulomb)
+        np.testing.assert_array_equal(actuators.armature, expected.armature)
+
+    with Runner(GEARED, 2, workers=0, control=control) as runner:
+        check(runner.actuators)
+        runner.actuators = bp.Actuators()
+        assert runner.actuators is None, "ideal"
+        ideal = runner.snapshot()
+        runner.actuators = None
+        check(runner.actuators)
+        runner.restore(ideal)
+        assert runner.actuators is None, "as in the snapshot"
+        runner.step(PANDA.start)
