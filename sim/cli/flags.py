@@ -38,7 +38,7 @@ Cluster = Annotated[
 Gains = Annotated[
     str | None,
     _flag(
-        "Gains: tuned, designed, tutorial, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
+        "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
         "`batchpid tune` or batchpid.save_params wrote. Default: tuned where the robot has them, else designed.",
         metavar="NAME|FILE",
     ),

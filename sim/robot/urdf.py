@@ -22,28 +22,37 @@ from batchpid.sim.robot.link_repair import MOMENTS
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
 from batchpid.sim.robot.repair import repair
-from batchpid.sim.robot.xml import number, numbers, parse_xml
+from batchpid.sim.robot.xml import number, numbers
 
 MOST_READ = 4096  # links and joints of a file
 
 
-def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, strict: bool) -> Urdf:
-    """Read and sanitise the URDF file at ``path``.
+def read_urdf(
+    root: etree._Element,
+    path: Path,
+    repairs: list[Finding],
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
+    strict: bool,
+) -> Urdf:
+    """Sanitise a URDF.
 
     Parameters
     ----------
+    root, path, repairs
+        Its root element, the file that it is from, and the findings of reading that.
     package_dirs, missing_meshes, strict
         See :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
     RobotError
-        Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a bad mesh.
+        A structure or number that SAPIEN cannot build, or a bad mesh.
     """
-    repairs: list[Finding] = []
-    root = parse_xml(path, repairs)
+    repairs = list(repairs)
     if root.tag != "robot":
-        raise RobotError(f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?")
+        problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
+        raise RobotError(f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?")
     if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
         raise RobotError(f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not need")
     repairs += repair(root, path)

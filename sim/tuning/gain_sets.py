@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options import ControlMode
 from batchpid.sim.robot.robot import Robot
 
-NAMES = ("tuned", "designed", "tutorial", "drive")
+NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
 
 
@@ -26,11 +26,12 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
 
     "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
-    SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names
-    are params files. Raises InvalidArgumentError where there is no such name or file, or the robot has no gains of it.
+    SAPIEN's tutorial, for a bundled robot, "mjcf" :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
+    "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names are params files. Raises InvalidArgumentError where
+    there is no such name or file, or the robot has no gains of it.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
-    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}
+    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params, "mjcf": robot.mjcf_gains}
     if name in named:
         return GainSet(name, named[name]())
     if name.partition(":")[0] == "drive":
