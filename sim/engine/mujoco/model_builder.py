@@ -169,23 +169,18 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
     ignored = {frozenset(pair) for pair in spec.ignored}
     solid = [link for link in owners if owners[link]]
-    excluded, split = [], set()
+    split: set[str] = set()
     for number, first in enumerate(solid):
         for second in solid[:number]:
             pairs = [frozenset(pair) in ignored for pair in product(owners[first], owners[second])]
-            if all(pairs):
-                excluded.append((names[first], names[second]))
-            elif any(pairs):
+            if any(pairs) and not all(pairs):
                 split |= {first, second}
     for link in split:
         for owner in owners[link]:
             scene.body(names[link]).add_body(name=_part(owner))
-    for pair in ignored:
-        holders = [next((link for link in split if owner in owners[link]), None) for owner in pair]
-        if None not in holders and len(set(holders)) == 2:
-            first, second = pair
-            excluded.append((_part(first), _part(second)))
-    for first, second in excluded:
+    holders = {owner: _part(owner) if link in split else names[link] for link in solid for owner in owners[link]}
+    excluded = {frozenset(holders[owner] for owner in pair) for pair in ignored if pair <= holders.keys()}
+    for first, second in sorted(sorted(pair) for pair in excluded if len(pair) == 2):
         scene.add_exclude(bodyname1=first, bodyname2=second)
     meshes: dict[bytes, str] = {}
     for link, of_link in shapes.items():
