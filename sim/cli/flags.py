@@ -54,9 +54,9 @@ Actuators = Annotated[
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or .json) "
-        "that `batchpid tune` or batchpid.save_params wrote. Default: tuned, tutorial and drive for a bundled robot, "
-        "else designed and drive.",
+        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
+        ".json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned, tutorial and drive for a bundled "
+        "robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
