@@ -20,6 +20,8 @@ from batchpid.sim.robot.self_collision import DisabledPair
 GRAVITY = (0.0, 0.0, -9.81)
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
+_ERRORS = (ValueError, mujoco.FatalError)
+"""Errors of MuJoCo's parser and compiler."""
 
 
 class Mjcf(NamedTuple):
@@ -50,7 +52,7 @@ def read_mjcf(path: Path, fixed_base: bool, missing_meshes: str) -> Mjcf:
     motors = read_motors(model, names, mimics, findings)
     tree = Tree(model, names, path, findings)
     tree.write(fixed_base, motors, mimics)
-    findings += _unused(model, names)
+    findings += [*_in_radians(model, names), *_unused(model, names)]
     key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
@@ -62,17 +64,17 @@ def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         missing = _strip(spec, path)
-    except ValueError as error:
+    except _ERRORS as error:
         raise RobotError(f"{path}: MuJoCo cannot read the file: {_line(error)}; correct it") from error
     if missing and missing_meshes == "error":
         remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
         raise RobotError(f"{path}: collision mesh not found: {', '.join(missing)}; {remedy}")
     try:
         model = spec.compile()
-    except ValueError as error:
+    except _ERRORS as error:
         try:  # something may refer to a geom that was removed
             return mujoco.MjSpec.from_file(str(path)).compile()
-        except ValueError as whole:
+        except _ERRORS as whole:
             shown = _line(error if missing else whole)
             raise RobotError(f"{path}: MuJoCo cannot compile the file: {shown}; correct it") from whole
     if missing:
@@ -81,7 +83,7 @@ def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
     return model
 
 
-def _line(error: ValueError) -> str:
+def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
@@ -108,6 +110,15 @@ def _strip(spec: Any, path: Path) -> list[str]:
     for each in [*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)]:
         spec.delete(each)
     return list(missing)
+
+
+def _in_radians(model: Any, names: Names) -> list[Finding]:
+    """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read as degrees."""
+    hinges = [joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)]
+    if not hinges or np.abs(model.jnt_range[hinges]).max() > np.deg2rad(3.2):
+        return []
+    text = "the ranges of all hinges are tiny: angles of an MJCF file are in degrees unless it says otherwise"
+    return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
 
 
 def _unused(model: Any, names: Names) -> list[Finding]:
