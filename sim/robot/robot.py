@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
+from lxml import etree
 from numpy.typing import ArrayLike
 
 import batchpid as bp
@@ -109,7 +110,7 @@ class Robot(RobotDescription):
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         repairs: list[Finding] = []
         root = parse_xml(path, repairs)
-        mjcf = _read_mjcf(path, fixed_base, missing_meshes) if root.tag == "mujoco" else None
+        mjcf = _read_mjcf(path, root, fixed_base, missing_meshes) if root.tag == "mujoco" else None
         if mjcf is not None:
             root, repairs = mjcf.root, [*repairs, *mjcf.findings]
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
@@ -252,14 +253,14 @@ def _find(name_or_path: str | Path) -> Path:
     )
 
 
-def _read_mjcf(path: Path, fixed_base: bool, missing_meshes: str) -> Mjcf:
+def _read_mjcf(path: Path, root: etree._Element, fixed_base: bool, missing_meshes: str) -> Mjcf:
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file", "mujoco") from error
     from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
 
-    return read_mjcf(path, fixed_base, missing_meshes)
+    return read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
 
 
 def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:

@@ -102,9 +102,10 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             if model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE and len(leading) == 1:
                 kp[name] += max(float(arm**2 * stiffness), 0.0)
                 kv[name] += max(float(arm**2 * rate), 0.0)
-    for follower, (leader, multiplier, _) in couplings.items():
-        armature[leader] += multiplier**2 * armature[follower]
-        armature[follower] = 0.0
+    own, armature = armature, {name: value * (name not in couplings) for name, value in armature.items()}
+    for follower in couplings:
+        for leader, multiplier in _leading({follower: 1.0}, couplings).items():
+            armature[leader] += multiplier**2 * own[follower]
     for joint, name in names.joints.items():
         limits.setdefault(name, math.inf)
         if model.jnt_actfrclimited[joint]:

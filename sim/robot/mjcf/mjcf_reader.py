@@ -37,8 +37,10 @@ class Mjcf(NamedTuple):
     findings: tuple[Finding, ...]
 
 
-def read_mjcf(path: Path, fixed_base: bool, missing_meshes: str) -> Mjcf:
-    """Return the content of the MJCF file at ``path``; the arguments are those of :meth:`batchpid.sim.Robot.load`.
+def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
+    """Return the content of the MJCF file at ``path`` as the robot ``name``.
+
+    The other arguments are those of :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
@@ -52,6 +54,7 @@ def read_mjcf(path: Path, fixed_base: bool, missing_meshes: str) -> Mjcf:
     motors = read_motors(model, names, mimics, findings)
     tree = Tree(model, names, path, findings)
     tree.write(fixed_base, motors, mimics)
+    tree.root.set("name", name)
     findings += [*_in_radians(model, names), *_unused(model, names)]
     key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -59,32 +62,42 @@ def read_mjcf(path: Path, fixed_base: bool, missing_meshes: str) -> Mjcf:
     return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, tuple(findings))
 
 
+class _Attempt(NamedTuple):
+    """Model of a file, or None with MuJoCo's reason; missing files of collision meshes, whose geoms are left out."""
+
+    model: Any | None
+    missing: list[str]
+    problem: str
+
+
 def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
     """Return the compiled model, if possible without geoms that are only drawn, whose meshes take time to read."""
+    stripped = _attempt(path, strip=True)
+    if stripped.model is not None and not stripped.missing:
+        return stripped.model
+    whole = _attempt(path, strip=False)  # something may refer to a removed geom, and a missing file be elsewhere
+    if whole.model is not None:
+        return whole.model
+    names = ", ".join(stripped.missing)
+    if names and missing_meshes == "error":
+        remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
+        raise RobotError(f"{path}: collision mesh not found: {names}; {remedy}")
+    if not names or stripped.model is None:
+        problem = stripped.problem if names else whole.problem
+        raise RobotError(f"{path}: MuJoCo cannot compile the file: {problem}; correct it")
+    text = f"collision meshes not found, simulated without: {names}"
+    findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
+    return stripped.model
+
+
+def _attempt(path: Path, strip: bool) -> _Attempt:
+    missing: list[str] = []
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        missing = _strip(spec, path)
+        missing = _strip(spec, path) if strip else []
+        return _Attempt(spec.compile(), missing, "")
     except _ERRORS as error:
-        raise RobotError(f"{path}: MuJoCo cannot read the file: {_line(error)}; correct it") from error
-    if missing and missing_meshes == "error":
-        remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
-        raise RobotError(f"{path}: collision mesh not found: {', '.join(missing)}; {remedy}")
-    try:
-        model = spec.compile()
-    except _ERRORS as error:
-        try:  # something may refer to a geom that was removed
-            return mujoco.MjSpec.from_file(str(path)).compile()
-        except _ERRORS as whole:
-            shown = _line(error if missing else whole)
-            raise RobotError(f"{path}: MuJoCo cannot compile the file: {shown}; correct it") from whole
-    if missing:
-        text = f"collision meshes not found, simulated without: {', '.join(missing)}"
-        findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
-    return model
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+        return _Attempt(None, missing, " ".join(str(error).split()))
 
 
 def _strip(spec: Any, path: Path) -> list[str]:

@@ -44,7 +44,7 @@ class Tree:
         self._model, self._names, self._path, self._findings = model, names, path, findings
         self._shapes = ShapeWriter(model, names, findings)
         self._anchors = {0: np.zeros(3)}  # origin of each body's link, in the frame of the body
-        self.root = etree.Element("robot", name=path.stem)
+        self.root = etree.Element("robot")
         self.solid: dict[int, str] = {}
 
     def write(self, fixed_base: bool, motors: Motors, couplings: Couplings) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +144,7 @@ def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
 
 def test_joints_are_those_of_the_file(load):
     robot = load(ARM)
+    assert (robot.name, load(CHAIN).name) == ("arm", "robot")  # of the model, else of the file
     assert robot.joint_names == ("lift", "reach", "turn")
     assert [joint.type for joint in robot.joints] == ["revolute", "prismatic", "continuous"]
     np.testing.assert_array_equal(robot.lower, [-1, -0.1, -np.inf])
@@ -313,6 +316,24 @@ def test_gains_of_servos(load, panda):
             gain_set(other, "mjcf")
 
 
+def test_several_actuators_of_a_joint_add_up(load):
+    text = two_links(
+        rest="""<actuator><position joint="j" kp="5" gear="2" forcerange="-1 1"/>
+        <velocity joint="j" kv="3" forcerange="-4 4"/><motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>"""
+    )
+    robot = load(text)
+    np.testing.assert_array_equal(robot.effort_limit, [12])
+    np.testing.assert_array_equal([np.ravel(robot.mjcf_gains().kp), np.ravel(robot.mjcf_gains().kd)], [[20], [3]])
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
+def test_armature_and_damping_of_actuators(load):
+    text = two_links(rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>')
+    robot = load(text)
+    np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
+    np.testing.assert_allclose(robot.damping, [1.8])
+
+
 def test_floating_base(load):
     fixed, floating = load(WALKER), load(WALKER, fixed_base=False)
     assert fixed.dof == floating.dof == 2
@@ -375,7 +396,7 @@ def test_a_plain_file_needs_no_repair(load):
 BAD = {
     "ball joint": (two_links('<joint name="wrist" type="ball"/>'), "ball joint 'wrist'.*replace it by three hinges"),
     "no joint": (two_links(""), "without moving joints"),
-    "not compiled": (two_links('<joint name="j" pos="x"/>'), "MuJoCo cannot read the file.*pos"),
+    "not compiled": (two_links('<joint name="j" pos="x"/>'), "MuJoCo cannot compile the file.*pos"),
     "no mass": (two_links(geom=""), "MuJoCo cannot compile the file.*mass"),
     "two robots": (
         two_links().replace(
@@ -414,6 +435,24 @@ def test_a_geom_that_is_referred_to_stays(load):
     geom = f'{inertial}{BOX}<geom name="shown" size=".1" contype="0" conaffinity="0"/>'
     sensor = '<sensor><framepos objtype="geom" objname="shown"/></sensor>'
     assert load(two_links(rest=sensor).replace(BOX, geom, 1)).dof == 1
+
+
+def test_an_include_brings_its_bodies(load, tmp_path):
+    arm = f'<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>{BOX}</body></mujocoinclude>'
+    (tmp_path / "arm.xml").write_text(arm)
+    assert load('<mujoco><worldbody><include file="arm.xml"/></worldbody></mujoco>').joint_names == ("j",)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # for MuJoCo's log
+    rng = random.Random(seed)
+    for _ in range(25):
+        text = rng.choice([*TEXTS.values(), *(text for text, *_ in FINDINGS.values())])
+        begin = rng.randrange(len(text))
+        part = rng.choice(["", "0", "-1", "nan", "1e300", "<joint/>", "<freejoint/>", "</body>", 'mass="0"', "<"])
+        with suppress(RobotError):
+            load(text[:begin] + part + text[begin + rng.randrange(8) :])
 
 
 def test_needs_the_extra(load, monkeypatch):
