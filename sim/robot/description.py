@@ -72,11 +72,10 @@ def register_engine(load: Callable[[], RobotFunctions]) -> None:
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of the mimic joints
-    among them to their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body
-    that links joined by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` is None
-    unless the robot is bundled, ``defaults`` are None unless it is from an MJCF file. ``package_dirs`` are the folders
-    in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of mimic joints to
+    their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body that links joined
+    by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` are a bundled robot's and
+    ``defaults`` an MJCF file's, else None. Meshes are looked up in ``package_dirs`` first. No ``actuators``: ideal ones.
     """
 
     path: Path
@@ -204,8 +203,7 @@ class RobotDescription(Urdf):
         """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to the joint limits."""
         if self.settings is not None:
             return self.settings.start.copy()
-        start = np.zeros(self.dof) if self.defaults is None else self.defaults.start
-        return self.coupled(np.clip(start, self.lower, self.upper))
+        return self.coupled(np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper))
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
