@@ -75,7 +75,7 @@ class RobotDescription(Urdf):
     ``joints`` are the degrees of freedom, those of ``all_joints`` that move; ``coupling`` is that of mimic joints to
     their leaders, None without. ``bodies`` is the placement of every link, by name: in the rigid body that links joined
     by fixed joints are simulated as, or, without ``merge_fixed``, in itself. ``settings`` are a bundled robot's and
-    ``defaults`` an MJCF file's, else None. Meshes are looked up in ``package_dirs`` first. No ``actuators``: ideal ones.
+    ``defaults`` an MJCF file's, else None. Meshes are looked up in ``package_dirs`` first. No ``actuators``: ideal.
     """
 
     path: Path
