@@ -1,7 +1,7 @@
 """Every code block of the pages runs; every command, link and make target in their text exists.
 
 Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
-which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``gains.yaml`` and
+which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``arm.xml``, ``gains.yaml`` and
 ``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
 within the text. C blocks compile next to the files that the commands of their page write.
 """
@@ -35,6 +35,9 @@ SHORTER = {
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
+MJCF = """<mujoco>
+<worldbody><body><joint name="hinge" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/></body></worldbody>
+<actuator><position joint="hinge" kp="100" kv="10"/></actuator></mujoco>"""
 ONLY_PARSED = ("bench", "tune", "identify", "render", "survey")
 
 
@@ -112,9 +115,12 @@ def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     panda = Robot.load("panda")
     shutil.copy(panda.path, "arm.urdf")
+    Path("arm.xml").write_text(MJCF)
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
     bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
     for match in blocks(page, "sh"):
+        if missing(match):
+            continue
         for line in match["code"].splitlines():
             words = shlex.split(line, comments=True)
             if words:

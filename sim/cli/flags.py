@@ -38,7 +38,7 @@ Cluster = Annotated[
 Gains = Annotated[
     str | None,
     _flag(
-        "Gains: tuned, designed, tutorial, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
+        "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
         "`batchpid tune` or batchpid.save_params wrote, or a controller's YAML of ros2_control. Default: tuned where "
         "the robot has them, else designed.",
         metavar="NAME|FILE",
@@ -55,7 +55,8 @@ Actuators = Annotated[
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or .json) "
+        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
+        ".json) "
         "that `batchpid tune` or batchpid.save_params wrote, or a controller's YAML of ros2_control. Default: tuned, "
         "tutorial and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",

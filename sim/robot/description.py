@@ -23,7 +23,7 @@ from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.robot.meshes import content_of
-from batchpid.sim.robot.parts import Joint, LinkMass, Placement, Settings, Urdf
+from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
 
@@ -77,8 +77,8 @@ class RobotDescription(Urdf):
     ``joints`` are the degrees of freedom, the moving joints of ``all_joints``; ``coupling`` couples the mimic joints
     among them to their leaders, and is None without mimic joints. ``bodies`` is the placement of every link, by name,
     in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is False.
-    ``settings`` is None unless the robot is bundled. ``package_dirs`` are the folders in which meshes are looked up
-    first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``settings`` are a bundled robot's and ``defaults`` an MJCF file's, else None. ``package_dirs`` are the folders in
+    which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -93,6 +93,7 @@ class RobotDescription(Urdf):
     coupling: Coupling | None = None
     package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
+    defaults: FileDefaults | None = None
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
@@ -205,10 +206,10 @@ class RobotDescription(Urdf):
 
     @property
     def start(self) -> Float64:
-        """Start pose (dof,) [rad or m]: the bundled settings', else zero, clipped to the joint limits."""
+        """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to the joint limits."""
         if self.settings is not None:
             return self.settings.start.copy()
-        return self.coupled(np.clip(np.zeros(self.dof), self.lower, self.upper))
+        return self.coupled(np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper))
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
@@ -290,7 +291,7 @@ class RobotDescription(Urdf):
             "robot": self.name,
             "urdf": self._urdf_digest,
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
-            "settings": digest(self.settings),
+            "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
         }
 

@@ -130,6 +130,15 @@ class Settings:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class FileDefaults:
+    """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos; None without servos."""
+
+    start: Float64
+    kp: Float64 | None = None
+    kv: Float64 | None = None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Urdf:
     """URDF prepared for headless simulation.

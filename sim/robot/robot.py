@@ -1,4 +1,4 @@
-"""Robot: a URDF, parsed once and checked, for headless simulation."""
+"""Robot: a URDF or MJCF file, parsed once and checked, for headless simulation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -25,12 +25,16 @@ from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple, coupling_of
-from batchpid.sim.robot.parts import Joint, Settings
+from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
 from batchpid.sim.robot.preflight import check
 from batchpid.sim.robot.robot_tree import kinematic_tree
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
+from batchpid.sim.robot.source import read_source
 from batchpid.sim.robot.urdf import read_urdf
 from batchpid.task_space.kinematic_tree import KinematicTree
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
 
 _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
@@ -56,7 +60,7 @@ class Robot(RobotDescription):
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
     ) -> Robot:
-        """Load a bundled robot by name (``Robot.bundled()``), or any URDF by path.
+        """Load a bundled robot by name (``Robot.bundled()``), or any URDF or MJCF file (extra ``mujoco``) by path.
 
         Parameters
         ----------
@@ -79,7 +83,8 @@ class Robot(RobotDescription):
             name, disables and enables further pairs. ``"none"``: no link collides with another.
         actuators
             Motors and sensors that runners of this robot have by default: :class:`batchpid.Actuators` of one row, or a
-            file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones.
+            file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
+            armature of an MJCF file.
         strict
             True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
 
@@ -88,8 +93,10 @@ class Robot(RobotDescription):
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is not a usable URDF; the message names the element and the remedy. With ``strict``, it needs
-            repairs, which the message lists.
+            The file is neither a usable URDF nor a usable MJCF file; the message names the element and the remedy. With
+            ``strict``, it needs repairs, which the message lists.
+        MissingDependencyError
+            The file is MJCF, and the package ``mujoco`` is missing.
         InvalidArgumentError
             An option has none of the values above.
         """
@@ -103,7 +110,8 @@ class Robot(RobotDescription):
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
-        urdf = read_urdf(path, folders, missing_meshes, strict)
+        root, repairs, mjcf = read_source(path, fixed_base, missing_meshes)
+        urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         bodies = place_links(urdf.urdf, merge_fixed)
@@ -111,12 +119,15 @@ class Robot(RobotDescription):
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
             raise RobotError(f"{path}: {problem}; {'split the robot' if merge_fixed else 'load with merge_fixed=True'}")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
-        srdf = path.with_suffix(".srdf")
+        beside = path.with_suffix(".srdf")
+        srdf = read_srdf(beside, [link.name for link in urdf.links]) if os.path.isfile(beside) else Srdf()
+        if mjcf is not None:
+            srdf = srdf._replace(disabled=(*mjcf.pairs, *srdf.disabled))
         bundled = path.parent == _ASSETS
         robot = cls(
             **vars(urdf),
             path=path,
-            srdf=read_srdf(srdf, [link.name for link in urdf.links]) if os.path.isfile(srdf) else Srdf(),
+            srdf=srdf,
             self_collision=self_collision,
             joints=joints,
             coupling=coupling_of(joints),
@@ -126,7 +137,10 @@ class Robot(RobotDescription):
             package_dirs=folders,
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
+            defaults=None if mjcf is None else _file_defaults(mjcf, joints),
         )
+        if actuators is None and mjcf is not None and any(mjcf.motors.armature.values()):
+            actuators = bp.make_actuators(robot.dof, armature=[mjcf.motors.armature[joint.name] for joint in joints])
         return robot if actuators is None else replace(robot, actuators=load_robot_actuators(actuators, robot))
 
     @staticmethod
@@ -232,6 +246,22 @@ class Robot(RobotDescription):
             raise InvalidArgumentError("robot", f"{self.name!r} has no tuned gains", remedy=remedy)
         return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
 
+    def mjcf_gains(self) -> bp.PIDParams:
+        """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
+
+        Joints without servo have gains of 0. The setpoint is a joint's position, whatever unit the servo's control has.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not from an MJCF file, or that has no servos.
+        """
+        defaults = self.defaults
+        if defaults is None or defaults.kp is None or defaults.kv is None:
+            problem = f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an affine bias)"
+            raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
+        return self.params(kp=defaults.kp, ki=0.0, kd=defaults.kv, measurement_rate="measured")
+
 
 def _find(name_or_path: str | Path) -> Path:
     path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
@@ -241,8 +271,19 @@ def _find(name_or_path: str | Path) -> Path:
         return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
-        "check the spelling, or pass the path of a URDF"
+        "check the spelling, or pass the path of a URDF or MJCF file"
     )
+
+
+def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
+    names = [joint.name for joint in joints]
+    start = read_only(np.array([mjcf.start[name] for name in names]))
+    if not any(mjcf.motors.kp.values()):
+        return FileDefaults(start)
+    kp, kv = (
+        read_only(np.array([gains.get(name, 0.0) for name in names])) for gains in (mjcf.motors.kp, mjcf.motors.kv)
+    )
+    return FileDefaults(start, kp, kv)
 
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:

@@ -61,6 +61,8 @@ def surfaces(
     except ImportError:
         raise MissingDependencyError("trimesh", "drawing a robot", "view") from None
     original, sanitised = parse_xml(robot.path), etree.fromstring(robot.urdf.encode())
+    if original.tag == "mujoco":  # drawn by its collision shapes
+        original = sanitised
     colours = {
         material.get("name"): _rgba(material.find("color"), f"{robot.path}: material")
         for material in original.iter("material")

@@ -22,25 +22,35 @@ from batchpid.sim.robot.link_repair import MOMENTS
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
 from batchpid.sim.robot.repair import repair
-from batchpid.sim.robot.xml import number, numbers, parse_xml
+from batchpid.sim.robot.xml import number, numbers
 
 MOST_READ = 4096  # links and joints of a file
 
 
-def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, strict: bool) -> Urdf:
-    """Read and sanitise the URDF file at ``path``.
+def read_urdf(
+    root: etree._Element,
+    path: Path,
+    repairs: list[Finding],
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
+    strict: bool,
+) -> Urdf:
+    """Sanitise a URDF.
 
     Parameters
     ----------
+    root, path, repairs
+        Its root element, the file that it is from, and the findings of reading that.
     package_dirs, missing_meshes, strict
         See :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
     RobotError
-        Unreadable file, malformed XML, an entity or DTD, a structure or number that SAPIEN cannot build, a bad mesh.
+        A structure or number that SAPIEN cannot build, or a bad mesh.
     """
-    root, missing, repairs = read_repaired(path, package_dirs, missing_meshes)
+    repairs = list(repairs)
+    missing = repair_urdf(root, path, repairs, package_dirs, missing_meshes)
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
     added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
@@ -54,14 +64,13 @@ def read_urdf(path: Path, package_dirs: tuple[Path, ...], missing_meshes: str, s
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
 
 
-def read_repaired(
-    path: Path, package_dirs: tuple[Path, ...], missing_meshes: str
-) -> tuple[etree._Element, list[str], list[Finding]]:
-    """Return the repaired ``<robot>`` of the file at ``path``, its missing meshes, and the repairs; see above."""
-    repairs: list[Finding] = []
-    root = parse_xml(path, repairs)
+def repair_urdf(
+    root: etree._Element, path: Path, repairs: list[Finding], package_dirs: tuple[Path, ...], missing_meshes: str
+) -> list[str]:
+    """Repair the ``<robot>`` of the file at ``path``, and append the repairs; return its missing meshes. See above."""
     if root.tag != "robot":
-        raise RobotError(f"{path}: the root element is <{root.tag}>, not <robot>; is this a URDF (not SDF, xacro)?")
+        problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
+        raise RobotError(f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?")
     if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
         raise RobotError(f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not need")
     repairs += repair(root, path)
@@ -75,7 +84,7 @@ def read_repaired(
         text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         remedy = "repair the files, or pass package_dirs=[...] to Robot.load"
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
-    return root, missing, repairs
+    return missing
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:

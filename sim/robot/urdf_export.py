@@ -16,8 +16,8 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.meshes import find_mesh
 from batchpid.sim.robot.repair import UNUSED
-from batchpid.sim.robot.urdf import read_repaired, read_urdf
-from batchpid.sim.robot.xml import parse_xml
+from batchpid.sim.robot.source import read_source
+from batchpid.sim.robot.urdf import read_urdf, repair_urdf
 
 
 def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
@@ -39,12 +39,14 @@ def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
         The file cannot be read, or has changed since the robot was loaded.
     """
     path, packages = robot.path, robot.package_dirs
-    if read_urdf(path, packages, "skip", False).urdf != robot.urdf:
+    source, findings, _ = read_source(path, robot.fixed_base, "skip")
+    root = deepcopy(source)
+    if read_urdf(deepcopy(source), path, findings, packages, "skip", False).urdf != robot.urdf:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
-    root, *_ = read_repaired(path, packages, "skip")
+    repair_urdf(root, path, findings, packages, "skip")
     root.set("name", robot.name)
     found = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
-    found += _copy_unused(parse_xml(path, []), root, path, packages)
+    found += _copy_unused(source, root, path, packages)
     found += _lacking(robot)
     if folder is not None:
         for mesh in root.iter("mesh"):

@@ -15,7 +15,7 @@ from batchpid.io import documents
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
 
-NAMES = ("tuned", "designed", "tutorial", "drive")
+NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
 
 
@@ -31,8 +31,9 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
 
     "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
-    SAPIEN's tutorial, for a bundled robot; "drive" or "drive:STIFFNESS,DAMPING" is PhysX's internal drive. Other names
-    are params files, or files of ros2_control, whose differences from the law are warnings.
+    SAPIEN's tutorial, for a bundled robot, "mjcf" :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
+    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or files of ros2_control,
+    whose differences from the law are warnings.
 
     Raises
     ------
@@ -40,7 +41,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         There is no such name or file, or the robot has no gains of it.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
-    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params}
+    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params, "mjcf": robot.mjcf_gains}
     if name in named:
         return GainSet(name, named[name]())
     if name.partition(":")[0] == "drive":

@@ -6,14 +6,16 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.checks.validate import file_path, integer, number
@@ -239,6 +241,21 @@ def add_floor(scene: Any, layout: RobotLayout, ground: bool, material: Any) -> N
     builder.build_kinematic(name="grid")
 
 
+@contextmanager
+def _drawn_file(robot: Robot) -> Iterator[str]:
+    """Yield the path of a URDF to draw: the robot's own or, for one from an MJCF file, its collision shapes."""
+    if robot.defaults is None:
+        yield str(robot.path)
+        return
+    root = etree.fromstring(robot.urdf.encode())
+    for collision in root.iter("collision"):
+        collision.tag = "visual"
+    with tempfile.NamedTemporaryFile("wb", suffix=".urdf") as file:
+        file.write(etree.tostring(root))
+        file.flush()
+        yield file.name
+
+
 class _RenderScene:
     """Lit SAPIEN scene with the robots of a run, which are placed and not simulated."""
 
@@ -255,7 +272,8 @@ class _RenderScene:
         material = sapien.render.RenderMaterial(base_color=[0.62, 0.66, 0.72, 1.0], roughness=0.9)
         add_floor(self.scene, layout, ground, material)
         loader = self.scene.create_urdf_loader()
-        self._articulations = [loader.load(str(robot.path)) for _ in layout.positions]
+        with _drawn_file(robot) as path:
+            self._articulations = [loader.load(path) for _ in layout.positions]
         for articulation, position in zip(self._articulations, layout.positions, strict=True):
             articulation.set_root_pose(sapien.Pose(position))
 

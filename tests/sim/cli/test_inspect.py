@@ -121,3 +121,15 @@ def test_unknown_robot(batchpid):
     status, out, err = batchpid("inspect", "panda2")
     assert (status, out) == (2, "")
     assert "'panda2'" in err
+
+
+def test_inspects_an_mjcf_file(tmp_path, batchpid):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    link = '<body name="{}"><joint name="hinge" armature=".1"/><geom size=".1" mass="2"/>{}</body>'
+    path.write_text(f"<mujoco><worldbody>{link.format('arm', '<site/>')}</worldbody></mujoco>")
+    status, out, _ = batchpid("inspect", path)
+    assert status == 0
+    assert "1 site; expect no effect" in out
+    assert "world > arm" in out
+    assert "2 kg" in out

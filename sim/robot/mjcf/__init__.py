@@ -1,0 +1,1 @@
+"""MJCF files as robots (extra ``mujoco``), compiled by MuJoCo and written as the equivalent URDF."""

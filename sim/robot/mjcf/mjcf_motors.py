@@ -1,0 +1,182 @@
+"""Actuators and coupled joints of a compiled MJCF file, as effort limits, armature, gains and mimic joints.
+
+An actuator with force F and moment arm g on a joint (the gear, times the joint's coefficient in a fixed tendon) applies
+the effort g F; a follower q' = m q adds m g' to the arm on its leader. A servo F = k u + b - kp g q - kv g q' has the
+gains g^2 kp and g^2 kv of a PID whose setpoint is its target in units of the joint. (MuJoCo's documentation,
+"Computation", actuation model.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_names import Names
+
+Couplings = dict[str, tuple[str, float, float]]
+"""Leader, multiplier and offset of each follower, as in ``<mimic>``."""
+_TRN, _BIAS, _EQ = mujoco.mjtTrn, mujoco.mjtBias, mujoco.mjtEq
+
+
+class Motors(NamedTuple):
+    """Quantities of the joints by name, in N m or N."""
+
+    effort_limit: dict[str, float]
+    """Infinite where the file gives none."""
+    armature: dict[str, float]
+    """Reflected inertia [kg m^2 or kg]; that of followers is added to their leaders'."""
+    damping: dict[str, float]
+    """Damping of the actuators, in addition to the joints'."""
+    kp: dict[str, float]
+    kv: dict[str, float]
+    """Gains of servos; joints without servo are left out."""
+
+
+def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplings:
+    """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the reference pose."""
+    couplings: Couplings = {}
+    others: dict[str, int] = defaultdict(int)
+    for equality in np.flatnonzero(model.eq_active0):
+        if model.eq_type[equality] != _EQ.mjEQ_JOINT:
+            others[_EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()] += 1
+            continue
+        follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        name = names.joints.get(follower, "")
+        offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
+        problem = None
+        if leader not in names.joints:
+            problem = "an equality that holds the joint at a position is not simulated"
+        elif any(higher) or multiplier == 0:
+            problem = f"an equality that couples the joint to {names.joints[leader]!r} nonlinearly is not simulated"
+        elif name in couplings:
+            problem = "of several equalities of the joint the first is simulated"
+        if problem is not None:
+            findings.append(Finding("warning", "mimic", problem, "give the joint a setpoint of its own", name))
+            continue
+        rest, rest_of_leader = (float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (follower, leader))
+        couplings[name] = names.joints[leader], multiplier, rest + offset - multiplier * rest_of_leader
+    if others:
+        listed = ", ".join(f"{count} {kind}" for kind, count in others.items())
+        text = f"equality constraints other than of joints are not simulated: {listed}; links move as a tree"
+        findings.append(Finding("warning", "equality", text, "expect closed loops to be open"))
+    return couplings
+
+
+def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[Finding]) -> Motors:
+    """Return what the actuators of the model do to its joints, each with a finding if a motor cannot do it."""
+    armature = {name: float(model.dof_armature[model.jnt_dofadr[joint]]) for joint, name in names.joints.items()}
+    damping = dict.fromkeys(armature, 0.0)
+    limits: dict[str, float] = defaultdict(float)
+    kp: dict[str, float] = defaultdict(float)
+    kv: dict[str, float] = defaultdict(float)
+    driven: set[str] = set()
+    for actuator in range(model.nu):
+        arms = _arms(model, actuator, names)
+        label = model.actuator(actuator).name or f"number {actuator}"
+        if not arms:
+            text = f"actuator {label!r} acts on no joint, or by a spatial tendon: left out"
+            findings.append(Finding("warning", "actuator", text, "expect every joint to have a motor of its own"))
+            continue
+        for name, arm in arms.items():
+            armature[name] += arm**2 * _field(model, "actuator_armature", actuator)
+            damping[name] += arm**2 * _field(model, "actuator_damping", actuator)
+        leading = _leading(arms, couplings)
+        if not leading:
+            continue  # a gear of 0
+        driven |= leading.keys()
+        if len(leading) > 1:
+            text = f"actuator {label!r} pulls several joints: each has a motor of its own here, as strong as all"
+            findings += [Finding("warning", "actuator", text, "control them together", name) for name in leading]
+        if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE:
+            text = f"actuator {label!r} has dynamics of its own, which are not simulated"
+            findings.append(Finding("warning", "actuator", text, "give lag= to make_actuators", next(iter(leading))))
+        force = _force_limit(model, actuator, next(iter(leading)), findings)
+        stiffness, rate = -model.actuator_biasprm[actuator, 1:3]
+        for name, arm in leading.items():
+            limits[name] += abs(arm) * force
+            if model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE and len(leading) == 1:
+                kp[name] += max(float(arm**2 * stiffness), 0.0)
+                kv[name] += max(float(arm**2 * rate), 0.0)
+    own, armature = armature, {name: value * (name not in couplings) for name, value in armature.items()}
+    for follower in couplings:
+        for leader, multiplier in _leading({follower: 1.0}, couplings).items():
+            armature[leader] += multiplier**2 * own[follower]
+    for joint, name in names.joints.items():
+        limits.setdefault(name, math.inf)
+        if model.jnt_actfrclimited[joint]:
+            limits[name] = min(limits[name], _magnitude(model.jnt_actfrcrange[joint], name, findings))
+        if model.nu and name not in driven and name not in couplings:
+            text = "no actuator of the file moves the joint: it is controlled as all others"
+            findings.append(Finding("warning", "actuator", text, "give it gains of 0 to let it move freely", name))
+    findings += _tendons(model)
+    return Motors(dict(limits), armature, damping, dict(kp), dict(kv))
+
+
+def _field(model: Any, name: str, index: int) -> float:
+    values = getattr(model, name, None)  # older versions have neither armature nor damping of actuators
+    return 0.0 if values is None else float(values[index])
+
+
+def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
+    """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by name; else None."""
+    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    gear = float(model.actuator_gear[actuator, 0])
+    if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
+        return {names.joints[target]: gear} if target in names.joints else None
+    if kind != _TRN.mjTRN_TENDON:
+        return None
+    wraps = range(int(model.tendon_adr[target]), int(model.tendon_adr[target] + model.tendon_num[target]))
+    if any(model.wrap_type[wrap] != mujoco.mjtWrap.mjWRAP_JOINT for wrap in wraps):
+        return None
+    arms: dict[str, float] = defaultdict(float)
+    for wrap in wraps:
+        arms[names.joints[int(model.wrap_objid[wrap])]] += gear * float(model.wrap_prm[wrap])
+    return dict(arms)
+
+
+def _leading(arms: dict[str, float], couplings: Couplings) -> dict[str, float]:
+    """Return the moment arms on the independent joints, with those on their followers."""
+    leading: dict[str, float] = defaultdict(float)
+    for name, arm in arms.items():
+        for _ in couplings:  # at most as many leaders of leaders
+            if name in couplings:
+                name, arm = couplings[name][0], arm * couplings[name][1]
+        leading[name] += arm
+    return {name: arm for name, arm in leading.items() if arm}
+
+
+def _force_limit(model: Any, actuator: int, name: str, findings: list[Finding]) -> float:
+    """Return the largest magnitude of an actuator's force that both its signs reach."""
+    if model.actuator_forcelimited[actuator]:
+        return _magnitude(model.actuator_forcerange[actuator], name, findings)
+    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+    if fixed and model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE and model.actuator_ctrllimited[actuator]:
+        ends = model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]
+        return _magnitude(ends, name, findings)
+    return math.inf
+
+
+def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
+    """Return the magnitude of a symmetric range, else the smaller one that is not zero, with a finding."""
+    magnitudes = sorted(abs(float(end)) for end in ends)
+    if magnitudes[0] != magnitudes[1]:
+        text = "the limits of the effort differ by direction: the smaller one that is not zero holds in both"
+        detail = f"{min(ends):g} to {max(ends):g}"
+        remedy = "pass effort_min= and effort_max= to robot.params()"
+        findings.append(Finding("warning", "limits", text, remedy, name, detail=detail))
+    return magnitudes[0] or magnitudes[1]
+
+
+def _tendons(model: Any) -> list[Finding]:
+    """Return a finding of tendons that act on the joints by themselves."""
+    passive = [model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited]
+    acting = [model.tendon(tendon).name for tendon in range(model.ntendon) if any(field[tendon] for field in passive)]
+    if not acting:
+        return []
+    text = f"springs, damping, friction and limits of tendons are not simulated: {', '.join(map(repr, acting))}"
+    return [Finding("warning", "tendon", text, "expect their joints to move freely")]

@@ -1,0 +1,49 @@
+"""Names of the links and joints that bodies and joints of MuJoCo become."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+
+MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+"""Types of joints with one degree of freedom."""
+
+
+class Names:
+    """Names of the ``bodies`` and of the hinges and slides among the ``joints``, by their numbers in the model.
+
+    A body or joint without a name gets one of its number.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._types = model.jnt_type
+        given = [model.body(body).name for body in range(1, model.nbody)]
+        self._links, self._joints = {"world", *given}, {model.joint(joint).name for joint in range(model.njnt)}
+        self.bodies = {0: "world"}
+        self.bodies |= {body: name or self.new_link(f"body{body}") for body, name in enumerate(given, start=1)}
+        self.joints = {
+            joint: model.joint(joint).name or self.new_joint(f"joint{joint}")
+            for joint in range(model.njnt)
+            if int(model.jnt_type[joint]) in MOVING
+        }
+
+    def is_slide(self, joint: int) -> bool:
+        """Return whether a joint is a slide, not a hinge."""
+        return bool(self._types[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+    def new_link(self, name: str) -> str:
+        """Return ``name``, with a number if a link has it."""
+        return _new(name, self._links)
+
+    def new_joint(self, name: str) -> str:
+        """Return ``name``, with a number if a joint has it."""
+        return _new(name, self._joints)
+
+
+def _new(name: str, taken: set[str]) -> str:
+    new, number = name, 2
+    while new in taken:
+        new, number = f"{name}_{number}", number + 1
+    taken.add(new)
+    return new

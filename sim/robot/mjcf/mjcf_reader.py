@@ -1,0 +1,165 @@
+"""Reader of MJCF files: MuJoCo compiles them, and the model becomes a URDF with motors and a start pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from lxml import etree
+
+from batchpid.errors import RobotError
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
+from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_shapes import excluded_pairs
+from batchpid.sim.robot.mjcf.mjcf_tree import Tree
+from batchpid.sim.robot.self_collision import DisabledPair
+
+GRAVITY = (0.0, 0.0, -9.81)
+_KEYFRAME = "home"
+"""Keyframe with the start pose."""
+_ERRORS = (ValueError, mujoco.FatalError)
+"""Errors of MuJoCo's parser and compiler."""
+
+
+class Mjcf(NamedTuple):
+    """Content of an MJCF file."""
+
+    root: etree._Element
+    """The ``<robot>`` of the equivalent URDF."""
+    pairs: tuple[DisabledPair, ...]
+    """Pairs of links that do not collide."""
+    motors: Motors
+    start: dict[str, float]
+    """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
+    findings: tuple[Finding, ...]
+
+
+def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
+    """Return the content of the MJCF file at ``path`` as the robot ``name``.
+
+    The other arguments are those of :meth:`batchpid.sim.Robot.load`.
+
+    Raises
+    ------
+    RobotError
+        MuJoCo refuses the file, it has a ball joint or several robots, or, if refused, a missing mesh.
+    """
+    findings: list[Finding] = []
+    model = _compile(path, missing_meshes, findings)
+    names = Names(model)
+    mimics = read_couplings(model, names, findings)
+    motors = read_motors(model, names, mimics, findings)
+    tree = Tree(model, names, path, findings)
+    tree.write(fixed_base, motors, mimics)
+    tree.root.set("name", name)
+    findings += [*_in_radians(model, names), *_unused(model, names)]
+    key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
+    pose = model.qpos0 if key is None else model.key_qpos[key]
+    start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, tuple(findings))
+
+
+class _Attempt(NamedTuple):
+    """Model of a file, or None with MuJoCo's reason; missing files of collision meshes, whose geoms are left out."""
+
+    model: Any | None
+    missing: list[str]
+    problem: str
+
+
+def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
+    """Return the compiled model, if possible without geoms that are only drawn, whose meshes take time to read."""
+    stripped = _attempt(path, strip=True)
+    if stripped.model is not None and not stripped.missing:
+        return stripped.model
+    whole = _attempt(path, strip=False)  # something may refer to a removed geom, and a missing file be elsewhere
+    if whole.model is not None:
+        return whole.model
+    names = ", ".join(stripped.missing)
+    if names and missing_meshes == "error":
+        remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
+        raise RobotError(f"{path}: collision mesh not found: {names}; {remedy}")
+    if not names or stripped.model is None:
+        problem = stripped.problem if names else whole.problem
+        raise RobotError(f"{path}: MuJoCo cannot compile the file: {problem}; correct it")
+    text = f"collision meshes not found, simulated without: {names}"
+    findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
+    return stripped.model
+
+
+def _attempt(path: Path, strip: bool) -> _Attempt:
+    missing: list[str] = []
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        missing = _strip(spec, path) if strip else []
+        return _Attempt(spec.compile(), missing, "")
+    except _ERRORS as error:
+        return _Attempt(None, missing, " ".join(str(error).split()))
+
+
+def _strip(spec: Any, path: Path) -> list[str]:
+    """Remove textures, and geoms that add neither shape nor mass; return the missing files of collision meshes."""
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    folder = path.parent / (spec.meshdir or "")
+    absent = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()}
+    inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    missing: dict[str, None] = {}
+    used: set[str] = set()
+    for geom in list(spec.geoms):
+        geom.material = ""
+        drawn_only = not (geom.contype | geom.conaffinity) and geom.name not in paired
+        unused = drawn_only and not inferred and bool(geom.parent.explicitinertial)
+        if not unused and geom.meshname in absent:
+            missing[absent[geom.meshname]] = None
+        if unused or geom.meshname in absent:
+            spec.delete(geom)
+        elif geom.meshname:
+            used.add(geom.meshname)
+    for site in spec.sites:
+        site.material = ""
+    for each in [*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)]:
+        spec.delete(each)
+    return list(missing)
+
+
+def _in_radians(model: Any, names: Names) -> list[Finding]:
+    """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read as degrees."""
+    hinges = [joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)]
+    if not hinges or np.abs(model.jnt_range[hinges]).max() > np.deg2rad(3.2):
+        return []
+    text = "the ranges of all hinges are tiny: angles of an MJCF file are in degrees unless it says otherwise"
+    return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
+
+
+def _unused(model: Any, names: Names) -> list[Finding]:
+    """Return findings of what has no equivalent, apart from motors, couplings and shapes."""
+    found = []
+    counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam}
+    if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
+        text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
+        found.append(Finding("note", "unknown-element", text, "expect no effect"))
+    option = model.opt
+    if tuple(option.gravity) != GRAVITY:
+        text = f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
+        found.append(Finding("warning", "option", text, "expect other loads"))
+    if option.density or option.viscosity:
+        text = "drag of the medium (<option density= viscosity=>) is not simulated"
+        found.append(Finding("warning", "option", text, "expect less damping"))
+    for joint, name in names.joints.items():
+        if model.jnt_stiffness[joint] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]):
+            text, remedy = "a spring acts on the joint in MuJoCo: it is not simulated", "add its effort in a controller"
+            detail = f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
+            found.append(Finding("warning", "spring", text, remedy, name, detail=detail))
+        if np.any(getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))[model.jnt_dofadr[joint]]):
+            text = "the damping grows with the speed in MuJoCo: the linear part alone is simulated"
+            found.append(Finding("warning", "dynamics", text, "give the damping at the speeds of interest", name))
+    for body in np.flatnonzero(model.body_gravcomp):
+        text = "gravity compensation of this body (gravcomp) is not simulated"
+        remedy = "keep the compensation of the controller on"
+        found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
+    if model.nflex or model.nskin:
+        found.append(Finding("warning", "unknown-element", "flexible bodies are left out", "expect rigid links alone"))
+    return found

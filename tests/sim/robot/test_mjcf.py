@@ -1,0 +1,515 @@
+"""MJCF files: the robot that is simulated is the one that MuJoCo compiles, and whatever is not has a finding."""
+
+from __future__ import annotations
+
+import random
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lxml import etree
+
+mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("mujoco.batch")
+
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotError  # noqa: E402
+from batchpid.sim import Robot, Runner  # noqa: E402
+from batchpid.sim.engine.engines import load_engine  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
+from batchpid.sim.robot.rotations import from_rpy, rotate  # noqa: E402
+from batchpid.sim.robot.shapes import surfaces  # noqa: E402
+from batchpid.sim.robot.xml import numbers  # noqa: E402
+from batchpid.sim.tuning.gain_sets import gain_set  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
+
+WEDGE = '<mesh name="wedge" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .2  .02 .02 .02"/>'
+ARM = f"""
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <asset>{WEDGE}</asset>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body name="base" pos="0 0 2" quat=".9 .1 .3 -.2">
+      <geom type="cylinder" size=".05 .1"/>
+      <body name="upper" pos="0 0 .1">
+        <joint name="lift" axis="0 1 0" pos=".02 0 -.03" ref=".4" range="-1 2" damping=".3" armature=".02"/>
+        <geom name="limb" type="capsule" fromto="0 0 0 .3 0 .1" size=".03"/>
+        <geom type="sphere" size=".5" contype="0" conaffinity="0" mass=".2"/>
+        <body name="fore" pos=".3 0 .1" quat=".9 .1 .2 .3">
+          <joint name="reach" type="slide" axis="1 0 1" ref=".05" range="-.1 .2" frictionloss=".1"/>
+          <geom type="mesh" mesh="wedge" pos=".1 0 0"/>
+          <body name="flange" pos=".2 0 0"><geom type="box" size=".02 .03 .04" quat=".5 .1 0 0"/>
+            <body name="hand" pos="0 0 .1">
+              <joint name="turn" axis="0 0 1" pos="0 .01 0"/>
+              <inertial pos=".01 0 .02" mass=".3" fullinertia=".002 .003 .004 .0001 .0002 .0003"/>
+              <geom type="ellipsoid" size=".02 .03 .05"/>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <contact><exclude body1="base" body2="fore"/></contact>
+  <actuator>
+    <position joint="lift" kp="100" kv="7" gear="2" forcerange="-10 10"/>
+    <motor joint="reach" gear="3" ctrlrange="-4 4"/>
+  </actuator>
+  <keyframe><key name="home" qpos=".7 .1 .2"/></keyframe>
+</mujoco>"""
+BOX = '<geom size=".1 .1 .1" type="box"/>'
+CHAIN = f"""
+<mujoco>
+  <worldbody>
+    <body name="cart"><joint name="x" type="slide" axis="1 0 0" ref=".2"/><joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="yaw" axis="0 0 1" pos=".1 .2 0" ref="30"/>{BOX}
+      <body pos="0 0 .3"><joint axis="1 1 0" pos="0 0 -.1"/>{BOX}</body>
+    </body>
+    <body name="table" pos="1 0 0">{BOX}</body>
+  </worldbody>
+</mujoco>"""
+LEG = '<body name="leg{0}" pos="0 {0} 0"><joint name="hip{0}" axis="0 1 0" pos="0 0 .1" armature=".1"/>{1}</body>'
+WALKER = f"""
+<mujoco>
+  <worldbody>
+    <body name="trunk" pos="0 0 .5" quat="1 .2 0 0"><freejoint/>{BOX}{LEG.format(1, BOX)}{LEG.format(2, BOX)}</body>
+    <body name="ball" pos="3 0 0"><freejoint/>{BOX}</body>
+    <body name="goal" mocap="true"/>
+  </worldbody>
+</mujoco>"""
+TEXTS = {"arm": ARM, "chain": CHAIN, "walker": WALKER}
+
+
+@pytest.fixture(autouse=True)
+def hulls(tmp_path, monkeypatch):
+    """Folder of the hulls of meshes."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache/batchpid/meshes"
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Function that loads the robot of an MJCF text."""
+
+    def load(text, **options):
+        path = tmp_path / "robot.xml"
+        path.write_text(text)
+        return Robot.load(path, **options)
+
+    return load
+
+
+def two_links(joint='<joint name="j"/>', rest="", geom=BOX):
+    return (
+        f'<mujoco><worldbody><body name="a">{geom}<body name="b" pos="0 0 1">{joint}{geom}</body></body></worldbody>'
+        f"{rest}</mujoco>"
+    )
+
+
+def spec_of(robot, **options):
+    options = {"ground": False, "merge_fixed": robot.merge_fixed} | options
+    return SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options)
+
+
+@pytest.mark.parametrize("merge_fixed", [True, False])
+@pytest.mark.parametrize("name", TEXTS)
+def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
+    robot = load(TEXTS[name], merge_fixed=merge_fixed)
+    model = mujoco.MjModel.from_xml_string(TEXTS[name])
+    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    joints = [3 if each == "joint3" else model.joint(each).id for each in robot.joint_names]  # that has no name
+    places, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    rng = np.random.default_rng(0)
+    qpos, qvel = rng.uniform(-2, 2, (2, 50, robot.dof))
+    matrices, biases = [], []
+    for q, v in zip(qpos, qvel, strict=True):
+        data.qpos[places], data.qvel[dofs] = q, v
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        matrices.append(full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs]))
+        biases.append(data.qfrc_bias[dofs].copy())
+    massless = 1e-4 if name == "chain" or not merge_fixed else 1e-9  # links that both engines give 1e-6 kg
+    for dynamics, tolerance in (
+        (load_engine("mujoco").scene_dynamics(spec_of(robot, collisions=False)), massless),
+        (robot.dynamics(), 1e-4),
+    ):
+        bias = dynamics.inverse_dynamics(qpos, qvel, np.zeros_like(qpos))
+        np.testing.assert_allclose(dynamics.mass_matrix(qpos), matrices, atol=tolerance * np.max(matrices))
+        np.testing.assert_allclose(bias, biases, atol=tolerance * np.abs(biases).max())
+
+
+def test_joints_are_those_of_the_file(load):
+    robot = load(ARM)
+    assert (robot.name, load(CHAIN).name) == ("arm", "robot")  # of the model, else of the file
+    assert robot.joint_names == ("lift", "reach", "turn")
+    assert [joint.type for joint in robot.joints] == ["revolute", "prismatic", "continuous"]
+    np.testing.assert_array_equal(robot.lower, [-1, -0.1, -np.inf])
+    np.testing.assert_array_equal(robot.upper, [2, 0.2, np.inf])
+    np.testing.assert_array_equal(robot.damping, [0.3, 0, 0])
+    np.testing.assert_array_equal(robot.friction, [0, 0.1, 0])
+    np.testing.assert_array_equal(robot.effort_limit, [20, 12, np.inf])
+    np.testing.assert_array_equal(robot.actuators.armature, [[0.02, 0, 0]])
+    np.testing.assert_array_equal(robot.start, [0.7, 0.1, 0.2])
+    np.testing.assert_allclose(load(CHAIN).start, [0.2, 0, np.deg2rad(30), 0])
+    assert robot.describe()["settings"] != load(ARM.replace('qpos=".7', 'qpos=".6')).describe()["settings"]
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_swings_as_in_mujoco(load, engine):
+    text = ARM.replace('frictionloss=".1"', 'damping="9"')
+    robot = load(text, self_collision="none")
+    model = mujoco.MjModel.from_xml_string(text)
+    off = mujoco.mjtDisableBit
+    model.opt.timestep, model.opt.disableflags = 5e-4, off.mjDSBL_ACTUATION | off.mjDSBL_CONTACT
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.start
+    mujoco.mj_step(model, data, 200)
+    options = {"control": "effort", "compensate": "none", "ground": False, "workers": 0}
+    with Runner(robot, num_envs=1, substeps=200, engine=engine, **options) as runner:
+        runner.reset()
+        moved = runner.step(np.zeros(3)).qpos[0]
+    assert np.abs(moved - robot.start).max() > 0.01
+    np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
+
+
+def test_both_engines_agree_and_settle(load):
+    robot = load(ARM)
+    target, ends = np.array([0.2, 0.05, 0.6]), []
+    for engine in ("sapien", "mujoco"):
+        with Runner(robot, num_envs=2, workers=0, engine=engine, substeps=20) as runner:
+            runner.reset()
+            for _ in range(100):
+                observation = runner.step(target)
+        assert observation.ok.all()
+        ends.append(observation.qpos)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-4)
+    np.testing.assert_allclose(ends[0], np.tile(target, (2, 1)), atol=2e-2)
+
+
+def shapes_of(robot, link):
+    """Return (tag, attributes, position, rotation) of the collision shapes of a link."""
+    root = etree.fromstring(robot.urdf.encode())
+    for collision in root.findall(f"link[@name='{link}']/collision"):
+        origin, (shape,) = collision.find("origin"), collision.find("geometry")
+        yield (
+            shape.tag,
+            shape.attrib,
+            np.array(numbers(origin, "xyz", "0 0 0", "")),
+            from_rpy(numbers(origin, "rpy", "0 0 0", "")),
+        )
+
+
+EXTENT = {  # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
+    3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
+    4: lambda u, size, vertices: np.linalg.norm(u * size, axis=1),
+    5: lambda u, size, vertices: size[0] * np.hypot(u[:, 0], u[:, 1]) + size[1] * np.abs(u[:, 2]),
+    6: lambda u, size, vertices: np.abs(u) @ size,
+    7: lambda u, size, vertices: (u @ vertices.T).max(1),
+}
+
+
+def reach_of(model, data):
+    """Return how far the geoms that can collide reach in 60 directions (geoms, 60) [m], the shortest first."""
+    directions = np.random.default_rng(0).normal(size=(60, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = []
+    for geom in np.flatnonzero((model.geom_contype > 0) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)):
+        mesh = model.geom_dataid[geom]
+        vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+        local = directions @ data.geom_xmat[geom].reshape(3, 3)
+        extent = EXTENT[int(model.geom_type[geom])](local, model.geom_size[geom], vertices)
+        rows.append(directions @ data.geom_xpos[geom] + extent)
+    return np.array(sorted(rows, key=lambda row: row[0]))
+
+
+def test_shapes_are_where_they_are_in_the_file(load):
+    robot = load(ARM)
+    built = robot_model(spec_of(robot))
+    original = mujoco.MjModel.from_xml_string(ARM)
+    reach = []
+    for model, places in (
+        (original, [original.joint(name).id for name in robot.joint_names]),
+        (built.model, built.qpos),
+    ):
+        data = mujoco.MjData(model)
+        data.qpos[places] = [0.7, -0.05, 1.2]
+        mujoco.mj_forward(model, data)
+        reach.append(reach_of(model, data))
+    assert len(reach[0]) == 5
+    errors = np.abs(reach[0] - reach[1]).max(1)
+    assert np.count_nonzero(errors < 1e-6) == 4
+    assert errors.max() < 0.03 * 0.05  # the ellipsoid's
+
+
+def read_obj(path):
+    """Return the vertices (n, 3) and the corners of the triangles (m, 3, 3) of an OBJ file."""
+    lines = [line.split() for line in Path(path).read_text().splitlines()]
+    vertices, faces = (np.array([line[1:] for line in lines if line[0] == kind], float) for kind in "vf")
+    return vertices, vertices[faces.astype(int) - 1]
+
+
+def test_a_capsule_has_the_ends_of_the_file(load):
+    ((tag, size, place, turn),) = shapes_of(load(ARM), "upper")  # not the sphere, which is only drawn
+    half = float(size["length"]) / 2 * rotate(turn, np.array([0.0, 0.0, 1.0]))
+    anchor = np.array([0.02, 0, -0.03])  # the link's origin
+    assert (tag, size["radius"]) == ("capsule", "0.03")
+    ends = sorted((anchor + place + sign * half).tolist() for sign in (1, -1))
+    np.testing.assert_allclose(ends, [[0, 0, 0], [0.3, 0, 0.1]], atol=1e-12)
+
+
+def test_a_mesh_is_its_convex_hull(load, hulls):
+    ((tag, attributes, place, turn),) = shapes_of(load(ARM), "fore")
+    vertices, corners = read_obj(attributes["filename"])
+    placed = rotate(turn, vertices) + place - [0.1, 0, 0]
+    expected = [[0, 0, 0], [0, 0, 0.2], [0, 0.1, 0], [0.1, 0, 0]]  # without the vertex inside
+    np.testing.assert_allclose(sorted(placed.round(6).tolist()), expected, atol=1e-6)
+    assert tag == "mesh"
+    assert Path(attributes["filename"]) in hulls.iterdir()
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", outward, corners[:, 0] - vertices.mean(0)) > 0).all()
+
+
+def test_an_ellipsoid_is_inscribed(load):
+    (shape,) = shapes_of(load(ARM), "hand")
+    vertices, corners = (each / [0.02, 0.03, 0.05] for each in read_obj(shape[1]["filename"]))
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    distances = np.einsum("ij,ij->i", normals, corners[:, 0]) / np.linalg.norm(normals, axis=1)
+    assert distances.min() > 0.97
+    assert distances.max() < 1
+
+
+def test_pairs_that_do_not_collide(load):
+    def pairs(text, **options):
+        return {frozenset((pair.first, pair.second)) for pair in load(text, **options).self_contact.pairs}
+
+    assert frozenset(("base", "fore")) in pairs(ARM, self_collision="urdf")
+    masked = two_links().replace('type="box"', 'type="box" contype="2" conaffinity="4"')
+    assert pairs(masked, self_collision="urdf") == {frozenset("ab")}
+    assert pairs(two_links(), self_collision="urdf") == set()
+    forced = masked.replace("<worldbody>", '<contact><pair geom1="ga" geom2="gb"/></contact><worldbody>')
+    forced = forced.replace("<geom", '<geom name="ga"', 1).replace(
+        'b" pos="0 0 1"><joint name="j"/><geom', 'b" pos="0 0 1"><joint name="j"/><geom name="gb"'
+    )
+    assert pairs(forced, self_collision="urdf") == set()
+
+
+def test_an_srdf_has_the_last_word(load, tmp_path):
+    (tmp_path / "robot.srdf").write_text('<robot><enable_collisions link1="base" link2="fore"/></robot>')
+    assert load(ARM, self_collision="urdf").ignored_pairs == ()
+
+
+def test_links_of_a_split_body_keep_their_pairs(load):
+    """A body whose links collide with another body in part still ignores the others whole."""
+    arm = '<body name="{0}" pos="{1}"><joint name="j{0}"/><geom size=".1"/></body>'
+    text = f"""<mujoco><worldbody><body name="base" pos="0 0 .01"><geom size=".1"/>
+      <body name="torso"><geom size=".1"/></body>{arm.format("near", "0 0 .02")}{arm.format("far", "2 0 0")}
+      </body></worldbody><contact><exclude body1="torso" body2="far"/></contact></mujoco>"""
+    robot = load(text)
+    built = robot_model(spec_of(robot))
+    data = mujoco.MjData(built.model)
+    mujoco.mj_forward(built.model, data)
+    assert data.ncon == 0
+
+
+def test_couplings(load):
+    joints = two_links().replace('<joint name="j"/>', '<joint name="j" ref="30"/>')
+    joints = joints.replace(
+        "</body></body>",
+        '<body name="c" pos="0 0 1"><joint name="k" armature=".1" damping=".2"/><geom size=".1"/></body></body></body>',
+    )
+    text = joints.replace(
+        "</mujoco>", '<equality><joint joint1="k" joint2="j" polycoef=".1 -2 0 0 0"/></equality></mujoco>'
+    )
+    robot = load(text)
+    (mimic,) = [joint.mimic for joint in robot.joints if joint.mimic is not None]
+    assert (mimic.joint, mimic.multiplier) == ("j", -2)
+    assert mimic.offset == pytest.approx(0.1 + 2 * np.deg2rad(30))
+    np.testing.assert_allclose(robot.actuators.armature, [[0.4, 0]])
+    np.testing.assert_allclose(robot.damping, [0.8, 0])
+
+
+def test_a_tendon_that_pulls_coupled_fingers(load):
+    finger = '<body name="{0}"><joint name="{0}" type="slide" axis="0 {1} 0" range="0 .04"/><geom size=".01"/></body>'
+    text = f"""<mujoco><worldbody><body name="hand">{BOX}{finger.format("left", 1)}{finger.format("right", -1)}</body>
+      </worldbody><tendon><fixed name="split"><joint joint="left" coef=".5"/><joint joint="right" coef=".5"/></fixed>
+      </tendon><equality><joint joint1="left" joint2="right"/></equality>
+      <actuator><general tendon="split" forcerange="-100 100" ctrlrange="0 255" gainprm=".0157 0 0"
+        biastype="affine" biasprm="0 -100 -10"/></actuator></mujoco>"""
+    robot = load(text)
+    assert robot.effort_limit[robot.joint_names.index("right")] == 100
+    gains = robot.mjcf_gains()
+    np.testing.assert_allclose(np.ravel(gains.kp), [0, 100])
+    np.testing.assert_allclose(np.ravel(gains.kd), [0, 10])
+
+
+def test_gains_of_servos(load, panda):
+    robot = load(ARM)
+    gains = gain_set(robot, "mjcf").params
+    np.testing.assert_array_equal(np.ravel(gains.kp), [400, 0, 0])
+    np.testing.assert_array_equal(np.ravel(gains.kd), [28, 0, 0])
+    np.testing.assert_array_equal(np.ravel(gains.effort_max), [20, 12, np.inf])
+    for other in (panda, load(CHAIN)):
+        with pytest.raises(InvalidArgumentError, match=r"no servos of an MJCF file.*designed"):
+            gain_set(other, "mjcf")
+
+
+def test_several_actuators_of_a_joint_add_up(load):
+    text = two_links(
+        rest="""<actuator><position joint="j" kp="5" gear="2" forcerange="-1 1"/>
+        <velocity joint="j" kv="3" forcerange="-4 4"/><motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>"""
+    )
+    robot = load(text)
+    np.testing.assert_array_equal(robot.effort_limit, [12])
+    np.testing.assert_array_equal([np.ravel(robot.mjcf_gains().kp), np.ravel(robot.mjcf_gains().kd)], [[20], [3]])
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
+def test_armature_and_damping_of_actuators(load):
+    text = two_links(rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>')
+    robot = load(text)
+    np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
+    np.testing.assert_allclose(robot.damping, [1.8])
+
+
+def test_floating_base(load):
+    fixed, floating = load(WALKER), load(WALKER, fixed_base=False)
+    assert fixed.dof == floating.dof == 2
+    assert ["joint-type" in {each.code for each in robot.repairs} for robot in (fixed, floating)] == [True, False]
+    assert {each.link for each in fixed.repairs if each.code == "loose-link"} == {"ball", "goal"}
+    for engine in ("sapien", "mujoco"):
+        with Runner(floating, num_envs=1, workers=0, engine=engine, ground=False) as runner:
+            runner.reset()
+            assert runner.step(floating.start).ok.all()
+
+
+FINDINGS = {
+    "spring": (two_links('<joint name="j" stiffness="3"/>'), "spring", "j"),
+    "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", None),
+    "medium": (two_links(rest='<option density="1.2"/>'), "option", None),
+    "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "gravcomp", None),
+    "site": (two_links().replace(BOX, f'{BOX}<site name="s"/>', 1), "unknown-element", None),
+    "weld": (two_links(rest='<equality><weld body1="b"/></equality>'), "equality", None),
+    "held joint": (two_links(rest='<equality><joint joint1="j"/></equality>'), "mimic", "j"),
+    "passive joint": (
+        two_links(rest='<actuator><motor joint="j"/></actuator>').replace(
+            '<joint name="j"/>', '<joint name="j"/><joint name="k" axis="0 1 0"/>'
+        ),
+        "actuator",
+        "k",
+    ),
+    "one-sided force": (
+        two_links(rest='<actuator><motor joint="j" forcerange="-2 5"/></actuator>'),
+        "limits",
+        "j",
+    ),
+    "filter": (two_links(rest='<actuator><position joint="j" timeconst=".1"/></actuator>'), "actuator", "j"),
+    "thruster": (
+        two_links(rest='<actuator><motor site="s"/></actuator>').replace(BOX, f'{BOX}<site name="s"/>', 1),
+        "actuator",
+        None,
+    ),
+    "stiff tendon": (
+        two_links(rest='<tendon><fixed stiffness="2"><joint joint="j" coef="1"/></fixed></tendon>'),
+        "tendon",
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FINDINGS)
+def test_what_has_no_equivalent_is_told(load, name):
+    text, code, joint = FINDINGS[name]
+    found = [each for each in load(text).repairs if each.code == code and each.joint == joint]
+    assert found
+    assert all(each.remedy for each in found)
+    with pytest.raises(RobotError, match="needs"):
+        load(text, strict=True)
+
+
+def test_a_plain_file_needs_no_repair(load):
+    assert load(two_links(), strict=True).repairs == ()
+
+
+BAD = {
+    "ball joint": (two_links('<joint name="wrist" type="ball"/>'), "ball joint 'wrist'.*replace it by three hinges"),
+    "no joint": (two_links(""), "without moving joints"),
+    "not compiled": (two_links('<joint name="j" pos="x"/>'), "MuJoCo cannot compile the file.*pos"),
+    "no mass": (two_links(geom=""), "MuJoCo cannot compile the file.*mass"),
+    "two robots": (
+        two_links().replace(
+            "</worldbody>", f'<body name="c"><freejoint/>{BOX}<body name="d"><joint/>{BOX}</body></body></worldbody>'
+        ),
+        "several robots, 'a', 'c'",
+    ),
+    "a part": ("<mujocoinclude/>", "root element is <mujocoinclude>.*part of an MJCF"),
+    "a DTD": (f'<!DOCTYPE mujoco [<!ENTITY a "b">]>{two_links()}', "DTD"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_simulated_is_refused(load, name):
+    text, message = BAD[name]
+    with pytest.raises(RobotError, match=message):
+        load(text)
+
+
+def test_missing_meshes(load):
+    asset = '<asset><mesh name="gone" file="gone.stl"/></asset>'
+    shown = f'{BOX}<geom type="mesh" mesh="gone" contype="0" conaffinity="0"/>'
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    assert load(two_links(rest=asset, geom=inertial + shown), missing_meshes="error").repairs == ()
+    text = two_links(rest=asset, geom=f'{BOX}<geom type="mesh" mesh="gone"/>')
+    (finding,) = load(text).repairs
+    assert finding.code == "missing-mesh"
+    assert "gone.stl" in finding.text
+    with pytest.raises(RobotError, match=r"gone\.stl.*missing_meshes"):
+        load(text, missing_meshes="error")
+
+
+def test_a_geom_that_is_referred_to_stays(load):
+    """Without the geoms that are only drawn the file would not compile."""
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    geom = f'{inertial}{BOX}<geom name="shown" size=".1" contype="0" conaffinity="0"/>'
+    sensor = '<sensor><framepos objtype="geom" objname="shown"/></sensor>'
+    assert load(two_links(rest=sensor).replace(BOX, geom, 1)).dof == 1
+
+
+def test_an_include_brings_its_bodies(load, tmp_path):
+    arm = f'<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>{BOX}</body></mujocoinclude>'
+    (tmp_path / "arm.xml").write_text(arm)
+    assert load('<mujoco><worldbody><include file="arm.xml"/></worldbody></mujoco>').joint_names == ("j",)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # for MuJoCo's log
+    rng = random.Random(seed)
+    for _ in range(25):
+        text = rng.choice([*TEXTS.values(), *(text for text, *_ in FINDINGS.values())])
+        begin = rng.randrange(len(text))
+        part = rng.choice(["", "0", "-1", "nan", "1e300", "<joint/>", "<freejoint/>", "</body>", 'mass="0"', "<"])
+        with suppress(RobotError):
+            load(text[:begin] + part + text[begin + rng.randrange(8) :])
+
+
+def test_needs_the_extra(load, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MissingDependencyError, match=r"reading an MJCF file.*batchpid\[mujoco\]"):
+        load(ARM)
+
+
+def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(RobotError, match=r"cannot be written.*XDG_CACHE_HOME"):
+        load(ARM)
+
+
+def test_is_drawn_by_its_shapes(load):
+    pytest.importorskip("trimesh")
+    assert {surface.link for surface in surfaces(load(ARM))} == {"base", "upper", "fore", "flange", "hand"}
