@@ -16,6 +16,12 @@ TRIAL_BYTES = 4096
 
 
 @contextmanager
+def read_bytes(path: str) -> bytes:
+    """Return the content of the file at ``path``, in one call of Python; Path.read_bytes takes several."""
+    with open(path, "rb", buffering=0) as file:
+        return file.read()
+
+
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path to write a file to, which then replaces the file at ``path``.
 

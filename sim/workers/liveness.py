@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import os
 from pathlib import Path
+
+from batchpid.io.files import read_bytes
 
 _STATE, _CPU = 0, slice(11, 13)  # fields of /proc/PID/stat after the name: the state, user and system time
 _RUNNABLE, _IDLE, _STOPPED = "R", "ST", "T"  # S: asleep; others: D waits for the disk, t is held by a debugger
@@ -33,8 +34,7 @@ class Liveness:
         if is_first:
             self.idle, self.busy, self._last = 0.0, 0.0, None
         try:
-            with _File(self._stat) as file:  # Path.read_text takes nine calls of Python
-                fields = file.read().rpartition(b")")[2].decode().split()
+            fields = read_bytes(self._stat).rpartition(b")")[2].decode().split()
         except OSError:
             return  # it has ended; its socket reports that
         state, cpu = fields[_STATE], sum(map(int, fields[_CPU])) / _CLOCK
@@ -44,10 +44,3 @@ class Liveness:
             self.idle = self.idle + passed if state in _IDLE and not ran else 0.0
             self.busy += ran if state == _RUNNABLE else max(ran, passed)
         self._last = now, cpu
-
-
-class _File(io.FileIO):
-    """File that is closed with its last reference, as after an interrupt."""
-
-    def __del__(self) -> None:
-        self.close()  # without the ResourceWarning of its base
