@@ -15,13 +15,13 @@ TRIAL_BYTES = 4096
 """Size of the file that :func:`try_writing` writes: a block of most file systems [B]."""
 
 
-@contextmanager
 def read_bytes(path: str) -> bytes:
     """Return the content of the file at ``path``, in one call of Python; Path.read_bytes takes several."""
     with open(path, "rb", buffering=0) as file:
         return file.read()
 
 
+@contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path to write a file to, which then replaces the file at ``path``.
 
