@@ -2,6 +2,7 @@ import json
 import os
 import runpy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -236,7 +237,7 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     seen = []
     whole = identify(arm, log, **options, progress=lambda steps: (seen.append(step) or step for step in steps))
 
-    def stop(steps):
+    def stop(steps, last):
         for step in steps:
             if step == last:
                 raise KeyboardInterrupt
@@ -245,7 +246,7 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     history = tmp_path / "fit.json"
     for last in (1, len(seen) - 1):  # the second while the fit with noise runs, in a fit that has resumed once
         with pytest.raises(KeyboardInterrupt):
-            identify(arm, log, **options, history=history, progress=stop)
+            identify(arm, log, **options, history=history, progress=partial(stop, last=last))
     resumed = identify(arm, log, **options, history=history)
     assert np.array_equal(resumed.estimate, whole.estimate)
     assert np.array_equal(resumed.uncertainty.deviation, whole.uncertainty.deviation)
