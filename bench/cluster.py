@@ -9,8 +9,10 @@ each, in turns; the ratios are medians over the turns. Then single steps. Prints
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import tyro
@@ -20,31 +22,43 @@ from batchpid.sim import Ray, Robot, Runner
 SMALL = {"object_store_memory": 100 << 20, "include_dashboard": False}
 
 
+@contextmanager
+def machines(workers: int) -> Iterator[str]:
+    """Start Ray nodes on this machine, with CPUs for all runners; yield the address of their cluster."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}  # as the local pool
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        for cpus in (workers + 1, *[1] * (workers - 1)):
+            cluster.add_node(num_cpus=cpus, **SMALL)
+        yield cluster.address
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
 @dataclass(frozen=True)
 class Bench:
     """Options."""
 
     num_envs: int = 64
+    workers: int = 2
     turns: int = 10
     ticks: int = 160
     """Ticks of a rollout, of 20 sim steps each."""
     steps: int = 100
     """Single ticks for the latency."""
 
-    def run(self) -> None:
-        import ray
-        from ray.cluster_utils import Cluster
-
-        head = {"num_cpus": 0, "_system_config": {"worker_niceness": 0}, **SMALL}  # as the local pool
-        cluster = Cluster(initialize_head=True, head_node_args=head)
-        for cpus in (3, 1):
-            cluster.add_node(num_cpus=cpus, **SMALL)
+    def run(self, address: str) -> None:
+        """Print the table, on the cluster at ``address``."""
         robot = Robot.load("panda")
         setpoints = np.tile(robot.settings.target, (self.ticks, 1))
-        where = {
-            "local, 2 workers": {"workers": 2},
-            "1 node of 2 workers": {"cluster": Ray(cluster.address, nodes=1, cpus_per_node=2)},
-            "2 nodes of 1 worker": {"cluster": Ray(cluster.address, nodes=2, cpus_per_node=1)},
+        where: dict[str, dict[str, Any]] = {
+            f"local, workers: {self.workers}": {"workers": self.workers},
+            f"one node, workers: {self.workers}": {"cluster": Ray(address, nodes=1, cpus_per_node=self.workers)},
+            f"one worker each, nodes: {self.workers}": {"cluster": Ray(address, nodes=self.workers, cpus_per_node=1)},
         }
         with ExitStack() as stack:
             runners = {
@@ -72,9 +86,9 @@ class Bench:
         for column, name in enumerate(runners):
             seconds, message = np.median(rollouts[:, column]), 1e3 * np.median(latencies[:, column])
             print(f"| {name} | {seconds:.2f} s | {ratios[column]:.3f} | {apart[column]:.3f} | {message:.2f} ms |")
-        ray.shutdown()
-        cluster.shutdown()
 
 
 if __name__ == "__main__":
-    tyro.cli(Bench).run()
+    bench = tyro.cli(Bench)
+    with machines(bench.workers) as address:
+        bench.run(address)

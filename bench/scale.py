@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from time import perf_counter, sleep
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,13 +160,16 @@ def report(costs: Costs) -> str:
     return "\n\n".join(f"**{title}**\n\n{table(ticks, case)}" for title, ticks, case in cases)
 
 
-def measure(calls: int = 30) -> str:
-    """Return Ray's costs on this machine, the lowest of several: calls with the arrays of one node and piece."""
+def measure(calls: int = 30, **connection: Any) -> str:
+    """Return Ray's costs on this machine, the lowest of several: calls with the arrays of one node and piece.
+
+    ``connection`` are arguments of ``ray.init``; by default it starts a cluster.
+    """
     import ray
 
     ticks = NODE_STEPS // (SUBSTEPS * ENVS)
     size = traffic(DOF)
-    ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
+    ray.init(**(connection or {"address": "local", "num_cpus": 1, "include_dashboard": False}), log_to_driver=False)
 
     @ray.remote
     class Node:

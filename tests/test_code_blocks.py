@@ -1,6 +1,7 @@
 """Every code block of the pages runs; every command, link and make target in their text exists.
 
-Python blocks of a page share one namespace, in order. ``<!-- needs: NAME -->`` above a block names a package without
+Python blocks of a page share one namespace, in order, and run with few envs and ticks; where they choose no workers,
+those of other pages than the README run in this process. ``<!-- needs: NAME -->`` above a block names a package without
 which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``arm.xml``, ``gains.yaml`` and
 ``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
 within the text. C blocks compile next to the files that the commands of their page write.
@@ -14,12 +15,15 @@ import shlex
 import shutil
 import subprocess
 import warnings
+from functools import partial
 from pathlib import Path
 
 import pytest
+from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
-from batchpid.sim import Robot
+import batchpid.sim
+from batchpid.sim import Robot, Runner
 from batchpid.sim.cli import COMMANDS, main, parse
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +42,13 @@ SHORTER = {
 MJCF = """<mujoco>
 <worldbody><body><joint name="hinge" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/></body></worldbody>
 <actuator><position joint="hinge" kp="100" kv="10"/></actuator></mujoco>"""
+SHORTER_CODE = {
+    # pattern in Python blocks: a smaller size
+    r"\b64\b": "8",
+    r"\brange\(\d{2,}\)": "range(5)",
+}
+TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))
+ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is slow
 ONLY_PARSED = ("bench", "tune", "identify", "render", "survey")
 
 
@@ -92,12 +103,18 @@ def test_every_page_is_in_the_index():
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
 def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    write(tmp_path, TWO_JOINTS, "two.urdf")
+    if page.name != "README.md":
+        monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
+    shorter = SHORTER_CODE | ({'"panda"': '"two.urdf"'} if name(page) in ON_TWO_JOINTS else {})
     namespace: dict = {"__name__": "__main__"}
     for match in blocks(page, "python"):
         if missing(match):
             continue
         line = page.read_text()[: match.start("code")].count("\n")
-        code = re.sub(r"\b64\b", "8", match["code"])  # envs
+        code = match["code"]
+        for pattern, size in shorter.items():
+            code = re.sub(pattern, size, code)
         exec(compile("\n" * line + code, page, "exec"), namespace)
 
 

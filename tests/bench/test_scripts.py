@@ -105,11 +105,11 @@ def test_view(monkeypatch, capsys):
 class TestOnRay:
     pytestmark = FILTERS
 
-    def test_cluster(self, capsys):
+    def test_cluster_and_the_measured_costs_of_the_page_on_large_clusters(self, capsys):
         pytest.importorskip("ray")
-        load_script("cluster").Bench(num_envs=4, turns=1, ticks=20, steps=1).run()
-        assert len(rows(capsys.readouterr().out)) == 3
-
-    def test_the_measured_costs_of_the_page_on_large_clusters(self):
-        pytest.importorskip("ray")
-        assert "round trip" in load_script("scale").measure(calls=2)
+        cluster = load_script("cluster")
+        bench = cluster.Bench(num_envs=2, workers=1, turns=1, ticks=20, steps=1)
+        with cluster.machines(bench.workers) as address:
+            bench.run(address)
+            assert len(rows(capsys.readouterr().out)) == 3
+            assert "round trip" in load_script("scale").measure(calls=2, address=address, ignore_reinit_error=True)

@@ -6,6 +6,7 @@ import os
 import re
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 from robots import load_bundled
 
 import batchpid as bp
+import batchpid.sim
+from batchpid.sim import Runner
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -27,6 +30,22 @@ def run(monkeypatch, capsys):
     return run
 
 
+@pytest.fixture
+def one_process(monkeypatch):
+    """Let runners run in this process unless told otherwise: the results are the same."""
+    monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
+
+
+@pytest.fixture
+def quick_compilation():
+    """Let JAX compile with few optimisations."""
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
+
+
 def errors(table: str) -> dict[str, float]:
     """Joint -> error of env 0, from the table of drive_robot.py."""
     return {row.split()[0]: float(row.split()[4]) for row in table.splitlines()[2:]}
@@ -37,21 +56,22 @@ def test_every_example_is_tested():
     assert {path.name for path in EXAMPLES.glob("*.py")} <= tested
 
 
-@pytest.mark.parametrize("robot", ["jaco2", "panda"])
-def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot):
-    drive = ("drive_robot.py", robot, "--num-envs", "1", "--seconds", "4", "--use-internal-drive")
-    kept = errors(run(*drive, "--compensate", "none"))
-    removed = errors(run(*drive))
-    joint = {"jaco2": "j2s7s300_joint_4", "panda": "panda_joint2"}[robot]
-    assert kept[joint] > 0.1
-    assert removed[joint] < 0.02
+@pytest.mark.usefixtures("one_process")
+@pytest.mark.parametrize(
+    ("robot", "joint", "seconds"), [("jaco2", "j2s7s300_joint_4", "1.5"), ("panda", "panda_joint2", "4")]
+)
+def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot, joint, seconds):
+    drive = ("drive_robot.py", robot, "--num-envs", "1", "--use-internal-drive", "--seconds")
+    assert errors(run(*drive, "1.5", "--compensate", "none"))[joint] > 0.1
+    assert errors(run(*drive, seconds))[joint] < 0.02
 
 
+@pytest.mark.usefixtures("one_process")
 def test_an_undriven_robot_falls_and_the_pid_reaches_the_target(run):
     panda = ("drive_robot.py", "panda", "--num-envs", "2")
     rows = [row.split() for row in run(*panda, "--seconds", "1").splitlines()[2:]]
     assert max(abs(float(end) - float(start)) for _, start, _, end, *_ in rows) > 0.5
-    held = errors(run(*panda, "--seconds", "1.5", "--use-external-pid"))
+    held = errors(run(*panda, "--seconds", "1.2", "--use-external-pid"))
     assert max(held.values()) < 2e-3
 
 
@@ -74,6 +94,7 @@ def test_list_joints_lists_every_joint(run):
     assert "qpos: [0.   3.14 0." in text
 
 
+@pytest.mark.usefixtures("one_process")
 def test_a_profile_is_followed_with_less_error_than_a_step(run):
     text = run("follow_trajectory.py")
     worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " rad " in row}
@@ -96,6 +117,7 @@ SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", 
 
 
 @needs_training
+@pytest.mark.usefixtures("quick_compilation")
 def test_a_short_training_ends_with_a_picture(run, tmp_path):
     picture = tmp_path / "curve.png"
     text = run("train_reach.py", *SMALL, "--epochs", "1", "--picture", str(picture))

@@ -19,7 +19,7 @@ ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
     path = tmp_path / "new" / "demo.png"
-    flags = ("--num-envs", 3, "--workers", 2, "--seconds", 0.05, "--picture", path)
+    flags = ("--num-envs", 3, "--workers", 1 if name == "panda" else 0, "--seconds", 0.05, "--picture", path)
     status, said, _ = batchpid("demo", name, *flags)
     assert status == 0
     for line in (
@@ -35,13 +35,6 @@ def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
     with Image.open(path) as picture:
         assert picture.width > 1000
         assert len(np.unique(np.asarray(picture))) > 20
-
-
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Pictures are not drawn: that takes longer than the robots."""
-    monkeypatch.setattr("batchpid.sim.plots.step_responses", lambda *_, **__: None)
-    monkeypatch.setattr("batchpid.sim.plots.save", lambda _, path: path)
 
 
 @pytest.mark.usefixtures("undrawn")

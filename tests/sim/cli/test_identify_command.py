@@ -63,6 +63,7 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         assert message in error
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_progress_promises_no_remaining_time(batchpid, log, tmp_path, monkeypatch):
     """A fit mostly ends long before its last evaluation."""
     bars = []

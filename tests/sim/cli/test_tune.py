@@ -24,10 +24,10 @@ SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--work
 
 @pytest.fixture(autouse=True)
 def few_moves(monkeypatch):
-    """Use two random moves in the final of a search and in the commands' table."""
-    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 2)
+    """Use one random move in the final of a search and in the commands' table."""
+    monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
     monkeypatch.setattr(
-        "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 2), seed)
+        "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed)
     )
 
 
@@ -48,6 +48,7 @@ def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_
     assert not out.with_suffix(".search.json").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypatch):
     out = tmp_path / "a.yaml"
 
@@ -69,6 +70,7 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
     assert f"{costs[0][0]:.4f} as designed" in said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
     out = tmp_path / "panda.yaml"
     monkeypatch.setattr("batchpid.sim.tuning.evaluation.Evaluation.drawback", lambda *_: "chatter: tuned 3, designed 2")
@@ -80,6 +82,7 @@ def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp
     assert (bp.load_params(out)[0].kp == load_bundled("panda").designed().kp).all()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     urdf = write(tmp_path, one_joint(), "my arm.urdf")
@@ -97,6 +100,7 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
     assert status == 0, error
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_settings_keep_the_types_of_options(batchpid, tmp_path):
     """Flags are not text in the file: "False" would be true to any program that reads it."""
     urdf = write(tmp_path, one_joint(), "arm.urdf")

@@ -53,8 +53,8 @@ def test_any_packing_and_workers_are_bit_identical(name, physics, options):
 def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     """Otherwise the tests of this module could not fail."""
     monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *_: False)
-    shared = thrash(pack_size=8, num_envs=64)
-    assert (shared.qpos != thrash(pack_size=1, num_envs=64).qpos).any()
+    shared = thrash(pack_size=8, physics="fast")
+    assert (shared.qpos != thrash(pack_size=1, physics="fast").qpos).any((0, 2)).sum() > 2
 
 
 @pytest.mark.parametrize("name", ["jaco2", "panda"])
@@ -80,11 +80,10 @@ def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     robot = Robot.load("panda", fixed_base=False)
     options = {"control": "effort", "params": robot.params(**OPEN_LOOP)}
     runs = []
-    for pack_size, workers in ((1, 0), (8, 0), (4, 2)):
+    for pack_size, workers in ((1, 0), (4, 2)):
         with Runner(robot, N, pack_size=pack_size, workers=workers, **options) as runner:
             runs.append(runner.rollout(random_efforts(robot)))
-    assert_identical(runs[1], runs[0])
-    assert_identical(runs[2], runs[0])
+    assert_identical(*runs)
 
 
 def test_an_env_alone_is_bit_identical_to_the_same_env_among_others(jaco2):
@@ -124,13 +123,12 @@ def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
     for start, isolated in ((jaco2.start, 0), (closed_hand(jaco2), N)):
         with Runner(jaco2, N, control="effort", params=jaco2.params(**OPEN_LOOP), workers=0) as runner:
             episodes = []
-            for _ in range(3):
+            for _ in range(2):
                 runner.reset(start)
                 assert packs.isolated() == isolated
                 episodes.append(runner.rollout(random_efforts(jaco2)))
                 assert packs.isolated() > 0
-        assert_identical(episodes[1], episodes[0], skip=["time"])
-        assert_identical(episodes[2], episodes[0], skip=["time"])
+        assert_identical(*episodes, skip=["time"])
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
@@ -147,7 +145,7 @@ def test_a_robot_that_is_isolated_keeps_its_drives(jaco2, packs):
     target, runs = closed_hand(jaco2), []
     for pack_size in (1, 8):
         with Runner(jaco2, N, control="drive", workers=0, pack_size=pack_size) as runner:
-            runs.append(runner.rollout(np.broadcast_to(target, (60, jaco2.dof))))
+            runs.append(runner.rollout(np.broadcast_to(target, (40, jaco2.dof))))
             assert packs.isolated() == N
     assert_identical(*runs)
     assert np.abs(runs[0].qpos[-1, :, :6] - target[:6]).max() < 0.02
@@ -165,7 +163,7 @@ def test_a_robot_that_is_isolated_keeps_its_payload_and_friction(jaco2, packs):
 
 
 def test_a_snapshot_in_contact_is_the_same_barrier_for_any_packing(jaco2):
-    effort = random_efforts(jaco2, 2 * TICKS)
+    effort = random_efforts(jaco2, TICKS + 10)
     options = {"control": "effort", "params": jaco2.params(**OPEN_LOOP)}
 
     def run(pack_size):

@@ -67,11 +67,20 @@ def expected(case):
 LOGS = {"jax_log_compiles", "jax_explain_cache_misses"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(SETTINGS.keys() - LOGS))
 @pytest.mark.parametrize("case", ["pid", "controller"])
 def test_no_setting_changes_a_motion(case, name):
     wanted = expected(case)
     with changed(**{name: SETTINGS[name]}):
+        assert_identical(motion(case), wanted)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("case", ["pid", "controller"])
+def test_all_that_leave_programs_compiled_at_once(case, wide):
+    wanted = expected(case)
+    with changed(**{**SETTINGS, "jax_disable_jit": False, "jax_enable_x64": wide}):
         assert_identical(motion(case), wanted)
 
 

@@ -418,13 +418,14 @@ def test_plot_draws_complete_and_partial_recordings(tmp_path, capsys):
         while read_count(recorder.partial) < 20:
             time.sleep(0.02)
         shutil.copy(recorder.partial, tmp_path / "c.h5.partial")  # as a kill would leave it
-    assert main(["plot", str(tmp_path / "a.h5")]) == 0
+    one = ["--joints", "panda_joint1"]
+    assert main(["plot", str(tmp_path / "a.h5"), *one]) == 0
     assert (tmp_path / "a-responses.png").stat().st_size > 10_000
     picture = tmp_path / "both.svg"
-    arguments = ["--versus", str(tmp_path / "b.h5"), "--joints", "panda_joint1", "--picture", str(picture)]
-    assert main(["plot", str(tmp_path / "a.h5"), *arguments]) == 0
+    arguments = ["--versus", str(tmp_path / "b.h5"), "--picture", str(picture)]
+    assert main(["plot", str(tmp_path / "a.h5"), *one, *arguments]) == 0
     assert "<svg" in picture.read_text()
-    assert main(["plot", str(tmp_path / "c.h5.partial"), "--kind", "efforts", "--every", "3"]) == 0
+    assert main(["plot", str(tmp_path / "c.h5.partial"), "--kind", "efforts", "--every", "3", *one]) == 0
     assert (tmp_path / "c-efforts.png").exists()
     assert "cut short" in capsys.readouterr().out
     with make() as runner, Recorder(tmp_path / "empty.h5", runner):

@@ -9,6 +9,7 @@ import random
 import signal
 import threading
 import warnings
+from functools import partial
 
 import numpy as np
 import psutil
@@ -42,13 +43,13 @@ def undisturbed():
     return rollout
 
 
-def at_tick(tick, act):
-    """Return a progress bar that calls ``act`` before the given tick."""
+def at_ticks(acts):
+    """Return a progress bar that calls each of ``acts`` before its tick."""
 
     def progress(ticks):
         for number in ticks:
-            if number == tick:
-                act()
+            if number in acts:
+                acts[number]()
             yield number
 
     return progress
@@ -83,17 +84,26 @@ def replace_run(act, in_env=None):
     return build
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP])
-def test_a_lost_worker_is_replaced(number, undisturbed):
+def test_a_lost_worker_is_replaced(undisturbed):
+    """Killed, crashed and stopped in one rollout."""
+    lost = []
+
+    def lose(number):
+        lost.append(runner.pids[1])
+        send(runner.pids[1], number)
+
+    losses = {7: signal.SIGKILL, 14: signal.SIGSEGV, 21: signal.SIGSTOP}
+    acts = {tick: partial(lose, number) for tick, number in losses.items()}
     with make_runner() as runner:
-        before = runner.pids
-        progress = at_tick(20, lambda: send(runner.pids[1], number))
-        with pytest.warns(RecoveryWarning, match=r"worker 1 \(pid \d+, envs 4 to 7\)"):
-            rollout = runner.rollout(setpoints(), progress=progress)
-        assert runner.recoveries == 1
-        assert runner.pids[0] == before[0]
-        assert runner.pids[1] != before[1]
-        assert not psutil.pid_exists(before[1])
+        other = runner.pids[0]
+        with pytest.warns(RecoveryWarning) as found:
+            rollout = runner.rollout(setpoints(), progress=at_ticks(acts))
+        assert runner.recoveries == len(found) == 3
+        for warning, pid in zip(found, lost, strict=True):
+            assert f"worker 1 (pid {pid}, envs 4 to 7)" in str(warning.message)
+        assert runner.pids[0] == other
+        assert len({*lost, runner.pids[1]}) == 4
+        assert not any(map(psutil.pid_exists, lost))
     assert_identical(undisturbed, rollout)
 
 
@@ -143,7 +153,7 @@ def test_a_worker_that_exceeds_the_timeout_is_noticed():
             pass
 
     with (
-        make_runner(recover=False, build=replace_run(work_for_ever), timeout=0.5) as runner,
+        make_runner(workers=1, recover=False, build=replace_run(work_for_ever), timeout=0.5) as runner,
         pytest.raises(WorkerError, match="no answer within"),
     ):
         runner.step(ROBOT.settings.target)
@@ -162,8 +172,8 @@ def test_workers_are_pinned_if_there_are_as_many_as_cores():
 
 
 def test_a_worker_with_a_long_tick_does_not_count_as_stuck():
-    with make_runner(recover=False) as runner:
-        obs = runner.step(ROBOT.settings.target, substeps=8_000)  # more than a second in one tick
+    with make_runner(workers=1, recover=False) as runner:
+        obs = runner.step(ROBOT.settings.target, substeps=4_000)  # more than a second in one tick
         assert obs.ok.all()
 
 
@@ -253,7 +263,7 @@ def test_a_request_that_kills_every_worker_is_given_up(monkeypatch):
         os.kill(os.getpid(), signal.SIGSEGV)
 
     with (
-        make_runner(build=replace_run(crash)) as runner,
+        make_runner(workers=1, build=replace_run(crash)) as runner,
         pytest.raises(WorkerError, match=r"(?s)SIGSEGV.*lost 2 times.*workers=0"),
     ):
         runner.step(ROBOT.settings.target)
@@ -264,7 +274,7 @@ def test_an_error_in_a_loop_is_raised_with_its_traceback():
         raise ZeroDivisionError("in the worker")
 
     with (
-        make_runner(build=replace_run(fail)) as runner,
+        make_runner(workers=1, build=replace_run(fail)) as runner,
         pytest.raises(WorkerError, match=r"(?s)worker \d.*envs.*Traceback.*ZeroDivisionError: in the worker"),
     ):
         runner.step(ROBOT.settings.target)
@@ -288,7 +298,7 @@ def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
 def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
     results = []
     for interrupted in (False, True):
-        with make_runner(workers=workers) as runner:
+        with make_runner(workers=workers if interrupted else 0) as runner:
             runner.rollout(setpoints(5))
             if interrupted:
                 with (

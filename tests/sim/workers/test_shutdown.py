@@ -21,15 +21,15 @@ import sys, numpy as np, warnings
 warnings.simplefilter("ignore")
 from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
-runner = Runner(robot, 8, params=robot.params(), workers=2)
+runner = Runner(robot, 8, params=robot.params(), workers={workers})
 print(*runner.pids, flush=True)
 {body}
 """
 
 
-def start(body, **options):
+def start(body, workers=2, **options):
     """Start a program with a runner; return its process and the pids of its workers."""
-    text = PROGRAM.format(body=textwrap.dedent(body))
+    text = PROGRAM.format(body=textwrap.dedent(body), workers=workers)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
     process = subprocess.Popen(
         [sys.executable, "-c", text],
@@ -40,7 +40,7 @@ def start(body, **options):
         **options,
     )
     pids = [int(pid) for pid in process.stdout.readline().split()]
-    assert len(pids) == 2, process.communicate()[1]
+    assert len(pids) == workers, process.communicate()[1]
     return process, pids
 
 
@@ -98,7 +98,7 @@ def test_workers_outlive_the_thread_that_made_them(panda):
     ],
 )
 def test_workers_end_with_their_runner_or_with_the_program(body, status):
-    process, pids = start(body)
+    process, pids = start(body, workers=1)
     with process:
         error = process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == status, error
@@ -116,7 +116,7 @@ def test_a_forked_child_does_not_end_the_workers_of_its_parent():
     os.waitpid(child, 0)
     print(runner.step(robot.settings.target).ok.all())
     """
-    process, pids = start(body)
+    process, pids = start(body, workers=1)
     with process:
         output, error = process.communicate(timeout=PATIENCE)
     assert output.strip() == "True", error
@@ -125,7 +125,7 @@ def test_a_forked_child_does_not_end_the_workers_of_its_parent():
 
 @pytest.mark.parametrize("kind", ["stdin", "script", "thread"])
 def test_programs_need_no_main_guard(kind, tmp_path):
-    text = PROGRAM.format(body="print(runner.step(robot.settings.target).ok.all(), len(runner.pids))")
+    text = PROGRAM.format(body="print(runner.step(robot.settings.target).ok.all(), len(runner.pids))", workers=1)
     if kind == "thread":
         text = "import threading\ndef job():\n" + textwrap.indent(text, "    ")
         text += "\nthread = threading.Thread(target=job); thread.start(); thread.join()"
@@ -142,5 +142,5 @@ def test_programs_need_no_main_guard(kind, tmp_path):
         cwd=tmp_path,
         timeout=PATIENCE,
     )
-    assert done.stdout.splitlines()[-1] == "True 2", done.stderr
+    assert done.stdout.splitlines()[-1] == "True 1", done.stderr
     assert have_ended([int(pid) for pid in done.stdout.splitlines()[0].split()])

@@ -2,6 +2,7 @@ import json
 import os
 import runpy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
+DT = 1 / 1000
+"""Time step of the logs of ``runs``: half the sim steps of the default."""
 ARM = """<robot name="arm2"><link name="base"/>
 <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
 <inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
@@ -58,9 +61,9 @@ def as_log(robot: Robot, table: dict, kind: str) -> Log:
 
 @pytest.fixture(scope="module")
 def runs(arm, mujoco_log):
-    """Truth, and logs of 3 s of setpoints and of efforts."""
+    """Truth, and logs of 2.5 s of setpoints and of efforts."""
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
-    table = mujoco_log["simulate"](arm, truth, excite(arm, 3.0, lowest=0.6), params, every=1, seed=1)
+    table = mujoco_log["simulate"](arm, truth, excite(arm, 2.5, lowest=0.6), params, timestep=DT, every=1, seed=1)
     return truth, as_log(arm, table, "setpoint"), as_log(arm, table, "effort")
 
 
@@ -102,9 +105,9 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
 
 def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     truth, _, efforts = runs
-    joints, drive = (0, 1), Drive(1 / 2000, None, "gravity+coriolis")
+    joints, drive = (0, 1), Drive(DT, None, "gravity+coriolis")
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
-    problem = Problem(arm, joints, drive, [efforts], [smooth(efforts, 1 / 2000)], unknowns)
+    problem = Problem(arm, joints, drive, [efforts], [smooth(efforts, DT)], unknowns)
     per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
     theta = unknowns.point(Motors(*per_joint, row(truth.delay + 7e-4), row(0.0095), row(0.0)))
     begin, delay = State(Step.first(theta, 20)), unknowns.names.index(("delay", None))
@@ -115,7 +118,7 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
 
 def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
-    motion = excite(arm, 2.0, rate=2000.0, lowest=0.6).position
+    motion = excite(arm, 1.0, rate=2000.0, lowest=1.0).position
     per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
     motors = Motors(*per_joint, row(truth.delay), row(0.005), row(0.0))
     drive = Drive(1 / 2000, params, "gravity+coriolis", substeps=4)
@@ -151,6 +154,7 @@ def test_known_motors_are_found(arm, runs, kind):
         arm,
         setpoints if by_law else efforts,
         params=arm.designed("effort") if by_law else None,
+        timestep=DT,
         workers=0,
         payload=False,
     )
@@ -182,9 +186,10 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     truth, params = mujoco_log["plausible"](turret, 2), turret.designed("effort")
     motion = excite(turret, 1.6, lowest=0.6)
     still = motion._replace(position=np.where([False, True], motion.position, motion.position[0]))
-    table = mujoco_log["simulate"](turret, truth, still, params, every=2, compensate=False)
+    table = mujoco_log["simulate"](turret, truth, still, params, timestep=DT, every=1, compensate=False)
     log = as_log(turret, table, "setpoint")
-    found = identify(turret, log, params=params, compensate="none", workers=0, payload=False, evaluations=3)
+    options = {"params": params, "timestep": DT, "compensate": "none", "workers": 0, "payload": False}
+    found = identify(turret, log, **options, evaluations=3)
     document = found.document()
     assert {f"shoulder: {kind}" for kind in PER_JOINT} <= set(found.not_identified)
     assert "elbow: friction" not in found.not_identified
@@ -209,7 +214,7 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
 def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothing(arm, runs):
     truth, _, efforts = runs
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
-    drive, motion = Drive(1 / 2000, None, "gravity+coriolis"), smooth(efforts, 1 / 2000)
+    drive, motion = Drive(DT, None, "gravity+coriolis"), smooth(efforts, DT)
     problem = Problem(arm, (0, 1), drive, [efforts], [motion], unknowns)
     per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
     theta = unknowns.point(Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0)))
@@ -226,25 +231,25 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
 
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
-    time, qpos, command = (table[:420] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    time, qpos, command = (table[:210] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
-    options = {"params": arm.designed("effort"), "workers": 0, "payload": False, "evaluations": 6}
+    options = {"params": arm.designed("effort"), "timestep": DT, "workers": 0, "payload": False, "evaluations": 6}
     seen = []
     whole = identify(arm, log, **options, progress=lambda steps: (seen.append(step) or step for step in steps))
 
-    def stop(steps):
+    def stop(steps, last):
         for step in steps:
             if step == last:
                 raise KeyboardInterrupt
             yield step
 
-    for last in (1, len(seen) - 1):  # the second while the fit with noise runs
-        history = tmp_path / f"fit{last}.json"
+    history = tmp_path / "fit.json"
+    for last in (1, len(seen) - 1):  # the second while the fit with noise runs, in a fit that has resumed once
         with pytest.raises(KeyboardInterrupt):
-            identify(arm, log, **options, history=history, progress=stop)
-        resumed = identify(arm, log, **options, history=history)
-        assert np.array_equal(resumed.estimate, whole.estimate)
-        assert np.array_equal(resumed.uncertainty.deviation, whole.uncertainty.deviation)
+            identify(arm, log, **options, history=history, progress=partial(stop, last=last))
+    resumed = identify(arm, log, **options, history=history)
+    assert np.array_equal(resumed.estimate, whole.estimate)
+    assert np.array_equal(resumed.uncertainty.deviation, whole.uncertainty.deviation)
     assert json.loads(history.read_text())["state"]["done"]
     with pytest.raises(bp.InvalidArgumentError, match=r"another fit \(seed differ\)"):
         identify(arm, log, **options, seed=1, history=history)
@@ -252,7 +257,7 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
 
 def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path):
     _, setpoints, _ = runs
-    time, qpos, command = (table[:600] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    time, qpos, command = (table[:210] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
     gains, history = arm.designed("effort"), tmp_path / "fit.json"
 
@@ -261,7 +266,7 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path
         yield from steps
 
     def resume(robot: Robot = arm, log: Log = log, **options) -> None:
-        fixed = {"params": gains, "workers": 0, "payload": False, "evaluations": 1, "history": history}
+        fixed = {"params": gains, "timestep": DT, "workers": 0, "payload": False, "evaluations": 1, "history": history}
         identify(robot, log, **{**fixed, **options}, progress=stop)
 
     with pytest.raises(KeyboardInterrupt):
@@ -289,7 +294,7 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_workers(arm, runs):
-    options = {"params": arm.designed("effort"), "evaluations": 2}
+    options = {"params": arm.designed("effort"), "timestep": DT, "evaluations": 2}
     alone, shared = (identify(arm, runs[1], workers=workers, **options) for workers in (0, 2))
     assert np.array_equal(alone.estimate, shared.estimate)
     assert np.array_equal(alone.uncertainty.deviation, shared.uncertainty.deviation)
@@ -299,10 +304,10 @@ def test_a_log_that_no_robot_could_have_made_is_refused(runs, tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.replace("revolute", "continuous"))
     arm, log = Robot.load(tmp_path / "arm.urdf"), runs[1]
     unstable = bp.make_params(2, kp=1e9, kd=1e9)
-    time, qpos, command = (table[:420] for table in (log.time, log.qpos, log.command))
+    time, qpos, command = (table[:210] for table in (log.time, log.qpos, log.command))
     part = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
     with pytest.raises(bp.InvalidArgumentError, match="all diverge"):
-        identify(arm, part, params=unstable, workers=0, payload=False)
+        identify(arm, part, params=unstable, timestep=DT, workers=0, payload=False)
 
 
 def test_logs_and_params_have_to_fit(arm, runs):
