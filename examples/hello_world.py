@@ -23,11 +23,11 @@ def build(scene, env):
     box.set_pose(sapien.Pose(p=[1.5, 0, HALF + 0.5 + 0.1 * env]))
     scene.set_ambient_light([0.5, 0.5, 0.5])
     scene.add_directional_light([0, 1, -1], [0.5, 0.5, 0.5])
-    return box  # Runner.poses() returns the poses of what is returned here
+    return box  # Runner.poses() returns the pose of the returned entity
 
 
 def main(num_envs=4):
-    """Let the boxes fall while the robots hold their start pose."""
+    """Drop the boxes while the robots hold their start pose."""
     robot = Robot.load("panda")
     with Runner(robot, num_envs, build=build) as runner:
         print("time [s]   height of each box's lower side [m]")

@@ -150,7 +150,7 @@ def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, 
 
 
 def as_actuators(robot: Robot, truth: Truth) -> bp.Actuators:
-    """Return the actuators that an identification should find; their friction adds to that of the robot."""
+    """Return the actuators that an identification should find; their friction adds to the robot's."""
     return bp.make_actuators(
         robot.dof,
         command_delay=truth.delay,

@@ -45,7 +45,7 @@ class Config:
     learning_rate: float = 1e-3  # At the start; it falls linearly to 0.
     discount: float = 0.9  # Of the reward, per step.
     gae_lambda: float = 0.95  # Weight of longer returns in the advantage.
-    clip: float = 0.2  # Change of a probability ratio beyond which there is no gradient.
+    clip: float = 0.2  # Change of a probability ratio beyond which the gradient is zero.
     shaping: float = 10.0  # Weight of the potential that shapes the reward.
     picture: Path | None = None  # Learning curve to draw: .png or .svg.
 
@@ -73,7 +73,7 @@ Batch = namedtuple("Batch", "observation action log_prob value reward terminated
 
 
 def init_mlp(key, sizes, scale):
-    """Return the layers (weights, biases) of a perceptron; ``scale`` is that of the last one's weights."""
+    """Return the layers (weights, biases) of a perceptron; ``scale`` applies to the weights of the last layer."""
     scales = [2**0.5] * (len(sizes) - 2) + [scale]
     layers = zip(jax.random.split(key, len(scales)), pairwise(sizes), scales, strict=True)
     return [(jax.nn.initializers.orthogonal(scale)(key, shape), jnp.zeros(shape[1])) for key, shape, scale in layers]

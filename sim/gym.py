@@ -53,7 +53,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
     """N robots, each with a joint pose to reach: a :class:`gymnasium.vector.VectorEnv` over the Runner.
 
     Joints are the independent ones (:attr:`batchpid.sim.Robot.independent`): followers move with their leaders. A
-    setpoint has one number for each of them, or those of the command of a :class:`batchpid.sim.Controller`, within the
+    setpoint has one number for each of them. A :class:`batchpid.sim.Controller` may define another command, within the
     bounds of its :class:`batchpid.sim.CommandSpec`.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
@@ -79,7 +79,7 @@ class ReachVectorEnv(SingleOwner, VectorEnv):
         ``"setpoint"`` or ``"increment"``.
     max_increment
         Change of the setpoint by an increment of 1, scalar or (size,) [rad or m]; default the velocity limit times the
-        time of a step. For increments of a command of its own a controller has no default.
+        time of a step. No default for a controller that defines its command.
     tolerance
         Largest error of a reached goal [rad or m].
     autoreset_mode

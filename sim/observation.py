@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
 class Observation(NamedTuple):
     """State of every env after a tick, (envs, dof) in the robot's joint order; ``ok`` is (envs,).
 
-    ``effort``, ``saturated`` and ``guarded`` are those of the last sim step; under control "drive" the effort is qf
+    ``effort``, ``saturated`` and ``guarded`` are from the last sim step; under control "drive" the effort is qf
     alone, since PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is
     suspended since an earlier one: see :attr:`batchpid.sim.Runner.faults`.
     """
@@ -91,7 +91,7 @@ class Redraw(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """Robot, options and origin of a run; what is not known is None.
+    """Robot, options and origin of a run; None where unknown.
 
     :meth:`batchpid.sim.Runner.rollout` and :func:`batchpid.sim.read_recording` fill it; ``robot.run_info()`` makes one
     by hand.
@@ -208,8 +208,8 @@ class Rollout:
     time: Float64
     """End of each tick (ticks,) [s]."""
     setpoint: Float64
-    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. Of a control with
-    a command of its own (ticks, envs, size), in the order of ``info.command.names``."""
+    """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. For a control that
+    defines its command (ticks, envs, size), in the order of ``info.command.names``."""
     observation: Observation
     """Observations, stacked."""
     tick: float
@@ -281,7 +281,7 @@ class Rollout:
     def plot(self, **options: Any) -> Any:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts for each joint.
 
-        ``options`` are those of :func:`batchpid.sim.plots.step_responses`: joints, band, mark, title.
+        ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, band, mark, title.
         """
         return _load_plot[0]()(self, **options)
 

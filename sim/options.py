@@ -204,7 +204,7 @@ class RunnerOptions:
 
     @property
     def solver(self) -> Physics | MujocoSolver:
-        """Solver settings that ``physics`` stands for."""
+        """Solver settings for the option ``physics``."""
         return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
 
     def load_engine(self) -> Engine:
@@ -244,14 +244,14 @@ class RunnerOptions:
         """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
 
         Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`batchpid.sim.engine.sapien.contact_prediction` missed a contact. Without collisions there is none to
-        miss: any number of workers get equal shares, and pack these.
+        where :mod:`batchpid.sim.engine.sapien.contact_prediction` missed a contact. Without collisions nothing can
+        be missed: any number of workers get equal shares, and pack these.
         """
         return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
 
     @property
     def inseparable_envs(self) -> int:
-        """Number of successive envs that one worker has: those of a pack, if they can touch anything."""
+        """Number of successive envs that stay on one worker: a whole pack, if they can touch anything."""
         return self.scenes_per_system if self.collisions else 1
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
@@ -295,7 +295,7 @@ class RunnerOptions:
         """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does; None if every effect
         is off.
 
-        None stands for the robot's own, of which control "drive" has the friction and armature.
+        None selects the robot's own actuators; control "drive" uses only their friction and armature.
 
         Raises
         ------
@@ -365,14 +365,14 @@ class RunnerOptions:
 
 
 def keyword_parameters() -> list[Parameter]:
-    """Return the parameters that :class:`RunnerKeywords` stands for, for the signatures that interpreters show."""
+    """Return the fields of :class:`RunnerKeywords` as parameters, for the signatures that interpreters show."""
     types, default = RunnerKeywords.__annotations__, {each.name: each.default for each in fields(RunnerOptions)}
     return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
 def _control(value: object) -> Any:
     if callable(value) and callable(getattr(value, "init", None)):
-        own_command(value)  # raises for one that is none
+        own_command(value)  # raises for an invalid command
         return value
     return choice("control", value, get_args(ControlMode))
 
@@ -392,7 +392,7 @@ def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> b
     """Return the params of a runner that is given none.
 
     - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
-    - ``"drive"``: the drive gains of a bundled robot's settings, else those of ``robot.designed("effort")`` without
+    - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of ``robot.designed("effort")`` without
       ki: a drive has no setpoint weight, so that the integral would overshoot;
     - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
 

@@ -13,7 +13,7 @@ Placement = Literal["SPREAD", "PACK"]
 
 @dataclass(frozen=True, eq=False)
 class Ray:
-    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` stands for ``Ray()``.
+    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` means ``Ray()``.
 
     Raises
     ------
@@ -58,4 +58,4 @@ class Ray:
 
 
 class ClusterWarning(UserWarning):
-    """A cluster is slower, or its machines are less alike, than results or time may allow."""
+    """A cluster is slow, or its machines may compute different results."""

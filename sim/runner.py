@@ -125,10 +125,10 @@ class Runner(SingleOwner):
         Parameters
         ----------
         setpoint
-            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. What it has for a
-            follower (:attr:`batchpid.sim.Robot.coupling`) is replaced by what the leader's means for it; an effort acts
-            on the leader. A :class:`batchpid.sim.Controller` with a command of its own takes (size,) or (envs, size):
-            :attr:`command`.
+            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
+            value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
+            an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
+            (envs, size): :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity. Not for
             a :class:`batchpid.sim.Controller`, which ignores it.
@@ -183,7 +183,7 @@ class Runner(SingleOwner):
         Parameters
         ----------
         setpoints
-            (ticks, envs, dof), or (ticks, dof) for all envs alike [rad or m]; of another command (ticks, envs, size).
+            (ticks, envs, dof), or (ticks, dof) for all envs [rad or m]; for another command (ticks, envs, size).
         setpoint_rates, feedforwards
             Also with the ticks first: see :meth:`step`.
         progress
@@ -218,7 +218,7 @@ class Runner(SingleOwner):
     def actuators(self) -> bp.Actuators | None:
         """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their histories.
 
-        As for the option, None stands for the robot's own when it is assigned, and ``bp.Actuators()`` for ideal ones.
+        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for ideal ones.
         """
         return self._session.state.actuators
 
@@ -246,7 +246,7 @@ class Runner(SingleOwner):
     def settle(self) -> None:
         """Complete a command whose call was interrupted (Ctrl-C), as every other method does first.
 
-        A closed runner passes on to the recorder what was completed before.
+        A closed runner passes completed ticks on to the recorder.
         """
         self._session.settle()
 

@@ -30,7 +30,7 @@ class Controller(Protocol):
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
-        """Return the state of so many envs at their start: None, an array, or tuples and dicts of these.
+        """Return the state of ``num_envs`` envs at their start: None, an array, or tuples and dicts of these.
 
         Every array has the envs as its first axis: states are reset by mask, and kept in snapshots. Later states have
         the same structure, shapes and dtypes.
@@ -113,7 +113,7 @@ class RunnerKeywords(TypedDict, total=False):
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     actuators: bp.Actuators | None
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
-    row per env. None, the default, stands for those of the robot: under control "drive" for their friction and
+    row per env. None, the default, selects the robot's actuators: under control "drive" their friction and
     armature. ``bp.Actuators()`` is ideal. The control sees measured positions and velocities; observations hold the
     true ones, and the effort that was delivered."""
     randomization: Randomization | None
@@ -127,7 +127,7 @@ class RunnerKeywords(TypedDict, total=False):
     it: the env that it is for fails."""
     recover: bool
     """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
-    those of an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
+    an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
     checkpoint_steps: int | None
     """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for
     which all commands are kept. After contacts the last bits of the results depend on it."""

@@ -110,7 +110,7 @@ class Session:
         return transactions.state
 
     def settle(self) -> None:
-        """Complete an unfinished command, and pass on to the recorder what is not recorded, also when closed."""
+        """Complete an unfinished command, and pass unrecorded ticks on to the recorder, also when closed."""
         self._transactions.run()
 
     # -- commands --------------------------------------------------------------------------------------------------
@@ -383,7 +383,7 @@ class Session:
             transactions.state = transactions.state._replace(unrecorded=ticks[1:])
 
     def _warn(self, stacklevel: int) -> None:
-        """Warn of what the last commands brought: lost workers, faults, missed contacts."""
+        """Warn of the last commands' lost workers, faults and missed contacts."""
         messages, state = self.pool.messages, self._transactions.state
         while messages:
             category, message = messages.popitem()

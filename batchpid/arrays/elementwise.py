@@ -31,7 +31,7 @@ def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
 
 
 def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
-    """Return an angle, or a difference of two, less its whole turns; ``turns_per_rad`` is 0 where it is no angle."""
+    """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to keep them."""
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
 
 

@@ -1,7 +1,7 @@
 """The control law as a C99 header without dependencies, generated from the trace of :func:`batchpid.advance`.
 
 The header holds the gains as constants, a struct for the state, and three functions: ``PREFIX_init``, ``PREFIX_reset``
-and ``PREFIX_step``. They allocate nothing and have no global state. Each operation is that of the law in NumPy, in the
+and ``PREFIX_step``. They allocate nothing and have no global state. Each operation is the same as in NumPy, in the
 same order, so that the efforts are bit-identical under ``-ffp-contract=off``, which forbids the compiler to fuse a
 multiplication and an addition. It also compiles as C++.
 """
@@ -356,7 +356,7 @@ static inline void {p}_step(
 def _unrolled(traced: Trace, constants: int, read: int) -> tuple[list[tuple[str, int, list[int]]], list[int]]:
     """Return the operations ``(name, value, operands)`` of a trace, each with a new value, and the values returned.
 
-    The operations on constants come first. Values below ``constants + read`` are the constants and what a step reads.
+    The operations on constants come first. Values below ``constants + read`` are constants and inputs of a step.
     """
     operations: list[tuple[str, int, list[int]]] = []
     following = iter(range(constants + read, 10**9))

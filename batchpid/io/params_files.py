@@ -116,7 +116,7 @@ def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None 
 
 
 def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the ``about`` that :func:`save_params` wrote; empty if there is none. Raises as :func:`load_params`."""
+    """Return the ``about`` that :func:`save_params` wrote, or an empty dict. Raises as :func:`load_params`."""
     document = documents.read(path)
     documents.check(str(path), document, SCHEMA)
     return dict(document.get("about", {}))

@@ -185,8 +185,8 @@ def make_actuators(
         Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there [N m or N], both
         (points,), (joints, points) or (envs, joints, points). Linear between the points, constant outside.
     coulomb, viscous
-        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to that of the robot's description, by
-        the model of :mod:`batchpid.motors.friction`.
+        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to the description's, by the model
+        of :mod:`batchpid.motors.friction`.
     static
         Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >= ``coulomb``, also
         in addition to the description's. 0: as much as while it moves.

@@ -109,7 +109,7 @@ class Coupling:
         return self.matrix.T @ np.asarray(mass_matrix, np.float64) @ self.matrix
 
     def mass_matrix(self, mass_matrix: ArrayLike) -> Float64:
-        """Return M_r in the rows and columns of the independent joints (..., joints, joints), those of 1 elsewhere."""
+        """Return M_r in the rows and columns of the independent joints (..., joints, joints), else the identity."""
         reduced = self.reduced(mass_matrix)
         joints, free = len(self.leader), np.flatnonzero(self.independent)
         whole = np.tile(np.eye(joints), (*reduced.shape[:-2], 1, 1))
@@ -121,7 +121,7 @@ class Coupling:
         return self.matrix.T**2 @ np.asarray(damping, np.float64)
 
     def of_all(self, figures: ArrayLike) -> NDArray[Any]:
-        """Return ``figures`` (..., independent) for all joints (..., joints); followers have those of their leaders."""
+        """Return ``figures`` (..., independent) for all joints (..., joints); followers have their leaders' values."""
         return np.asarray(figures)[..., (np.cumsum(self.independent) - 1)[self.leader]]
 
     def of_leaders(self, figures: ArrayLike) -> NDArray[Any]:

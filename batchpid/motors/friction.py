@@ -16,7 +16,7 @@ models", IROS 2005)::
 
     u = min(max(u' - K (v + w (v - v')), tau - F), tau + F)             K = J / dt,  w = 1 - dt B / J
 
-  J = 1 / ((M + dt B)^-1)_jj is the inertia that the joint shows. At rest u becomes the load h, whatever tau does within
+  J = 1 / ((M + dt B)^-1)_jj is the inertia that the joint shows. At rest u becomes the load h, for any tau within
   F of it, and the joint stays. In velocities integrated over time K is a spring of stiffness K / dt that yields at F:
   elastic, then plastic, so that a load below F never makes it creep, unlike LuGre's (P. Dupont, V. Hayward,
   B. Armstrong and F. Altpeter, "Single state elastoplastic friction models", IEEE Transactions on Automatic Control 47,

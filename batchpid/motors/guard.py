@@ -107,9 +107,9 @@ def init(guard: Guard, qpos: Any) -> GuardState:
 
 
 def advance(guard: Guard, state: GuardState, setpoint: Any, dt: float) -> tuple[GuardState, Any]:
-    """Advance the guard by ``dt`` [s]; return the state, whose ``setpoint`` is guarded, and what was changed (bool).
+    """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask of the changes.
 
-    ``setpoint`` (envs, joints) [rad or m] is the one that is asked for; it is not written to.
+    ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask has the same shape.
     """
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)

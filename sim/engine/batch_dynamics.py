@@ -1,8 +1,8 @@
 r"""Dynamics of many robots of one kind, each with its payload, and steps of their joints with friction.
 
-Some joints move (``joints``), others rest or follow one of those: q_whole = rest + G q, with one leader for each row of
-G. With the mass matrix M and the passive forces h (gravity, Coriolis and centrifugal forces) of all joints, those of
-the ones that move are G^T M G and G^T h.
+Some joints move (``joints``), others rest or follow one of them: q_whole = rest + G q, with one leader for each row of
+G. With the mass matrix M and the passive forces h (gravity, Coriolis and centrifugal forces) of all joints, the
+joints that move have G^T M G and G^T h.
 
 The extension computes M by composite rigid bodies (:mod:`batchpid.sim.engine.rigid_body`) and h by the recursive
 Newton-Euler algorithm without acceleration of the joints (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
@@ -94,7 +94,7 @@ class MovingJoints(NamedTuple):
     leader: NDArray[np.int32]
     """Number among the joints that move, of each joint of the robot (dof,); -1 for a joint that rests."""
     multiplier: Float64
-    """Its speed over that of its leader (dof,)."""
+    """Ratio of its speed to its leader's speed (dof,)."""
     rest: Float64
     """Its position where its leader is at 0 (dof,)."""
     low: Float64
@@ -125,7 +125,7 @@ class MovingJoints(NamedTuple):
 
 
 class NativeBatchDynamics:
-    """Dynamics by the extension: those of :class:`PinocchioBatchDynamics`."""
+    """Dynamics as of :class:`PinocchioBatchDynamics`, computed by the extension."""
 
     def __init__(self, models: Models, joints: MovingJoints) -> None:
         bodies, loaded = models(0.0).bodies, models(1.0).bodies
@@ -212,9 +212,9 @@ class PinocchioBatchDynamics:
         friction: Friction,
         dt: float,
     ) -> tuple[Float64, Float64, Float64]:
-        """Return positions, velocities and efforts of friction (n, joints) after a step; ``state`` are those before.
+        """Return positions, velocities and efforts of friction (n, joints) after a step; ``state`` holds them before.
 
-        ``matrix`` is that of :meth:`at`, ``effort`` all but friction, ``added`` the inertia on its diagonal.
+        ``matrix`` is the one from :meth:`at`, ``effort`` excludes friction, ``added`` is the inertia on its diagonal.
         """
         q, v, f = state
         mobility = dt * np.linalg.inv(matrix + added[:, :, None] * np.eye(q.shape[1]))

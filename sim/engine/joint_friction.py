@@ -1,4 +1,4 @@
-"""Friction and damping of a robot's joints: the description's, those of its variation, and those of its actuators."""
+"""Friction and damping of a robot's joints, from its description, its variation and its actuators."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
 
 
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
-    """Return ``own`` friction and damping with those of ``actuators`` added."""
+    """Return ``own`` friction and damping plus the actuators' friction and damping."""
     added = Actuators() if actuators is None else actuators
     static = added.static
     both = zip(own[:2], (added.coulomb, added.viscous), strict=True)

@@ -21,7 +21,7 @@ class LazyModule(ModuleType):
 
 @contextmanager
 def imported_lazily(name: str) -> Iterator[None]:
-    """Let modules that are imported within the block, and import the package ``name``, have a :class:`LazyModule`."""
+    """Give a :class:`LazyModule` to modules that import the package ``name`` within the block."""
     if name in sys.modules:
         yield
         return

@@ -25,7 +25,7 @@ Float64 = NDArray[np.float64]
 class RigidBodies(NamedTuple):
     """Bodies of a robot on a fixed base, one for each joint, parents first; links that cannot move apart are one body.
 
-    A body's frame is that of its joint, which turns about x or slides along it.
+    A body's frame is its joint's frame: the joint turns about x or slides along it.
     """
 
     tree: NDArray[np.int32]

@@ -13,7 +13,7 @@ from batchpid.sim.randomization.fields import PHYSICAL, elements, nominal_values
 
 
 def make_pack(options: RunnerOptions, scene: SceneSpec, size: int, first_env: int, draws: Draws | None) -> EnginePack:
-    """Return the pack of ``size`` envs; without ``draws`` the robots are those of the model."""
+    """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization, robot, packed = options.randomization, options.robot, options.scenes_per_system
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:

@@ -1,4 +1,4 @@
-"""Canonical episode: a short run whose digest is equal on machines that round alike."""
+"""Canonical episode: a short run with equal digests on machines that round in the same way."""
 
 from __future__ import annotations
 

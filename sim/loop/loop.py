@@ -75,7 +75,7 @@ class Loop:
     ) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state.
 
-        ``draws`` are those of all envs from now on; they differ from those before in these envs alone.
+        ``draws`` apply to all envs from now on; they differ from the previous draws in these envs alone.
         """
         for group, ticks in zip(self.groups, self._group_ticks, strict=True):
             group.draws = draws.for_envs(group.envs)
@@ -143,8 +143,8 @@ class Loop:
             group.observe(ticks[0])
 
     def _place(self, states: EnvStates) -> None:
-        # The engine's contact caches, and the order in which it solves contacts, depend on its past; only those of a
-        # new world do not.
+        # The engine's contact caches, and the order in which it solves contacts, depend on its past. A new
+        # world has no past.
         for group in self.groups:
             group.pack.close()
             group.write(self._build(group.envs, group.draws), states.for_envs(group.envs))

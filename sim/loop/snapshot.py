@@ -85,15 +85,15 @@ class EnvStates:
         engine_sizes: Sequence[int],
         command_size: int,
     ) -> None:
-        """Check that these are states of so many envs and joints, with as many values of the engine (envs,).
+        """Check the states' envs and joints, and the number of engine values of each env, ``engine_sizes`` (envs,).
 
         ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
-        have Coulomb friction, ``guard`` whether there is a guard. ``command_size`` is that of a setpoint.
+        have Coulomb friction, ``guard`` whether there is a guard. ``command_size`` is the size of a setpoint.
 
         Raises
         ------
         InvalidArgumentError
-            They are not.
+            An array is missing, unknown, or of another shape, dtype or range.
         """
         table, double, row = np.zeros((num_envs, dof), np.float32), np.zeros((num_envs, dof)), np.zeros(num_envs, bool)
         expected = EnvStates(
@@ -242,9 +242,9 @@ class Snapshot:
         kinds = {name: {type(one).__name__: one for one in _CHOICES[name]} for name in choices}
         chosen = {name: kinds[name][kind] for name, kind in choices.items()}
         params, states = bp.PIDParams(**groups.pop("params"), **chosen), EnvStates(**groups)
-        params.options()  # raises for a choice that is none
+        params.options()  # raises for an unknown choice
         params.check(num_envs)
-        # The rows first: what the next check allocates is of the size of the file then.
+        # Rows first: then the next check allocates no more than the size of the file.
         if states.effort.shape != (num_envs, dof) or params.num_joints != dof or params.dtype.kind != "f":
             raise ValueError(f"its effort {states.effort.shape} or params do not fit {num_envs} envs of {dof} joints")
         controller = states.controller
@@ -270,7 +270,7 @@ class Snapshot:
 def initial_actuators(
     actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float
 ) -> dict[str, NDArray[Any]]:
-    """Return a state of ``actuators`` in the shapes that it has for so many envs and joints, by name."""
+    """Return a state of ``actuators`` by name, in its shapes for ``num_envs`` envs and ``dof`` joints."""
     if actuators is None or not (actuators.measures or actuators.delivers):
         return {}
     longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))

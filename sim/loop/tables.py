@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Return all arrays by name; those of a group as "group.name"."""
+    """Return all arrays by name; a group's arrays as "group.name"."""
     tables: dict[str, NDArray[Any]] = {}
     for name, value in groups.items():
         tables |= {f"{name}.{leaf}": rows for leaf, rows in value.items()} if isinstance(value, dict) else {name: value}

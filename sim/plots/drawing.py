@@ -126,7 +126,7 @@ def set_effort_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
 
 
 def quantiles(values: NDArray[Any], *at: float) -> NDArray[Any]:
-    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN where there are none."""
+    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN without finite envs."""
     finite = np.where(np.isfinite(values), values, np.nan)
     if not np.isnan(finite).any():  # nanquantile is many times slower
         return np.quantile(finite, at, axis=1)

@@ -14,7 +14,7 @@ Float64 = NDArray[np.float64]
 def engine_differences(
     time: Float64, open_loop: Float64, chaos: Float64, ticks: Float64, closed_loop: Float64, title: str
 ) -> Figure:
-    """Draw differences of positions: under equal efforts, beside those of rounding, and under gains on each move.
+    """Draw differences of positions: under equal efforts, with rounding for comparison, and under gains on each move.
 
     Arrays are (times,), and ``closed_loop`` (ticks, moves) over ``ticks`` (ticks,) [s].
     """

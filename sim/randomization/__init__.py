@@ -1,1 +1,1 @@
-"""Randomization of the robots: distributions, and what is drawn from them for each env and episode."""
+"""Randomization of the robots: distributions, and the values drawn from them for each env and episode."""

@@ -160,7 +160,7 @@ class Normal(Distribution):
 
 @dataclass(frozen=True)
 class Choice(Distribution):
-    """Choice among ``values``, all alike probable."""
+    """Choice among ``values``, with equal probabilities."""
 
     values: Sequence[float]
     kind = "choice"

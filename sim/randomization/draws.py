@@ -26,7 +26,7 @@ class Draws(NamedTuple):
         return Draws(self.episodes[envs], {name: rows[envs] for name, rows in self.values.items()})
 
     def replaced(self, mask: NDArray[np.bool_], new: Draws) -> Draws:
-        """Return the draws with those of the envs of ``mask`` (envs,) from ``new``, which has only these."""
+        """Return the draws, with the envs of ``mask`` (envs,) taken from ``new``, which holds only these envs."""
         values = {name: rows.copy() for name, rows in self.values.items()}
         for name, rows in new.values.items():
             values[name][mask] = rows

@@ -26,7 +26,7 @@ GROUPS = ("params", "actuators")
 
 
 def elements(name: str, robot: Robot) -> Sequence[str]:
-    """Return what a field has one value each of: joints, links, axes of links, or one thing."""
+    """Return the names of a field's values: joints, links, axes of links, or the payload."""
     if name == "payload":
         return ("payload",)
     if name == "center_of_mass":

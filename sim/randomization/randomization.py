@@ -44,7 +44,7 @@ class Randomization:
     Raises
     ------
     InvalidArgumentError
-        A field is none of these.
+        A field is neither a distribution nor such a mapping.
     """
 
     seed: int = 0
@@ -60,20 +60,20 @@ class Randomization:
     center_of_mass: Field | None = None
     """Displacement of the centers of mass of the links, along each of the three axes of the link [m]; nominal 0."""
     friction: Field | None = None
-    """Coulomb friction of the joints [N m or N]; nominal that of the URDF."""
+    """Coulomb friction of the joints [N m or N]; nominal as in the URDF."""
     damping: Field | None = None
-    """Viscous damping of the joints [N m s/rad or N s/m]; nominal that of the URDF."""
+    """Viscous damping of the joints [N m s/rad or N s/m]; nominal as in the URDF."""
     armature: Field | None = None
     """Reflected inertia of the motors [kg m^2 or kg]; nominal 0."""
     qpos: Field | None = None
-    """Position at a reset [rad or m], within the joint limits; nominal that which is given to ``reset``."""
+    """Position at a reset [rad or m], within the joint limits; nominal the argument of ``reset``."""
     qvel: Field | None = None
     """Velocity at a reset [rad/s or m/s]."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
     actuators: Mapping[str, Field] = field(default_factory=dict)
-    """Fields of :class:`batchpid.Actuators`, e.g. ``{"command_delay": ...}``; nominal those of the runner's actuators,
-    or those of ideal ones."""
+    """Fields of :class:`batchpid.Actuators`, e.g. ``{"command_delay": ...}``; nominal the values of the runner's
+    actuators, or of ideal ones."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
@@ -94,7 +94,7 @@ class Randomization:
 
     @property
     def given(self) -> dict[str, Field]:
-        """Fields that are given, by name, those of a group as "group.name"."""
+        """Given fields by name; fields of a group as "group.name"."""
         known = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
         for group in GROUPS:
             known |= {f"{group}.{name}": each for name, each in getattr(self, group).items()}
@@ -179,7 +179,7 @@ class Randomization:
     ) -> bp.Actuators | None:
         """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is drawn for them.
 
-        They are those of :func:`batchpid.sim.randomization.checks.prepared_actuators`.
+        ``actuators`` come from :func:`batchpid.sim.randomization.checks.prepared_actuators`.
         """
         if draws is None or actuators is None or not self.actuators:
             return actuators
@@ -200,7 +200,7 @@ class Randomization:
     # -- files -------------------------------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values, for :meth:`from_dict`; what is not given is left out."""
+        """Return the given fields as plain values, for :meth:`from_dict`."""
 
         def plain(each: Any) -> Any:
             if isinstance(each, Mapping):
@@ -217,7 +217,7 @@ class Randomization:
         Raises
         ------
         InvalidArgumentError
-            It is none, or has a field that is unknown.
+            It is not a randomization, or has an unknown field.
         """
         known = mapping("randomization", known)
         names = [each.name for each in fields(cls)]

@@ -133,7 +133,7 @@ class PartialFile(SingleOwner):
             ) from error
 
     def _abandon(self) -> None:
-        """Close the file as it is on disk."""
+        """Close the file without changing it on disk."""
         _redirect_to_memory(self._file)
         with contextlib.suppress(Exception):
             self._file.close()
@@ -156,7 +156,7 @@ def _cause(error: Exception) -> str:
 
 
 def _redirect_to_memory(file: h5py.File) -> None:
-    """Make HDF5 write the rest of ``file`` to memory, after an error; what is on disk stays unchanged.
+    """Make HDF5 write the rest of ``file`` to memory, after an error; the file on disk stays unchanged.
 
     HDF5 writes its caches when it closes a file, and can crash the process where it cannot.
     """

@@ -3,8 +3,8 @@
 A thread makes the file, appends the recorded ticks every half second in HDF5's single-writer mode, and completes it. A
 tick waits while the oldest row that is not on disk was recorded more than :data:`MAX_LAG` ago, so that a kill loses at
 most a second's ticks, however slow the disk. The file grows as ``NAME.partial`` and gets its name when it is complete;
-an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for what it
-holds.
+an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for its
+content.
 
 A signal handler (Ctrl-C) can interrupt the calls at any moment, but not the thread. So the calls take no lock that the
 thread needs: they put items into queues that are written in C, and wait in ways that can be repeated.
@@ -149,7 +149,7 @@ class Recorder(SingleOwner):
                 try:
                     runner.settle()
                 except (InUseError, RecordingError):
-                    pass  # the tick of a call in another thread is not recorded; what the disk said is raised below
+                    pass  # the tick of a call in another thread is not recorded; an error of the disk is raised below
                 except BatchPIDError as error:
                     failure = error
                 self._faults = runner.faults
@@ -178,7 +178,7 @@ class Recorder(SingleOwner):
             raise self._error
 
     def _finish_with(self, end: Callable[[PartialFile], None]) -> None:
-        """Let the thread write the remaining rows and call ``end``, the first one that is given."""
+        """Make the thread write the remaining rows and call ``end``; only the first ``end`` counts."""
         if self._end is None:
             self._end = end
         self._rows.put(None)

@@ -1,7 +1,7 @@
 """Rollouts in files: written as a whole, or tick by tick by :class:`batchpid.sim.Recorder`, and read back.
 
 A file is .npz (NumPy) or .h5 (HDF5). Both hold the arrays of a :class:`batchpid.sim.Rollout` under their names, ticks
-first, and what is known of its :class:`batchpid.sim.RunInfo`: as further arrays in an .npz file, as attributes of an
+first, and the known fields of its :class:`batchpid.sim.RunInfo`: as further arrays in an .npz file, as attributes of an
 .h5 file. ``params``, ``versions`` and ``faults`` are JSON text. An .h5 file has checksums too: the attribute
 ``checksum`` of all others, and the dataset ``checksum`` of each tick's rows (Fletcher-32 covers whole chunks, whose
 older rows a kill would lose).
@@ -57,7 +57,7 @@ def write_recording(
     path
         File to write, ending in .npz (compressed), .h5 or .hdf5.
     seed
-        Seed of the run, kept in the recording; default that of ``rollout.info``.
+        Seed of the run, kept in the recording; default: the seed in ``rollout.info``.
     overwrite
         Whether an existing file is replaced.
 
@@ -234,7 +234,7 @@ def redraws_text(redraws: Iterable[Redraw]) -> str:
 
 
 def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
-    """Return what is known of a run as numbers, texts, and arrays of them."""
+    """Return the known fields of ``info`` as numbers, texts, and arrays of them."""
     known = {name: value for name, value in vars(info).items() if value is not None}
     known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
     if (command := known.pop("own_command", None)) is not None:
@@ -253,7 +253,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
 
 
 def _info(attributes: Mapping[str, Any]) -> RunInfo:
-    """Return what the attributes of a recording say of its run."""
+    """Return the :class:`RunInfo` in the attributes of a recording."""
     if (found := str(attributes.get("format", FORMAT))) != FORMAT:
         raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
     known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}

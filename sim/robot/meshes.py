@@ -1,6 +1,6 @@
 """Mesh files of a URDF: the search for them, and a check of their headers and sizes.
 
-SAPIEN silently drops a collision shape whose file it cannot read, and trusts what a header claims: 20 bytes can cost
+SAPIEN silently drops a collision shape whose file it cannot read, and trusts the sizes in a header: 20 bytes can cost
 gigabytes. Formats other than those checked here are refused: in some, a truncated file ends the process.
 """
 
@@ -122,7 +122,7 @@ def _obj(data: bytes) -> bool:
 def _numbers(text: bytes) -> NDArray[np.float64]:
     """Return the numbers in ``text``, separated by blanks. Raises ValueError if there is anything else."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # by which NumPy tells of a word that is no number
+        warnings.simplefilter("error", DeprecationWarning)  # NumPy's report of a word that is not a number
         try:
             return np.fromstring(text.decode("ascii"), sep=" ")
         except DeprecationWarning as error:

@@ -249,7 +249,7 @@ class Robot(RobotDescription):
     def mjcf_gains(self) -> bp.PIDParams:
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
-        Joints without servo have gains of 0. The setpoint is a joint's position, whatever unit the servo's control has.
+        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control.
 
         Raises
         ------

@@ -56,7 +56,7 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
 
 
 def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bp.Guard | None:
-    """Return the guard that an option of a runner stands for, None for none.
+    """Return the guard for a runner's option ``guard``; None means no guard.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from batchpid.sim.robot.urdf import read_urdf, repair_urdf
 def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
-    Links, joints, numbers and mimics are those of the file, where they were not repaired; visuals and other elements
+    Links, joints, numbers and mimics are copied from the file unless repaired; visuals and other elements
     without effect here are copied. Links that fixed joints connect stay apart.
 
     Parameters
@@ -79,7 +79,7 @@ def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packa
 
 
 def _lacking(robot: RobotDescription) -> Iterator[str]:
-    """Yield what is infinite here and has no number in a URDF, and what a URDF has no place for."""
+    """Yield sentences about infinite limits, for which a URDF has no number, and about actuators."""
     for what, names in (
         ("effort limit", [joint.name for joint in robot.joints if math.isinf(joint.effort_limit)]),
         ("velocity limit", [joint.name for joint in robot.joints if math.isinf(joint.velocity_limit)]),

@@ -69,7 +69,7 @@ class Parity(NamedTuple):
         return np.array([_settling(each) for each in self.moves])
 
     def verdict(self) -> list[str]:
-        """Return what the figures mean, a sentence for each."""
+        """Return the meaning of the figures, one sentence each."""
         said = []
         if max(self.mass_matrix, self.bias) < DYNAMICS_TOLERANCE:
             said.append("Both engines simulate the same robot: masses, inertias and joints agree.")
@@ -111,7 +111,7 @@ def compare_engines(
     seed: int = 0,
     workers: int | None = None,
 ) -> Parity:
-    """Compare SAPIEN and MuJoCo on ``robot``, under ``params`` (by default those of a :class:`batchpid.sim.Runner`).
+    """Compare SAPIEN and MuJoCo on ``robot``, under ``params`` (default as in :class:`batchpid.sim.Runner`).
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _relative(reference: NDArray[Any], other: NDArray[Any]) -> float:
 def _open_loop(robot: Robot, start: Float64, seed: int, workers: int | None) -> tuple[Float64, Float64, Float64, float]:
     """Return times, differences of the engines, and of two runs in SAPIEN; and the difference after one tick.
 
-    The efforts are those of sines of acceleration at the start poses. Once an env reaches a joint limit it is left out.
+    The efforts give sinusoidal accelerations at the start poses. Once an env reaches a joint limit it is left out.
     """
     tick = SUBSTEPS / 2000
     ticks, rng = np.arange(1, round(OPEN_SECONDS / tick) + 1), np.random.default_rng(seed)

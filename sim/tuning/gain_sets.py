@@ -30,15 +30,15 @@ class GainSet(NamedTuple):
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
 
-    "tuned" are those that ship with the robot, "designed" :meth:`batchpid.sim.Robot.designed`, "tutorial" those of
-    SAPIEN's tutorial, for a bundled robot, "mjcf" :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
+    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial" are the gains in
+    SAPIEN's tutorial, for a bundled robot, "mjcf" is :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
     "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or files of ros2_control,
     whose differences from the law are warnings.
 
     Raises
     ------
     InvalidArgumentError
-        There is no such name or file, or the robot has no gains of it.
+        There is no such name or file, or the robot lacks these gains.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
     named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params, "mjcf": robot.mjcf_gains}
@@ -64,7 +64,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
 
 def _of_ros2_control(robot: Robot, path: Path) -> bp.PIDParams:
-    """Return the params in a file of ros2_control; followers, which it does not name, have those of their leaders."""
+    """Return the params in a file of ros2_control; followers, which it does not name, get their leaders' gains."""
     own = robot.independent
     joints = [name for name, independent in zip(robot.joint_names, own, strict=True) if independent]
     found = from_ros2_control(path.read_text(), joints, continuous=robot.continuous[own])

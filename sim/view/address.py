@@ -18,7 +18,7 @@ def resolve(host: str) -> Any:
     Raises
     ------
     InvalidArgumentError
-        There is none.
+        The host cannot be resolved.
     """
     try:
         return socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -33,7 +33,7 @@ def listen(host: str, port: int) -> socket.socket:
     Raises
     ------
     InvalidArgumentError
-        The host is no address of this machine, or no port is free.
+        The host is not an address of this machine, or no port is free.
     """
     family, _, _, _, address = resolve(host)
     for candidate in range(port, min(port + PORTS, 2**16)):

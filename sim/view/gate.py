@@ -45,7 +45,7 @@ class Gate:
     Raises
     ------
     InvalidArgumentError
-        The host is no address of this machine, or no port is free.
+        The host is not an address of this machine, or no port is free.
     """
 
     def __init__(self, host: str, port: int, refuse: Refuse) -> None:

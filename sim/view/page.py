@@ -36,7 +36,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
     Raises
     ------
     InvalidArgumentError
-        The host is no address of this machine, or no port is free.
+        The host is not an address of this machine, or no port is free.
     MissingDependencyError
         The package ``viser`` is missing.
     """

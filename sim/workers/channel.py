@@ -76,7 +76,7 @@ class Channel:
         return data[:count]
 
     def _receive(self, most: int) -> bytes:
-        """Wait for some bytes, at most so many, and return them."""
+        """Wait for data and return between 1 and ``most`` bytes."""
         while True:
             try:
                 part = self._socket.recv(most)

@@ -83,11 +83,11 @@ def _cgroup_memory() -> Iterator[int]:
                 stat = dict(line.split() for line in (here / "memory.stat").read_text().splitlines())
                 cached = sum(int(stat.get(f"{total}{kind}_file", 0)) for kind in ("active", "inactive"))
                 yield int(limit) - int(used) + cached
-            except (OSError, ValueError):  # there is none, or it is "max"
+            except (OSError, ValueError):  # no such file, or the limit is "max"
                 continue
 
 
 def _address_space() -> int | None:
-    """Return the limit of this process' virtual memory [bytes], which its children inherit; None: there is none."""
+    """Return the limit of this process' virtual memory [bytes], which its children inherit; None means unlimited."""
     limits = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
     return min((limit for limit in limits if limit != resource.RLIM_INFINITY), default=None)

@@ -38,7 +38,7 @@ class NodeWorker(Worker):
         self._beat: Future[None] | None = None
         self._sent_at = self._heard_at = 0.0
         self._is_replacement = self._has_beaten = False
-        self._ticks = 0  # of the run that is under way
+        self._ticks = 0  # of the current run
         self.info: NodeInfo | None = None
         """Known when the node has started."""
 

@@ -24,7 +24,7 @@ def pinned_cores(workers: int) -> list[int]:
     """Return one core for each worker if there are as many workers as cores; else none.
 
     The kernel may wake two workers on the core of the parent and leave another core idle for milliseconds. Fewer
-    workers than cores are not pinned: those of several programs could get the same cores.
+    workers than cores are not pinned: several programs could pin their workers to the same cores.
     """
     cores = sorted(os.sched_getaffinity(0))
     return cores if workers == len(cores) else []

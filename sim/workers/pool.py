@@ -6,7 +6,7 @@ last checkpoint and the requests since. A checkpoint is a barrier for the other 
 so that one can catch up while the others continue.
 
 An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool says at every moment how
-far each worker is, and a worker with which a message was under way is replaced, so that the call can be repeated.
+far each worker is, and a worker with a partly sent or received message is replaced, so that the call can be repeated.
 
 Longer than 300 lines because all that can happen to a worker during a request is read in one place.
 """
@@ -156,7 +156,7 @@ class WorkerPool(SingleOwner):
         self._serve(request, wait=False)
 
     def run(self, request: Request) -> list[Any]:
-        """Let every worker execute its part of ``request``; return their results, if there is no :attr:`failure`.
+        """Execute ``request`` on all workers; return their results, unless there is a :attr:`failure`.
 
         A call with a request that :meth:`begin` sent, or whose call was interrupted, continues it.
 
@@ -320,7 +320,7 @@ class WorkerPool(SingleOwner):
         self._start(slot)
 
     def _start(self, slot: _Slot) -> None:
-        """Start the worker of ``slot``, and queue what brings it to the present state."""
+        """Start the worker of ``slot``, and queue the requests that bring it to the present state."""
         slot.worker.open()
         if self._cores:
             slot.worker.pin(self._cores[slot.start.index])

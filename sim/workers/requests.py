@@ -40,7 +40,7 @@ class Request(ABC):
         return None
 
     def limit(self, num_envs: int) -> float:
-        """Return an upper bound of the seconds that it takes for so many envs."""
+        """Return an upper bound of the request's time for ``num_envs`` envs [s]."""
         return 1e-2 * num_envs
 
     def for_envs(self, envs: slice) -> Self:
@@ -53,7 +53,7 @@ class Request(ABC):
         return deepcopy(self)
 
     def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027  (most requests travel in the message)
-        """Write what travels in the shared arrays (ticks, envs, ...), the rows of some envs."""
+        """Write the rows of some envs to the shared arrays (ticks, envs, ...)."""
 
     def encode(self, envs: slice) -> bytes:
         """Return the message from which :func:`decode` makes the part of some envs in their worker."""

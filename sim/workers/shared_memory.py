@@ -62,9 +62,9 @@ class MemoryFile(io.FileIO):
 
 
 def above_standard_streams(descriptor: int) -> int:
-    """Return ``descriptor``, or in its place one that is no standard stream: a program can have closed those.
+    """Return ``descriptor``, or replace it by a number above the standard streams, if a program has closed these.
 
-    A child process would get something else under that number, and what the program prints would go there.
+    Otherwise a child process would get another file under that number, and printed text would go to ``descriptor``.
     """
     if descriptor > 2:
         return descriptor

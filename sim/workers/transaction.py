@@ -120,7 +120,7 @@ class Transactions:
         return self.state
 
     def run(self, request: Request | None = None, commit: Commit = read_only, *, wait: bool = True) -> Any:
-        """Let every worker execute its part of ``request``, then ``commit``; return the result of the command.
+        """Execute ``request`` on all workers, then ``commit``; return the result of the command.
 
         An unfinished command is completed first; without ``request`` nothing else is done, and an error in it is
         dropped if it only reads. Without ``wait`` the request is sent, for a later call to complete. The arrays of
@@ -150,7 +150,7 @@ class Transactions:
                     if self._user == me
                     else "this Runner is in a call from another thread; take turns, or make one for each thread"
                 )
-            # There is no call between the check and here, so that neither a thread nor a signal can come in between.
+            # Nothing is called between the check and here, so that neither a thread nor a signal can come in between.
             self._user, mine = me, True
             if request is None or self.phase is Phase.BEGUN:
                 self._settle()

@@ -224,7 +224,7 @@ class ProcessWorker(Worker):
         return type(self)(self._start, self._shared, self._message)
 
     def pin(self, core: int) -> None:
-        with contextlib.suppress(OSError):  # it died, or the core is no longer ours
+        with contextlib.suppress(OSError):  # it died, or the core was taken away
             os.sched_setaffinity(self.pid or 0, {core})
 
     def _death(self) -> WorkerLost:
@@ -246,7 +246,7 @@ class ProcessWorker(Worker):
 
 
 def pickled(start: Any) -> bytes:
-    """Return what starts a worker as bytes, with a ``build`` that cannot be imported there.
+    """Return the start request of a worker as bytes, with a ``build`` that the worker cannot import.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The robot as it is simulated here, with the law in MuJoCo's own PID actuators, as MJCF.
+"""MJCF of the simulated robot, with the law in MuJoCo's own PID actuators.
 
 MuJoCo's ``pid`` actuator (3.15 and later), with the error e, inputs r, r' and ff, and the integral A::
 

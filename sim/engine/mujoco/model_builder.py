@@ -1,11 +1,11 @@
 r"""Robots as MuJoCo's models.
 
 Each simulated link of the robot (rigid bodies, with fixed joints merged) is a body in the frame of its joint. Masses
-and inertias are those of the URDF, in double precision; shapes are the convex ones that SAPIEN builds, so that both
+and inertias come from the URDF, in double precision; shapes are the convex ones that SAPIEN builds, so that both
 engines collide the same geometry. A body whose links collide with another body in part has one body without mass for
 each link with shapes, since MuJoCo excludes pairs of bodies.
 
-Damping and Coulomb friction are no forces of MuJoCo's: the loop applies them as efforts, in the same way for every
+MuJoCo does not compute damping and Coulomb friction: the loop applies them as efforts, in the same way for every
 engine, with the damping's share dt d in the armature, which makes it implicit (:mod:`batchpid.motors.friction`).
 """
 
@@ -35,7 +35,7 @@ from batchpid.sim.robot.xml import numbers
 ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
 """Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""
 _FRICTION = 0.3
-"""Coefficient of sliding friction of every shape, that of SAPIEN's default material."""
+"""Coefficient of sliding friction of every shape, as in SAPIEN's default material."""
 LARGEST_FORCE = 1e10
 """Limit of a drive without a limit [N m or N]."""
 _NARROWEST = 1e-9
@@ -48,7 +48,7 @@ _FARTHEST = 1e10
 
 @dataclass(frozen=True, eq=False)
 class RobotMj:
-    """Compiled model of a robot, and where its joints stand in MuJoCo's arrays."""
+    """Compiled model of a robot, and the indices of its joints in MuJoCo's arrays."""
 
     model: Any
     """``mujoco.MjModel``; it is shared, so copy it before a change."""
@@ -89,7 +89,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
     """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
 
-    ``inertias`` are those of the links, of which it has mass and center; the tensors are placeholders.
+    The bodies have the links' mass and center from ``inertias``; their inertia tensors are placeholders.
     """
     scene = mujoco.MjSpec()
     _set_options(scene, spec)

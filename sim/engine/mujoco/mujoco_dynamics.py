@@ -24,7 +24,7 @@ Float64 = NDArray[np.float64]
 
 
 class MujocoDynamics:
-    """Dynamics of the robot of ``spec``; the methods are those of :class:`batchpid.sim.engine.protocol.RobotModel`."""
+    """Dynamics of the robot of ``spec``. Implements :class:`batchpid.sim.engine.protocol.RobotModel`."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self._spec, self._robot, self._lock = spec, robot_model(spec), RLock()

@@ -21,7 +21,7 @@ from batchpid.sim.robot.self_collision import SelfContact
 
 
 class MujocoEngine:
-    """MuJoCo on the CPU. The methods are those of the protocol."""
+    """MuJoCo on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name = "mujoco"
     capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts"})
@@ -43,7 +43,7 @@ class MujocoEngine:
         carrier: str = "",
         links: Sequence[str] = (),
     ) -> MujocoPack:
-        """Return a new pack; its robots share nothing, whatever ``system_size``."""
+        """Return a new pack; its robots share nothing, for any ``system_size``."""
         return MujocoPack(spec, size, first_env, variation, carrier, links)
 
     def scene_dynamics(self, spec: SceneSpec) -> MujocoDynamics:

@@ -39,8 +39,8 @@ class MujocoPack(SingleOwner):
     """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
 
     ``variation`` holds their differences from the model, one row for each; ``carrier`` is the link of the URDF that
-    carries the payload, ``links`` are those whose mass or center varies. The members are those of
-    :class:`batchpid.sim.engine.protocol.CompiledPack`, and of DrivenPack.
+    carries the payload, ``links`` are the links with varying mass or center. Implements
+    :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
     """
 
     def __init__(
@@ -236,7 +236,7 @@ class MujocoPack(SingleOwner):
         self._share()
 
     def _share(self) -> None:
-        """Let all robots share one model again if their masses do not vary and their joints are alike."""
+        """Return to one shared model if masses do not vary and all robots have the same armature."""
         first = self._models[0]
         if not self._masses_vary and all(
             np.array_equal(first.dof_armature, model.dof_armature) for model in self._models[1:]
@@ -271,7 +271,7 @@ class MujocoPack(SingleOwner):
         """Set the drive of every joint; each argument broadcasts to (M, dof).
 
         They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity v+ after it, the
-        effort kp (r - q - dt v+) + kd (r' - v+) is that of stiffness kp and implicit damping kd + dt kp.
+        effort kp (r - q - dt v+) + kd (r' - v+) is a drive's with stiffness kp and implicit damping kd + dt kp.
         """
         if self._robot.model.nu == 0:
             states = self.read_state()
@@ -326,7 +326,7 @@ class MujocoPack(SingleOwner):
         self._update(range(self.size))
 
     def read_poses(self) -> list[NDArray[np.float32]]:
-        """Return an empty list: there is no content in the scenes but the robots."""
+        """Return an empty list: the scenes have no content besides the robots."""
         return []
 
     def close(self) -> None:

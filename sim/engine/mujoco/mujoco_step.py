@@ -41,7 +41,7 @@ def functions() -> dict[str, int] | None:
 
 
 class MujocoStep:
-    """Sim step of robots in MuJoCo; the methods are those of :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    """Sim step of robots in MuJoCo. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
 
     Parameters
     ----------

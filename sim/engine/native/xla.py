@@ -26,7 +26,7 @@ def status() -> native.NativeStatus:
 
 @cache
 def _registered() -> str:
-    """Make the functions known to JAX; return what is in the way, or nothing."""
+    """Register the functions with JAX; return the problem, or an empty string."""
     import jax
 
     for name, address in native.extension("_gateway").xla_functions().items():
@@ -67,7 +67,7 @@ def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
 def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
 
-    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are those of :class:`batchpid.sim.engine.rigid_body.RigidBodies`.
+    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :class:`batchpid.sim.engine.rigid_body.RigidBodies`.
     """
     import jax
 

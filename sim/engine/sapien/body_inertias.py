@@ -25,7 +25,7 @@ class Part(NamedTuple):
     inertia: SpatialInertia
     """In the frame of the body."""
     axes: Float64
-    """Axes of the link's frame in that of the body, as columns (3, 3)."""
+    """Axes of the link's frame in the body's frame, as columns (3, 3)."""
     column: int | None
     """Number among the links that vary; None for a link that does not."""
 
@@ -44,7 +44,7 @@ def body_inertias(spec: SceneSpec) -> dict[str, SpatialInertia]:
 
 
 def varied_bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, Body]:
-    """Return the simulated bodies whose mass varies, by name: those of ``links``, and that of ``carrier``."""
+    """Return the simulated bodies with varying mass, by name: the bodies of ``links`` and of ``carrier``."""
     loaded, place = center_of_mass(spec, carrier)
     return {
         body: Body(members, place if body == loaded else None)

@@ -29,7 +29,7 @@ _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
 
 with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fifths of the start of a worker
-    # Its packages suppress a Ctrl-C while they are imported: not amid a run.
+    # Its packages suppress Ctrl-C during their import, so they are imported before a run.
     import sapien.wrapper.urdf_loader  # noqa: F401
 
 

@@ -37,7 +37,7 @@ class CollisionGroups(NamedTuple):
 def collision_groups(
     bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair] = frozenset()
 ) -> CollisionGroups:
-    """Return words by which the pairs ``ignored`` are ignored, and no others but those of ``free``.
+    """Return words by which PhysX ignores the pairs ``ignored``, perhaps some of ``free``, and no others.
 
     The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """
@@ -91,6 +91,6 @@ def _cliques(bodies: Sequence[str], ignored: Collection[Pair], free: Collection[
 
 
 def _within(clique: Iterable[str], pairs: Collection[Pair]) -> set[Pair]:
-    """Return those of ``pairs`` that lie within ``clique``."""
+    """Return the ``pairs`` that lie within ``clique``."""
     members = set(clique)
     return {pair for pair in pairs if pair <= members}

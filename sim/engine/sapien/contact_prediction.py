@@ -1,13 +1,13 @@
 """Prediction of contact, from which it follows which robots get a PhysX system to themselves.
 
 Robots that share a system never meet, and each moves bit-identically to a robot alone, as long as at most one contact
-acts on it. PhysX solves contacts in sequence, each with what the previous ones left over (Gauss-Seidel), and their
-order depends on what else the system holds: PGS sorts those of articulations by their index in a pool that all share
+acts on it. PhysX solves contacts in sequence, each from the result of the previous ones (Gauss-Seidel), and their
+order depends on the other content of the system: PGS sorts the contacts of articulations by index in a shared pool
 (``ArticulationSortPredicate`` in ``DyDynamics.cpp`` of PhysX 5.3.1), TGS takes them in the order in which they began.
 PhysX's flag for enhanced determinism changes neither. Alone in a system, a robot's past decides the order.
 
 A robot has to move to such a system before a second contact acts on it, and better before the first: rebuilding a robot
-discards what the engine remembers of a contact, such as where friction holds. The engine lists a pair of shapes from
+discards the engine's stored contacts, such as the points where friction holds. The engine lists a pair of shapes from
 LISTED_DISTANCE on, long before they push each other.
 
 A robot without listed pairs costs a look at an empty list in every step. One with such pairs, as a closed gripper has
@@ -32,7 +32,7 @@ Float64 = NDArray[np.float64]
 MAX_ACCELERATION = 3000.0
 """Largest acceleration [m/s^2] of one link towards another that is predicted: a light finger's under full effort."""
 LOOKAHEAD_STEPS = 3
-"""Time steps looked ahead: the listed distance is one step old, and the next step acts on what closes within it."""
+"""Time steps looked ahead: the listed distance is one step old, and the next step acts on pairs that close in it."""
 
 LISTED_DISTANCE = 0.02
 """Distance from which the engine lists a pair of shapes [m], twice the contact offset."""
@@ -88,7 +88,7 @@ class ContactPredictor:
             _add_reach(row, link, links)
         self.reach = read_only(reach)
         between = (reach[:, None] > 0) != (reach[None] > 0)
-        # A joint above both links moves them alike.
+        # A joint above both links does not change their distance.
         self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
         self._lookahead, self._speed_gain = LOOKAHEAD_STEPS * timestep, MAX_ACCELERATION * timestep
         self._timestep = timestep
@@ -131,8 +131,8 @@ class ContactPredictor:
         """Return the sizes s (pairs,) [m] of a region around the present joint positions, where none is predicted.
 
         No contact is predicted while ``arms`` (|q - q0| + STEP_FACTOR |q - q'|) < s, with q0 the present positions, q
-        those of a later step and q' those of the step before. A pair that is d apart now, with the arms r, was at least
-        d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
+        the positions of a later step and q' of the step before. A pair that is d apart now, with the arms r, was at
+        least d - r . |q' - q0| apart in that step, of which distances are listed, and closes by r . |q - q'| in one.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) ->
 class SafeRegions:
     """Regions of the joint positions of ``size`` robots, within which no contact is predicted; a robot may have none.
 
-    ``arms`` are those of :class:`ContactPredictor`.
+    The argument ``arms`` is the attribute of :class:`ContactPredictor`.
 
     Attributes
     ----------

@@ -107,7 +107,7 @@ class ContactWatch:
         return self._look(near) if near else []
 
     def _add_near_pairs(self, contacts: Iterable[Any], near: dict[int, list[NearPair]]) -> None:
-        """Add to ``near`` the pairs in a system's contacts, those of robots without a region."""
+        """Add to ``near`` the pairs in a system's contacts, for robots without a region."""
         for contact in contacts:
             (row, first), (other, second) = (self._links.get(body, (None, WORLD)) for body in contact.bodies)
             row = other if row is None else row

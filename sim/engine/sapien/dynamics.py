@@ -72,7 +72,7 @@ class Dynamics:
             for link in self._robot.links
             for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True)
         }
-        # Rigid body of each link, by number; the last is that of the ground (WORLD), which counts as the base.
+        # Rigid body of each link, by number; the last is the ground's (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
 
     @cached_property
@@ -95,7 +95,7 @@ class Dynamics:
     def joint_mass_matrix(self, qpos: NDArray[Any], added: Mapping[str, Float64] | None = None) -> Float64:
         """Return the mass matrices (n, dof, dof) that the joints show, on a floating base where the robot has one.
 
-        There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, those of the base.
+        There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, for the base.
         ``added`` are spatial inertias (n, 6, 6) that links have in addition, by name
         (:func:`batchpid.sim.robot.spatial_inertia.spatial_matrix`).
         """

@@ -20,7 +20,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 Float64 = NDArray[np.float64]
 
 DEPTH = 1e-3
-"""Depth [m] from which an overlap counts as a contact: what rests on something may overlap by less."""
+"""Depth [m] from which an overlap counts as a contact: bodies at rest on each other may overlap by less."""
 
 
 class MissedContacts:

@@ -28,7 +28,7 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 def engine_calls(
     robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_], native: bool
 ) -> EngineCalls:
-    """Return native calls, or Python's; the arguments before ``native`` are those of both."""
+    """Return native calls, or Python's; both take the arguments before ``native``."""
     make = NativeCalls if robots and native else PythonCalls
     return make(robots, systems, qf, skip)
 
@@ -84,7 +84,7 @@ def pointer(wrapper: Any, kind: str) -> int:
 
 
 def gateway_address(gateway: Any) -> int:
-    """Return the address of what a gateway's capsule holds."""
+    """Return the address of the object in a gateway's capsule."""
     return extension("_gateway").address(gateway)
 
 

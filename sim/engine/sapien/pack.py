@@ -55,7 +55,7 @@ class Pack(SingleOwner):
     isolated
         Robots that have a system to themselves because contact was predicted (M,); none with ``isolates`` False.
     qf
-        Efforts last written, in the engine's precision; those of a coupling are not among them.
+        Efforts last written, in the engine's precision, without the efforts of a coupling.
     friction
         Friction and damping that the loop has to apply to the joints.
     watch
@@ -165,7 +165,7 @@ class Pack(SingleOwner):
             self.isolate(predicted)
 
     def _write_coupled_qf(self, constraint: ConstraintEfforts, update: bool) -> None:
-        """Apply the efforts ``qf`` together with those of the coupling, which no sensor and no delay is between."""
+        """Apply the efforts ``qf`` plus the efforts of the coupling, which has neither sensors nor delays."""
         qpos = self._calls.qpos(np.float64)
         if update:
             passive = self._calls.passive_force(True, True, np.float64)

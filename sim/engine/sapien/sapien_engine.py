@@ -20,7 +20,7 @@ from batchpid.sim.robot.self_collision import SelfContact
 
 
 class SapienEngine:
-    """SAPIEN with PhysX on the CPU, which has all capabilities. The methods are those of the protocol."""
+    """SAPIEN with PhysX on the CPU, with all capabilities. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name = "sapien"
     capabilities: frozenset[Capability] = frozenset(get_args(Capability))

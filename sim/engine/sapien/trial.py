@@ -1,7 +1,7 @@
 """Trials: calls into SAPIEN that might end the process, made in a child process first.
 
 A server process imports SAPIEN once and forks for each trial, in milliseconds instead of 0.3 s. It has one thread, so
-that a fork is safe, as it is not in the caller's process. It ends after some idle seconds, and with the caller.
+that a fork is safe, unlike in the caller's process. It ends after some idle seconds, and with the caller.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _servers: dict[int, Connection] = {}  # by the process id of the caller, which m
 
 
 def in_child(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-    """Return what a function of a module returns in a child process; its exceptions are raised here.
+    """Call a function of a module in a child process; its result is returned, or its exception raised, here.
 
     Raises
     ------

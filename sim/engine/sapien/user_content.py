@@ -56,7 +56,7 @@ class SceneContent:
     """Content that ``build`` added to the scene of env ``env``.
 
     ``watched`` are the entities that ``build`` returned, each with the pose of a frame in it or None; ``size`` is the
-    number of values in the state. ``links`` are those of the scene's robot.
+    number of values in the state. ``links`` are the links of the scene's robot.
     """
 
     def __init__(self, build: Build, scene: Any, env: int, links: Frames) -> None:
@@ -113,7 +113,7 @@ class SceneContent:
             robot.set_qf(take(robot.dof))
 
     def poses(self) -> NDArray[np.float32]:
-        """Return the poses of what is watched (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
+        """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
         frames = [(entity.get_pose(), frame) for entity, frame in self.watched]
         poses = [pose if frame is None else pose * frame for pose, frame in frames]
         rows = [np.concatenate([pose.p, pose.q]) for pose in poses]
@@ -121,7 +121,7 @@ class SceneContent:
 
 
 def refuse_shapes(scene: Any, env: int) -> None:
-    """Raise InvalidArgumentError if an entity of ``scene``, that of env ``env``, has a collision shape."""
+    """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a collision shape."""
     for entity in scene.entities:
         for component in entity.components:
             if getattr(component, "collision_shapes", ()):

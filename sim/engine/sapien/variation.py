@@ -1,6 +1,6 @@
 """Robots that differ from the model, env by env: payload, masses and their centers, friction, damping and armature.
 
-Compensation and mass matrix stay those of the model, because a controller does not know its payload.
+Compensation and mass matrix keep the model's values, because a controller does not know its payload.
 
 The engine takes these changes while a robot exists, and then moves bit-identically to a robot that was built with them,
 with one exception: a new center of mass moves the frames of the joints by rounding, so that they are set again.

@@ -29,7 +29,7 @@ class Motors(NamedTuple):
     effort_limit: dict[str, float]
     """Infinite where the file gives none."""
     armature: dict[str, float]
-    """Reflected inertia [kg m^2 or kg]; that of followers is added to their leaders'."""
+    """Reflected inertia [kg m^2 or kg]; a follower's armature is added to its leader's."""
     damping: dict[str, float]
     """Damping of the actuators, in addition to the joints'."""
     kp: dict[str, float]
@@ -68,7 +68,7 @@ def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplin
 
 
 def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[Finding]) -> Motors:
-    """Return what the actuators of the model do to its joints, each with a finding if a motor cannot do it."""
+    """Return the effects of the model's actuators on its joints, with findings for effects that are not simulated."""
     armature = {name: float(model.dof_armature[model.jnt_dofadr[joint]]) for joint, name in names.joints.items()}
     damping = dict.fromkeys(armature, 0.0)
     limits: dict[str, float] = defaultdict(float)

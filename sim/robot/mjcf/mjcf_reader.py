@@ -40,7 +40,7 @@ class Mjcf(NamedTuple):
 def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
-    The other arguments are those of :meth:`batchpid.sim.Robot.load`.
+    For the other arguments see :meth:`batchpid.sim.Robot.load`.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def _in_radians(model: Any, names: Names) -> list[Finding]:
 
 
 def _unused(model: Any, names: Names) -> list[Finding]:
-    """Return findings of what has no equivalent, apart from motors, couplings and shapes."""
+    """Return findings for content that is not simulated, apart from motors, couplings and shapes."""
     found = []
     counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam}
     if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:

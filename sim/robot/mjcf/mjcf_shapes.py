@@ -1,6 +1,6 @@
 """Collision shapes of a compiled MJCF file, and the pairs of links that its masks and exclusions keep apart.
 
-A mesh collides as its convex hull in MuJoCo as in PhysX. The hulls, and those of ellipsoids, are written to
+A mesh collides as its convex hull, in MuJoCo and in PhysX. Hulls of meshes and ellipsoids are written to
 ``batchpid/meshes`` in the user's cache folder, named by their content.
 """
 
@@ -137,7 +137,7 @@ def text_of(values: ArrayLike) -> str:
 def _hull(model: Any, mesh: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return vertices (n, 3) [m] and triangles (m, 3) of the convex hull of a mesh, or of the mesh if it has none.
 
-    The layout of the hull's graph is that of ``mesh_graph`` in MuJoCo's mjmodel.h.
+    The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h.
     """
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = model.mesh_vert[first : first + count]

@@ -1,6 +1,6 @@
 r"""Bodies and joints of a compiled MJCF file as the links and joints of a URDF.
 
-Masses and inertias are those of the compiled bodies. A hinge with anchor p, axis a and reference angle q0 moves its
+Masses and inertias are taken from the compiled bodies. A hinge with anchor p, axis a and reference angle q0 moves its
 body by Trans(p) Rot(a, q - q0) Trans(-p), so that the link of the URDF, whose origin is the anchor, is at::
 
     origin = X Trans(p) Rot(a, -q0)        link = origin Rot(a, q)        body = link Trans(-p)
@@ -30,7 +30,7 @@ from batchpid.sim.robot.rotations import about, multiply, rotate, to_rpy
 from batchpid.sim.robot.spatial_inertia import rotation_matrix
 
 NO_MASS = 1e-9
-"""Mass [kg] of a link with shapes and without mass, which a URDF's reader would give that of the shapes."""
+"""Mass [kg] of a link with shapes and without mass: a URDF reader would give it the mass of its shapes."""
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
