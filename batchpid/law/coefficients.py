@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.checks.validate import positive
+from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
 
 
@@ -30,6 +31,8 @@ class Coefficients(NamedTuple):
     integral_max: Any
     b: Any
     c: Any
+    c_given: Any
+    """c of a setpoint rate that is given, where only that has a weight; off: c, or 1."""
     deadband: Any
     tracking: Any
     """dt / Tt, at most 1: a shorter Tt would correct by more than the whole excess, and oscillate."""
@@ -54,6 +57,8 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
     """
     if isinstance(dt, int | float):
         positive("dt", dt, "s")
+    weighs_rate = params.setpoint_weight_derivative is not None
+    params = as_explicit(params, dt)
     tau, tracking = params.derivative_filter_time, params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
     k = Coefficients(
@@ -64,7 +69,8 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
         intake=None if tau is None else dt / (tau + dt),
         effort_step=None if params.effort_rate_limit is None else params.effort_rate_limit * dt,
         b=params.setpoint_weight,
-        c=params.setpoint_weight_derivative,
+        c=params.setpoint_weight_derivative if weighs_rate else None,
+        c_given=None if weighs_rate else params.setpoint_weight_derivative,
         tracking=None if tracking is None else dt / namespace(tracking, dt).maximum(tracking, dt),
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),

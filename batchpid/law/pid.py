@@ -133,7 +133,7 @@ def advance(
     if k.kd is not None:
         rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
-            rate = rate + (r_rate if k.c is None else k.c * r_rate)
+            rate = rate + weighted_rate(k, r_rate)
         elif k.c is not None:
             rate = rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
         derivative = rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
@@ -210,6 +210,12 @@ def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
     return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
+
+
+def weighted_rate(k: Coefficients, r_rate: Any) -> Any:
+    """Return a given setpoint rate times its weight."""
+    weight = k.c if k.c_given is None else k.c_given
+    return r_rate if weight is None else weight * r_rate
 
 
 def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
