@@ -53,7 +53,10 @@ def track(
     integral = effort - proportional(k, error, measurement, origin)
     integral = integral if k.kd is None else integral - k.kd * rate
     integral = integral if feedforward is None else integral - feedforward
-    integral = integral if params.integration is None else integral - k.ki_dt * error
+    if params.integration is not None:
+        integral = integral - k.ki_dt * error
+        if k.ki_dt2 is not None and setpoint_rate is not None:
+            integral = integral + k.ki_dt2 * setpoint_rate
     return PIDState(
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),

@@ -124,6 +124,8 @@ def advance(
     integral = state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
+        if k.ki_dt2 is not None and r_rate is not None:
+            integral = integral - k.ki_dt2 * r_rate
         if k.integration is not None:
             integral = clip(integral, k.integral_min, k.integral_max, xp)
         i = state.integral if k.integration is None else integral
