@@ -89,6 +89,4 @@ def as_explicit(params: PIDParams, dt: Any) -> PIDParams:
     if params.discretization is None:
         return params
     kp, ki, kd, b, _, c = implicit_gains(params, dt)
-    return params._replace(
-        kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None
-    )
+    return params._replace(kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None)

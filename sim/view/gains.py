@@ -110,7 +110,9 @@ def _values(params: bp.PIDParams) -> dict[str, Float64]:
     """Return the options behind the gains of ``params``, (dof,) each."""
     leaves = {name: getattr(params, name) for name in _OPTIONS}
     return {
-        name: np.clip(np.full(params.num_joints, off) if leaves[name] is None else leaves[name][0], *_ends(params, name))
+        name: np.clip(
+            np.full(params.num_joints, off) if leaves[name] is None else leaves[name][0], *_ends(params, name)
+        )
         for name, (off, *_) in _OPTIONS.items()
     }
 

@@ -37,7 +37,6 @@ def solved(f):
     seed=st.integers(0, 999),
 )
 def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measures, rated, seed):
-    kp, ki, kd = gains
     p = bp.make_params(1, *gains, setpoint_weight=b, setpoint_weight_derivative=c, integration=order, **IMPLICIT)
     p_, i_, d_ = (0.0 if x is None else x for x in gains)
     b_, on_rate = 1.0 if b is None else b, (1.0 if rated else 0.0) if c is None else c
@@ -45,10 +44,10 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
     setpoints, rates = rng.normal(size=(2, 8))
     y, v, integral, last = 0.3, 0.0, 0.0, None
     state = bp.init(p, np.array([[y]]))
-    for r, given in zip(setpoints, rates, strict=True):
-        rate = given if rated else 0.0 if last is None else (r - last) / dt
+    for r, slope in zip(setpoints, rates, strict=True):
+        rate = slope if rated else 0.0 if last is None else (r - last) / dt
         last = r
-        integral += i_ * dt * (r - (dt * given if rated else 0.0) - y)
+        integral += i_ * dt * (r - (dt * slope if rated else 0.0) - y)
 
         def excess(a, r=r, rate=rate, y=y, v=v, integral=integral):
             v_end = v + dt * a
@@ -58,7 +57,7 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
 
         expected = solved(excess)
         known = {"measurement_rate": np.array([[v]])} if measures else {}
-        known |= {"setpoint_rate": np.array([[given]])} if rated else {}
+        known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
         state, a = bp.step(p, state, np.array([[r]]), np.array([[y]]), dt, **known)
         scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
@@ -131,9 +130,7 @@ def test_an_inertia_that_the_model_overestimates_has_a_bound(wdt, largest):
         assert (radius < 1) == stable
 
 
-@pytest.mark.parametrize(
-    ("backend", "dtype"), [("numpy", np.float32), ("numpy", np.float64), ("jax", np.float32)]
-)
+@pytest.mark.parametrize(("backend", "dtype"), [("numpy", np.float32), ("numpy", np.float64), ("jax", np.float32)])
 def test_the_controller_is_the_law_on_every_backend(backend, dtype):
     if backend == "jax":
         pytest.importorskip("jax")
@@ -165,11 +162,11 @@ def test_a_change_of_gains_is_bumpless_with_track(order):
 
 def test_options_that_it_does_not_have_are_refused():
     for units in ("effort", "inertia"):
-        with pytest.raises(InvalidArgumentError, match="discretization.*mass_matrix"):
+        with pytest.raises(InvalidArgumentError, match=r"discretization.*mass_matrix"):
             bp.make_params(2, 1.0, gain_units=units, discretization="implicit")
-    with pytest.raises(InvalidArgumentError, match="derivative_filter_time.*implicit"):
+    with pytest.raises(InvalidArgumentError, match=r"derivative_filter_time.*implicit"):
         bp.make_params(2, 1.0, derivative_filter_time=[0.0, 1e-3], **IMPLICIT)
-    with pytest.raises(InvalidArgumentError, match="discretization.*'tustin'.*use one of"):
+    with pytest.raises(InvalidArgumentError, match=r"discretization.*'tustin'.*use one of"):
         bp.make_params(2, 1.0, gain_units="mass_matrix", discretization="tustin")
     p = bp.make_params(2, 1.0, derivative_filter_time=0.0, **IMPLICIT)
     assert (p.kd == 0).all()

@@ -79,13 +79,13 @@ def test_mujoco_runs_it(arm):
 
 
 def test_setpoint_steps_in_long_ticks_settle():
-    """The mass matrix is fresh in every sim step: with one 4 steps old this diverges."""
+    """The mass matrix is fresh in every sim step: kept for 4 steps, it would diverge."""
     panda = load_bundled("panda")
-    target = panda.start + 0.5 * (panda.settings.target - panda.start)
-    with Runner(panda, 1, params=params_of(panda, 40.0), workers=0, timestep=1 / 100, substeps=20) as runner:
+    target = panda.settings.target
+    with Runner(panda, 1, params=params_of(panda, 100.0), workers=0, timestep=1 / 100, substeps=20) as runner:
         runner.reset(panda.start)
-        rollout = runner.rollout(np.broadcast_to(target, (5, panda.dof)))
-    np.testing.assert_allclose(rollout.qpos[-1, 0], target, atol=1e-3)
+        rollout = runner.rollout(np.broadcast_to(target, (3, panda.dof)))
+    np.testing.assert_allclose(rollout.qpos[-1, 0], target, atol=1e-4)
 
 
 def test_any_packing_and_backend_gives_the_same_motion(panda):
