@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from identical import assert_identical
 from robots import load_bundled
-from tiny_urdf import random_tree, robot, write
+from tiny_urdf import joint, link, random_tree, robot, write
 
-from batchpid.sim import Robot, Runner, StabilityWarning
+from batchpid.sim import Robot, Runner, Snapshot, StabilityWarning
 from batchpid.trajectories import minimum_jerk
 
 DURATION, HELD = 1.0, 0.3
@@ -111,3 +111,24 @@ def test_no_gain_passes_the_stability_bound(panda):
     assert [one.severity for one in found] == ["note"]
     assert "1.52 times" in found[0].text  # w dt = 5
     assert not [one for one in panda.check(params=params_of(panda, 30.0)) if "implicit" in one.text]
+
+
+def test_a_snapshot_in_a_file_continues_it(panda, tmp_path):
+    options = {"timestep": 1 / 100, "substeps": 2, "workers": 0}
+    params, goal = params_of(panda, 60.0, ki=1e4), np.broadcast_to(panda.settings.target, (4, panda.dof))
+    with Runner(panda, 1, params=params, **options) as runner:
+        runner.rollout(goal)
+        runner.snapshot().save(tmp_path / "s.npz")
+        expected = runner.rollout(goal)
+    with Runner(panda, 1, params=params.replace(discretization="explicit", kp=1.0), **options) as runner:
+        runner.restore(Snapshot.load(tmp_path / "s.npz"))
+        assert runner.params.discretization == params.discretization
+        assert_identical(runner.rollout(goal), expected)
+
+
+def test_coupled_joints_move_together(tmp_path):
+    limit = '<limit lower="-1" upper="1" effort="50" velocity="2"/>'
+    follower = joint("two", "b", "c", inner=f'{limit}<mimic joint="one" multiplier="-0.5"/>')
+    path = write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b", inner=limit), follower))
+    arm = Robot.load(path, self_collision="none")
+    assert largest_error(arm, 1 / 100, params_of(arm, 100.0))[0] < 1e-3
