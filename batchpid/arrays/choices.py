@@ -57,6 +57,10 @@ class PerMassMatrix(Choice):
     """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
 
+class ImplicitLaw(Choice):
+    """P, I and D act on position and velocity at the end of the step, which the law predicts."""
+
+
 CHOICES: dict[str, dict[str, Any]] = {
     "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
@@ -64,6 +68,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
     "measurement_rate": {"difference": None, "measured": MeasuredRate()},
     "gain_units": {"effort": None, "inertia": PerInertia(), "mass_matrix": PerMassMatrix()},
+    "discretization": {"explicit": None, "implicit": ImplicitLaw()},
 }
 """Options chosen by name, and what each name puts into the params; the first is the default."""
 CHOICE_TYPES: tuple[type[Any], ...] = (

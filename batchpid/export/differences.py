@@ -22,6 +22,7 @@ from batchpid.arrays.choices import IntegrateFirst, MeasuredRate, PerMassMatrix
 from batchpid.checks.validate import at_least, instance, names, positive, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
+from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
 
 Float64 = NDArray[np.float64]
@@ -30,11 +31,19 @@ Float64 = NDArray[np.float64]
 class Differences(list[str]):
     """Sentences ``"option: difference"`` about params in effort units, for a target.
 
-    ``params`` are those given, of one env, converted to efforts at ``inertia`` if they were per unit of it; ``joints``
-    their names; ``dt`` the time step [s].
+    ``params`` are those given, of one env, converted to efforts at ``inertia`` if they were per unit of it, and to the
+    explicit law at ``dt`` if they were implicit; ``joints`` their names; ``dt`` the time step [s]. ``implicit``: the
+    target integrates P and D implicitly, and takes gains of the implicit law as they are.
     """
 
-    def __init__(self, params: PIDParams, joint_names: Sequence[str], dt: float, inertia: ArrayLike | None) -> None:
+    def __init__(
+        self,
+        params: PIDParams,
+        joint_names: Sequence[str],
+        dt: float,
+        inertia: ArrayLike | None,
+        implicit: bool = False,
+    ) -> None:
         super().__init__()
         instance("params", params, PIDParams, "build them with make_params()")
         if params.num_envs > 1:
@@ -45,7 +54,19 @@ class Differences(list[str]):
         params.check(1, self.joints)
         check_gain_units(params)
         self.inertia = None if inertia is None else _inertia(inertia, self.joints)
-        self.params = self._in_efforts(params)
+        self.params = self._in_efforts(params._replace(discretization=None) if implicit else self._explicit(params))
+
+    def _explicit(self, params: PIDParams) -> PIDParams:
+        """Return the params of the explicit law at this time step."""
+        found = as_explicit(params, self.dt)
+        if found is not params:
+            with np.errstate(invalid="ignore"):
+                share = np.where(params.kp > 0, found.kp / params.kp, 1.0)[0]
+            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times {self.listed(share)}"
+            if params.ki is not None and np.any(params.ki > 0):
+                text += "; the integral takes the setpoint for the beginning of a step, a lead of dt times its rate"
+            self.append(f"discretization: {text}")
+        return found
 
     def _in_efforts(self, params: PIDParams) -> PIDParams:
         """Return the params with gains in effort units."""

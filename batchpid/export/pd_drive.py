@@ -47,7 +47,8 @@ class Drive(Differences):
         implicit: bool,
         whole: bool = False,
     ) -> None:
-        super().__init__(params, joint_names, dt, inertia)
+        super().__init__(params, joint_names, dt, inertia, implicit)
+        self._damps_more = implicit and params.discretization is None
         self.actuators = (
             Actuators()
             if actuators is None
@@ -110,7 +111,7 @@ class Drive(Differences):
             self.append("continuous: errors are not taken the short way round")
         if params.non_finite is not None:
             self.append("non_finite: inputs are not checked")
-        if implicit:
+        if self._damps_more:
             self.append("law: stiffness and damping act at the end of a step, implicitly, which damps more")
         for effect, unit in LACKING.items():
             self.lack_motor(effect, "none in the target", unit, float(effect == "strength"))

@@ -105,6 +105,7 @@ def design_gains(
     dt: float = 1 / 2000,
     poses: ArrayLike | None = None,
     gain_units: str = "effort",
+    discretization: str = "explicit",
     margin: float = 0.5,
     **options: Any,
 ) -> PIDParams:
@@ -129,6 +130,9 @@ def design_gains(
         limits.
     gain_units
         Unit of the gains: "effort", or per "inertia" or "mass_matrix" (:mod:`batchpid.law.computed_torque`).
+    discretization
+        "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.implicit`): stable at any ``dt``, so
+        that the bandwidth is kept and the derivative is not filtered.
     margin
         Share of the stability range that may be used, in [0.001, 0.999].
     options
@@ -137,7 +141,8 @@ def design_gains(
     Raises
     ------
     InvalidArgumentError
-        A number out of range, an unknown unit, or a robot whose mass matrix is not positive definite.
+        A number out of range, an unknown unit, an implicit law with gains not per "mass_matrix", or a robot whose mass
+        matrix is not positive definite.
     """
     bandwidth = positive("bandwidth_hz", bandwidth_hz, "Hz")
     positive("damping_ratio", damping_ratio, "zeta")
@@ -147,6 +152,7 @@ def design_gains(
     if integral_time is not None and integrates:
         positive("integral_time", integral_time, "s")
     choice("gain_units", gain_units, CHOICES["gain_units"])
+    is_explicit = choice("discretization", discretization, CHOICES["discretization"]) == "explicit"
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     viscous, coupling = robot.damping, getattr(robot, "coupling", None)
     if coupling is not None:
@@ -157,7 +163,7 @@ def design_gains(
     damping = {"effort": viscous, "inertia": viscous / own.max(0), "mass_matrix": 0.0}[gain_units]
     while True:
         gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
-        filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin)
+        filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin) if is_explicit else 0.0
         if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
             break
         bandwidth *= BACK_OFF
@@ -169,6 +175,7 @@ def design_gains(
         "derivative_filter_time": filter_time,
         "weight_origin": "start",
         "gain_units": gain_units,
+        "discretization": discretization,
     }
     limit = getattr(robot, "design_effort_limit", None)
     if limit is not None and not {"effort_limit", "effort_min", "effort_max"} & set(options):

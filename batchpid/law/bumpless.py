@@ -8,7 +8,7 @@ from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import proportional, turned_origin, wrapped_error
+from batchpid.law.pid import proportional, turned_origin, weighted_rate, wrapped_error
 from batchpid.law.state import PIDState
 
 
@@ -28,19 +28,20 @@ def track(
 
     Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
     effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
-    reproduced: the limits hold. ``dt`` is needed where the params integrate first.
+    reproduced: the limits hold. ``dt`` is needed where the params integrate first or are implicit.
 
     Raises
     ------
     InvalidArgumentError
-        If the params have no integral (ki is None), or integrate first and dt is missing.
+        If the params have no integral (ki is None), or dt is missing where it is needed.
     """
     if params.ki is None:
         raise InvalidArgumentError(
             "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"
         )
-    if params.integration is not None and dt is None:
-        raise InvalidArgumentError("dt", "is needed where the params integrate first", remedy="give dt in seconds")
+    if dt is None and (params.integration is not None or params.discretization is not None):
+        which = "integrate first" if params.discretization is None else "have discretization 'implicit'"
+        raise InvalidArgumentError("dt", f"is needed where the params {which}", remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)
@@ -48,11 +49,14 @@ def track(
     origin = turned_origin(k, state, measurement, xp)
     rate = zero if measurement_rate is None else -measurement_rate
     if setpoint_rate is not None:
-        rate = rate + (setpoint_rate if k.c is None else k.c * setpoint_rate)
+        rate = rate + weighted_rate(k, setpoint_rate)
     integral = effort - proportional(k, error, measurement, origin)
     integral = integral if k.kd is None else integral - k.kd * rate
     integral = integral if feedforward is None else integral - feedforward
-    integral = integral if params.integration is None else integral - k.ki_dt * error
+    if params.integration is not None:
+        integral = integral - k.ki_dt * error
+        if k.ki_dt2 is not None and setpoint_rate is not None:
+            integral = integral + k.ki_dt2 * setpoint_rate
     return PIDState(
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),

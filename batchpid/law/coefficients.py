@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.checks.validate import positive
+from batchpid.law.implicit import as_explicit, implicit_gains
 from batchpid.law.params import PIDParams
 
 
@@ -15,6 +16,8 @@ class Coefficients(NamedTuple):
 
     kp: Any
     ki_dt: Any
+    ki_dt2: Any
+    """ki dt^2 of the implicit law: weight of a setpoint rate that is given, in the integral."""
     kd: Any
     per_dt: Any
     """1 / dt."""
@@ -30,6 +33,8 @@ class Coefficients(NamedTuple):
     integral_max: Any
     b: Any
     c: Any
+    c_given: Any
+    """c of a setpoint rate that is given, in the implicit law; off: c, or 1."""
     deadband: Any
     tracking: Any
     """dt / Tt, at most 1: a shorter Tt would correct by more than the whole excess, and oscillate."""
@@ -54,17 +59,23 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
     """
     if isinstance(dt, int | float):
         positive("dt", dt, "s")
+    c, c_given, implicit = params.setpoint_weight_derivative, None, params.discretization is not None
+    if implicit:
+        c, c_given = implicit_gains(params, dt)[-2:]
+        params = as_explicit(params, dt)
     tau, tracking = params.derivative_filter_time, params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
     k = Coefficients(
         **same,
         ki_dt=None if params.ki is None else params.ki * dt,
+        ki_dt2=params.ki * dt * dt if implicit and params.ki is not None else None,
         per_dt=1 / dt,
         decay=None if tau is None else tau / (tau + dt),
         intake=None if tau is None else dt / (tau + dt),
         effort_step=None if params.effort_rate_limit is None else params.effort_rate_limit * dt,
         b=params.setpoint_weight,
-        c=params.setpoint_weight_derivative,
+        c=c,
+        c_given=c_given,
         tracking=None if tracking is None else dt / namespace(tracking, dt).maximum(tracking, dt),
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),

@@ -16,6 +16,8 @@ which keeps its direction (P. J. Campo and M. Morari, "Robust control of process
 nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot stays on the straight line to its
 setpoint, however tight the limits. A joint whose passive force alone exceeds its limit is clipped, and left out of s.
 While s < 1, conditional integration does not integrate further into the direction of a.
+
+The time step limits the gains per mass matrix, unless the law is implicit (:mod:`batchpid.law.implicit`).
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import at_least, is_traced
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.implicit import check_implicit
 
 
 class PIDParams(NamedTuple):
@@ -59,6 +60,8 @@ class PIDParams(NamedTuple):
     """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
     gain_units: Any = None
     """PerInertia() or PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
+    discretization: Any = None
+    """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 
     @property
     def num_joints(self) -> int:
@@ -176,6 +179,7 @@ def make_params(
     non_finite: str = "propagate",
     measurement_rate: str = "difference",
     gain_units: str = "effort",
+    discretization: str = "explicit",
     joint_names: Sequence[str] | None = None,
     dtype: Any = None,
 ) -> PIDParams:
@@ -231,6 +235,10 @@ def make_params(
         "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
         which :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (see
         :mod:`batchpid.law.computed_torque`).
+    discretization
+        "explicit": P, I and D act on position and velocity at the beginning of the step, which is unstable at large
+        gains or time steps. "implicit": on those at its end (:mod:`batchpid.law.implicit`), stable at any time step.
+        It needs gain_units "mass_matrix" and no derivative_filter_time; without kd, kd is 0.
     joint_names
         Used in error messages.
     dtype
@@ -245,6 +253,11 @@ def make_params(
     if kp is None:
         raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
     p, i, d = (build.array(name, gain, 0.0) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    filter_time = build.option("derivative_filter_time", derivative_filter_time, neutral=0.0)
+    units, implicit = build.choice("gain_units", gain_units), build.choice("discretization", discretization)
+    if implicit is not None:
+        check_implicit(units, filter_time)
+        d = build.array("kd", 0.0, 0.0) if d is None else d
     effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
     integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
     clamp, conditional, back = build.strategies(anti_windup)
@@ -258,7 +271,7 @@ def make_params(
         effort_rate_limit=build.option("effort_rate_limit", effort_rate_limit, neutral=math.inf, above=True),
         integral_min=build.freeze(integral_ends[0]),
         integral_max=build.freeze(integral_ends[1]),
-        derivative_filter_time=build.option("derivative_filter_time", derivative_filter_time, neutral=0.0),
+        derivative_filter_time=filter_time,
         setpoint_weight=build.option("setpoint_weight", setpoint_weight, neutral=1.0),
         setpoint_weight_derivative=build.option("setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0),
         deadband=build.option("deadband", deadband, neutral=0.0),
@@ -270,7 +283,8 @@ def make_params(
         weight_origin=build.choice("weight_origin", weight_origin),
         non_finite=build.choice("non_finite", non_finite),
         measurement_rate=build.choice("measurement_rate", measurement_rate),
-        gain_units=build.choice("gain_units", gain_units),
+        gain_units=units,
+        discretization=implicit,
     )
 
 

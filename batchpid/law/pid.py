@@ -16,7 +16,8 @@ With setpoint r, measurement y and step dt, per env and joint::
 A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
 whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
 is what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
-conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp.
+conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
+discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
 """
 
 from __future__ import annotations
@@ -124,6 +125,8 @@ def advance(
     integral = state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
+        if k.ki_dt2 is not None and r_rate is not None:
+            integral = integral - k.ki_dt2 * r_rate
         if k.integration is not None:
             integral = clip(integral, k.integral_min, k.integral_max, xp)
         i = state.integral if k.integration is None else integral
@@ -133,7 +136,7 @@ def advance(
     if k.kd is not None:
         rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
-            rate = rate + (r_rate if k.c is None else k.c * r_rate)
+            rate = rate + weighted_rate(k, r_rate)
         elif k.c is not None:
             rate = rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
         derivative = rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
@@ -210,6 +213,12 @@ def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
     return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
+
+
+def weighted_rate(k: Coefficients, r_rate: Any) -> Any:
+    """Return a given setpoint rate times its weight."""
+    weight = k.c if k.c_given is None else k.c_given
+    return r_rate if weight is None else weight * r_rate
 
 
 def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:

@@ -31,7 +31,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.pid_law import MASS_MATRIX_STEPS, PIDLaw, half_way
+from batchpid.sim.loop.pid_law import PIDLaw, half_way
 
 REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
@@ -248,19 +248,19 @@ def _feedforward(layout: Layout, constants: Constants, command: Command, qpos: A
 
 
 def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
-    """qf = sat(PID(setpoint, qpos) + feedforward). A mass matrix is kept for MASS_MATRIX_STEPS."""
+    """qf = sat(PID(setpoint, qpos) + feedforward). A mass matrix is kept for ``law.matrix_steps``."""
     command, seen, limits, step = given
     law, matrix, qvel = layout.law, state.matrix, seen.qvel
     assert law is not None
 
     def fresh() -> Any:
         xp = namespace(seen.qpos)
-        steps = xp.minimum(MASS_MATRIX_STEPS, step.end - step.index).astype(seen.qpos.dtype)
+        steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(seen.qpos.dtype)
         found = mass_matrix(layout, constants, half_way(seen.qpos, qvel, steps, constants.timestep))
         return found if law.whole else xp.einsum("ejj->ej", found).copy()
 
     if law.needs_matrix:
-        matrix = layout.model.when(step.index % MASS_MATRIX_STEPS == 0, fresh, matrix)
+        matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, matrix)
     viscous = None if constants.damping is None else constants.damping * qvel
     if viscous is not None and layout.coupling is not None:
         viscous = layout.coupling.efforts(viscous)

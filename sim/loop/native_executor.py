@@ -34,7 +34,6 @@ from batchpid.sim.loop.control_step import (
     control_step,
 )
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
-from batchpid.sim.loop.pid_law import MASS_MATRIX_STEPS
 from batchpid.sim.options import RunnerOptions
 
 Float64 = NDArray[np.float64]
@@ -174,9 +173,9 @@ class TickProgram:
             tree = np.ascontiguousarray(bodies.tree, np.int32)
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
             arrays |= {"armature": constants.armature, "damping": constants.damping}
-        whole = law is not None and law.whole
+        whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
         self._tick = NativeTick(
-            program, given, results, timestep=constants.timestep, matrix_steps=MASS_MATRIX_STEPS, whole=whole, **arrays
+            program, given, results, timestep=constants.timestep, matrix_steps=steps, whole=whole, **arrays
         )
 
     def load(self, state: StepState, measured: Measured, command: Command) -> None:

@@ -6,7 +6,8 @@ shows while all others are free, 1 / (M^-1)_jj, and tau the derivative's filter 
     ratio = 1/2 (kd dt/I dt/(dt + 2 tau) + 1/2 kp dt^2/I) < 1          (for tau = 0: kd dt/I + kp dt^2/(2 I) < 2)
 
 and the whole robot :func:`batchpid.stability_bound` < 1, which is never below the largest of these: joints with axes
-nearly in line turn against each other with less inertia than either has.
+nearly in line turn against each other with less inertia than either has. With params of discretization "implicit"
+the ratio, at the gains of the same law at this time step, is below 1 for any gains and time step.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import batchpid as bp
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
+from batchpid.law.implicit import as_explicit
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 
@@ -49,8 +51,8 @@ class StabilityReport(NamedTuple):
 class Gains(NamedTuple):
     """Gains and plant as the law acts on it at one pose: in units of ``matrix`` (n, n), for independent joints (n,).
 
-    kp, ki, kd and the derivative's filter time are (envs, n) or (1, n); ``damping`` is the viscous damping of the
-    joints.
+    kp, ki, kd and the derivative's filter time are (envs, n) or (1, n), of the explicit law; ``damping`` is the viscous
+    damping of the joints.
     """
 
     matrix: Float64
@@ -61,8 +63,14 @@ class Gains(NamedTuple):
     filter_time: Float64
 
 
-def gains_at(robot: RobotDescription, params: bp.PIDParams, qpos: Float64, armature: Float64 | float = 0.0) -> Gains:
-    """Return ``params`` and the robot at ``qpos`` (dof,); ``armature`` (dof,) is inertia of motors [kg m^2 or kg]."""
+def gains_at(
+    robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, armature: Float64 | float = 0.0
+) -> Gains:
+    """Return ``params`` and the robot at ``qpos`` (dof,); ``armature`` (dof,) is inertia of motors [kg m^2 or kg].
+
+    Implicit params become those of the explicit law at ``timestep`` [s].
+    """
+    params = as_explicit(params, timestep)
     leaves = params.kp, params.ki, params.kd, params.derivative_filter_time
     columns = [np.zeros((1, robot.dof)) if leaf is None else np.asarray(leaf, np.float64) for leaf in leaves]
     coupling, damping = robot.coupling, robot.damping
@@ -87,7 +95,7 @@ def stability_report(
     armature: Float64 | float = 0.0,
 ) -> StabilityReport:
     """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,)."""
-    gains = gains_at(robot, params, qpos, armature)
+    gains = gains_at(robot, params, qpos, timestep, armature)
     dt, damping, inverse = (
         timestep,
         gains.damping,
@@ -113,7 +121,7 @@ def slow_oscillation(
     robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, env: int
 ) -> Oscillation:
     """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,)."""
-    gains = gains_at(robot, params.for_envs(slice(env, env + 1)), qpos)
+    gains = gains_at(robot, params.for_envs(slice(env, env + 1)), qpos, timestep)
     kp, ki, kd, tau = (leaf[0] for leaf in gains[2:])
     found = oscillation(gains.matrix, kp, ki, kd, timestep, filter_time=tau, damping=gains.damping)
     if robot.coupling is not None:

@@ -185,6 +185,13 @@ def _stability(
         yield from _ringing(robot, params, start, timestep, report.env)
     if report.robot_ratio < NEAR_BOUND:
         return
+    if params.discretization is not None:
+        text = (
+            f"the implicit law diverges where the model has {1 / report.robot_ratio:.3g} times the inertia of the "
+            "robot, or more"
+        )
+        yield Finding("note", "near-unstable", text, "lower its kp and kd if the model may be as far off")
+        return
     unstable = report.robot_ratio >= 1
     severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
     effect = "it diverges, alternating from step to step" if unstable else "it may diverge in other poses"

@@ -59,7 +59,7 @@ class GroupGains:
         if choice("gain", gain, GAINS) == "effort_limit":
             values["effort_min"][joint], values["effort_max"][joint] = -value, value
         else:
-            values[gain][joint] = np.clip(value, *_OPTIONS[gain][1:])
+            values[gain][joint] = np.clip(value, *_ends(self.params, gain))
         self.params = self.params.replace(**values)
 
     def slider_range(self, gain: str, joint: int) -> tuple[float, float]:
@@ -111,6 +111,14 @@ def _values(params: bp.PIDParams) -> dict[str, Float64]:
     """Return the options behind the gains of ``params``, (dof,) each."""
     leaves = {name: getattr(params, name) for name in _OPTIONS}
     return {
-        name: np.clip(np.full(params.num_joints, off) if leaves[name] is None else leaves[name][0], low, high)
-        for name, (off, low, high) in _OPTIONS.items()
+        name: np.clip(
+            np.full(params.num_joints, off) if leaves[name] is None else leaves[name][0], *_ends(params, name)
+        )
+        for name, (off, *_) in _OPTIONS.items()
     }
+
+
+def _ends(params: bp.PIDParams, option: str) -> tuple[float, float]:
+    """Return the range of an option's values; the implicit law has no filter."""
+    has_none = option == "derivative_filter_time" and params.discretization is not None
+    return (0.0, 0.0) if has_none else _OPTIONS[option][1:]

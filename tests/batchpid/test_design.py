@@ -108,6 +108,8 @@ def test_a_step_settles_within_two_periods_without_overshoot():
         ("margin", {"margin": 1.5}),
         ("dt", {"dt": 0.0}),
         ("gain_units", {"gain_units": "torque"}),
+        ("discretization", {"discretization": "tustin"}),
+        ("discretization", {"discretization": "implicit"}),
         ("mass_matrix", {}),
     ],
 )
@@ -116,3 +118,11 @@ def test_bad_arguments_are_named(name, options):
     with pytest.raises(InvalidArgumentError) as caught:
         bp.design_gains(robot, **options)
     assert caught.value.argument == name
+
+
+def test_the_implicit_law_keeps_the_bandwidth_at_any_time_step():
+    robot, options = random_chain(0), {"gain_units": "mass_matrix", "dt": 0.01}
+    implicit = bp.design_gains(robot, 20.0, discretization="implicit", **options)
+    np.testing.assert_allclose(implicit.kp, (40 * np.pi) ** 2)
+    assert implicit.derivative_filter_time is None
+    assert (bp.design_gains(robot, 20.0, **options).kp < implicit.kp).all()

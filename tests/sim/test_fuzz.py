@@ -147,6 +147,7 @@ GOOD_PARAMS = {
     "weight_origin": "start",
     "measurement_rate": "measured",
     "gain_units": "effort",
+    "discretization": "explicit",
     "non_finite": "propagate",
     "joint_names": ROBOT.joint_names,
     "dtype": np.float64,

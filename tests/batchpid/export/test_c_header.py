@@ -133,6 +133,9 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     options["integration"] = draw(st.sampled_from(["output_first", "integrate_first"]))
     options["continuous"] = draw(st.lists(st.booleans(), min_size=joints, max_size=joints))
     units = draw(st.sampled_from(["effort", "effort", "inertia", "mass_matrix"]))
+    if units == "mass_matrix" and draw(st.booleans()):
+        options["discretization"] = "implicit"
+        options.pop("derivative_filter_time", None)
     options["measurement_rate"] = draw(st.sampled_from(["difference", "measured"]))
     params = bp.make_params(joints, **options, gain_units=units, dtype=dtype)
     inputs = ["measurement_rate"] if options["measurement_rate"] == "measured" else []

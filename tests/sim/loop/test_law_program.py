@@ -37,6 +37,7 @@ OPTIONS = st.fixed_dictionaries(
         "non_finite": st.sampled_from(["zero", "hold"]),
         "measurement_rate": st.just("measured"),
         "gain_units": st.sampled_from(["inertia", "mass_matrix"]),
+        "discretization": st.just("implicit"),
         "continuous": st.just(True),
     },
 )

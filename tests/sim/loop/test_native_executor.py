@@ -24,6 +24,7 @@ N = 3
 CASES = {
     "tuned": {},
     "inertia": {"gain_units": "inertia", "kp": 400.0, "ki": 100.0, "kd": 40.0},
+    "implicit": {"gain_units": "mass_matrix", "discretization": "implicit", "kp": 4e4, "ki": 1e6, "kd": 400.0},
     "without units": {"gain_units": "effort", "kp": 300.0, "ki": 50.0, "kd": 30.0},
 }
 

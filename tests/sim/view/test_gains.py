@@ -72,3 +72,12 @@ def test_sliders_reach_beyond_every_set_in_the_same_units(panda):
     assert gains.slider_range("effort_limit", 0) == (87.0, 87.0)
     assert gains.slider_range("setpoint_weight", 0)[1] == 1.0
     assert gains.slider_range("derivative_filter_time", 0)[1] == 0.02
+
+
+def test_the_implicit_law_has_no_filter_to_change(panda):
+    params = panda.params(kp=400.0, kd=40.0, gain_units="mass_matrix", discretization="implicit")
+    gains = GroupGains(panda, {"given": params})
+    gains.set("kp", 0, 77.0)
+    gains.set("derivative_filter_time", 0, 0.01)
+    assert gains.params.derivative_filter_time is None
+    assert gains.params.discretization == params.discretization

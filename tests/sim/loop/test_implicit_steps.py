@@ -1,0 +1,134 @@
+"""The implicit law on real robots at large time steps: stable, and as exact as at small ones."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from identical import assert_identical
+from robots import load_bundled
+from tiny_urdf import joint, link, random_tree, robot, write
+
+from batchpid.sim import Robot, Runner, Snapshot, StabilityWarning
+from batchpid.trajectories import minimum_jerk
+
+DURATION, HELD = 1.0, 0.3
+
+
+@pytest.fixture(scope="module", params=["panda", "jaco2", "tree"])
+def arm(request, tmp_path_factory):
+    if request.param != "tree":
+        return load_bundled(request.param)
+    path = write(tmp_path_factory.mktemp("tree"), robot(*random_tree(np.random.default_rng(5), 12)))
+    return Robot.load(path, self_collision="none")
+
+
+def params_of(arm, w, discretization="implicit", **options):
+    options = {"ki": None, "effort_limit": None, "measurement_rate": "measured", **options}
+    units = {"gain_units": "mass_matrix", "discretization": discretization}
+    return arm.params(kp=w**2, kd=2 * w, **units, **options)
+
+
+def move_of(arm, dt):
+    """Return a start, and a motion of up to 0.8 rad or m of every joint within its limits."""
+    low, high = np.maximum(arm.lower, -2.0), np.minimum(arm.upper, 2.0)
+    start = arm.coupled(arm.start)
+    way = np.where(high - start > start - low, 0.8, -0.8)
+    margin = 0.02 * (high - low)
+    goal = arm.coupled(np.clip(start + way, low + margin, high - margin))
+    return start, minimum_jerk(start, goal, dt, duration=DURATION).hold(HELD)
+
+
+def largest_error(arm, dt, params, engine="sapien", substeps=1):
+    """Return the largest error during the motion, and afterwards [rad or m]."""
+    start, move = move_of(arm, dt * substeps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Runner(arm, 1, params=params, workers=0, timestep=dt, substeps=substeps, engine=engine) as runner:
+            runner.reset(start)
+            rollout = runner.rollout(move.position[:, None], setpoint_rates=move.velocity[:, None])
+    error = np.nan_to_num(np.abs(rollout.qpos - rollout.setpoint)[:, 0], nan=1e9)
+    return error.max(), error[-1].max()
+
+
+@pytest.mark.parametrize("w", [100.0, 316.0])
+def test_it_is_stable_at_large_time_steps_and_tracks_as_at_small_ones(arm, w):
+    (fine, _), *coarse = (largest_error(arm, dt, params_of(arm, w)) for dt in (1 / 2000, 1 / 500, 1 / 100))
+    assert fine < 7 / w**2
+    assert coarse[0][0] < 1.05 * fine  # at 1/500
+    assert coarse[1][0] < 0.15e-3  # at 1/100
+    assert max(after for _, after in coarse) < 1e-5
+    assert largest_error(arm, 1 / 100, params_of(arm, w, "explicit"))[0] > 1.0  # w dt > 0.828
+
+
+def test_its_integral_tracks_too(arm):
+    w = 200.0
+    params = params_of(arm, w, ki=w**3 / 5.2)
+    for dt in (1 / 500, 1 / 100):
+        worst, after = largest_error(arm, dt, params)
+        assert worst < 0.5e-3
+        assert after < 1e-4
+
+
+def test_mujoco_runs_it(arm):
+    pytest.importorskip("mujoco")
+    worst, after = largest_error(arm, 1 / 100, params_of(arm, 316.0), engine="mujoco")
+    assert worst < 0.15e-3
+    assert after < 1e-6
+
+
+def test_setpoint_steps_in_long_ticks_settle():
+    """The mass matrix is fresh in every sim step: kept for 4 steps, it would diverge."""
+    panda = load_bundled("panda")
+    target = panda.settings.target
+    with Runner(panda, 1, params=params_of(panda, 100.0), workers=0, timestep=1 / 100, substeps=20) as runner:
+        runner.reset(panda.start)
+        rollout = runner.rollout(np.broadcast_to(target, (3, panda.dof)))
+    np.testing.assert_allclose(rollout.qpos[-1, 0], target, atol=1e-4)
+
+
+def test_any_packing_and_backend_gives_the_same_motion(panda):
+    start = np.broadcast_to(panda.start, (3, panda.dof)) - [[0.0], [0.1], [0.2]] * np.arange(9).clip(0, 1)
+    goal, outcome = panda.settings.target, []
+    options = {"timestep": 1 / 200, "workers": 0, "params": params_of(panda, 50.0, ki=1e4, effort_limit=80.0)}
+    for more in ({"pack_size": 3}, {"pack_size": 2}, {"backend": "jax"}):
+        if "backend" in more:
+            pytest.importorskip("jax")
+        with Runner(panda, 3, **options, **more) as runner:
+            runner.reset(np.clip(start, panda.lower, panda.upper))
+            outcome.append(runner.rollout(np.broadcast_to(goal, (4, 3, panda.dof))))
+    assert_identical(outcome[1], outcome[0])
+    np.testing.assert_allclose(outcome[2].qpos, outcome[0].qpos, atol=1e-5)
+
+
+def test_no_gain_passes_the_stability_bound(panda):
+    params = params_of(panda, 1e4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", StabilityWarning)
+        Runner(panda, 1, params=params, workers=0, timestep=1 / 100, collisions=False).close()
+    found = [one for one in panda.check(params=params) if "implicit" in one.text]
+    assert [one.severity for one in found] == ["note"]
+    assert "1.52 times" in found[0].text  # w dt = 5
+    assert not [one for one in panda.check(params=params_of(panda, 30.0)) if "implicit" in one.text]
+
+
+def test_a_snapshot_in_a_file_continues_it(panda, tmp_path):
+    options = {"timestep": 1 / 100, "substeps": 2, "workers": 0}
+    params, goal = params_of(panda, 60.0, ki=1e4), np.broadcast_to(panda.settings.target, (4, panda.dof))
+    with Runner(panda, 1, params=params, **options) as runner:
+        runner.rollout(goal)
+        runner.snapshot().save(tmp_path / "s.npz")
+        expected = runner.rollout(goal)
+    with Runner(panda, 1, params=params.replace(discretization="explicit", kp=1.0), **options) as runner:
+        runner.restore(Snapshot.load(tmp_path / "s.npz"))
+        assert runner.params.discretization == params.discretization
+        assert_identical(runner.rollout(goal), expected)
+
+
+def test_coupled_joints_move_together(tmp_path):
+    limit = '<limit lower="-1" upper="1" effort="50" velocity="2"/>'
+    follower = joint("two", "b", "c", inner=f'{limit}<mimic joint="one" multiplier="-0.5"/>')
+    path = write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b", inner=limit), follower))
+    arm = Robot.load(path, self_collision="none")
+    assert largest_error(arm, 1 / 100, params_of(arm, 100.0))[0] < 1e-3
