@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_of
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.symmetric import quiet
@@ -14,6 +15,7 @@ from batchpid.task_space.tree_kinematics import (
     motions_of,
     prepared,
     rate_at,
+    read_point,
     tool_frame,
     velocities_of,
 )
@@ -84,6 +86,11 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
     """
     index = tree.index(link)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    chain = xp.asarray(tree.chain(link), dtype=q.dtype)
+    wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias"
+    found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
+    if found is not None:
+        return TaskDynamics(*found, chain=chain)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         velocities = velocities_of(tree, motions, v, xp)
@@ -94,7 +101,7 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
             jacobian_rate=rate_at(tree, velocities, index, tool[..., 3]),
             mass_matrix=mass_matrix_of(tree, bodies, motions, xp),
             bias=effort_of(tree, bodies, motions, velocities, xp),
-            chain=xp.asarray(tree.chain(link), dtype=q.dtype),
+            chain=chain,
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.native.interface import BODY
+from batchpid.native.task_space_extension import BODY
 
 Float64 = NDArray[np.float64]
 
