@@ -43,6 +43,9 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
     return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
   }
   friend Lanes where_positive(Lanes mask, Lanes a, Lanes b) { return mask.of > 0.0 ? a.of : b.of; }
+  // 1.0 where a >= b, else 0.0, also for nan.
+  friend Lanes at_least_mask(Lanes a, Lanes b) { return a.of >= b.of ? Packed{} + 1.0 : Packed{}; }
+  friend Lanes absolute(Lanes a) { return a.of < 0.0 ? -a.of : a.of; }
   friend Lanes root(Lanes x) {
     for (int k = 0; k < WIDTH; ++k) x.of[k] = std::sqrt(x.of[k]);
     return x;
@@ -62,49 +65,60 @@ inline void scatter(Lanes value, double *table, std::int64_t columns, std::int64
   for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = value.of[k];
 }
 
-// Write Cholesky's factor L (n, n) of a symmetric matrix, with the inverses of its diagonal; nan if it is not definite.
-inline void cholesky(std::int64_t n, Lanes const *a, Lanes *l) {
+// Overwrite the lower triangle of a symmetric matrix (n, n) by Cholesky's factor L, with the inverses of its diagonal;
+// nan if it is not definite. Inner loops have independent sums: a chain of dependent ones takes four times as long.
+inline void cholesky(std::int64_t n, Lanes *a) {
   for (std::int64_t j = 0; j < n; ++j) {
-    for (std::int64_t i = j; i < n; ++i) {
-      Lanes sum = a[i * n + j];
-      for (std::int64_t k = 0; k < j; ++k) sum -= l[i * n + k] * l[j * n + k];
-      l[i * n + j] = i == j ? 1.0 / root(sum) : sum * l[j * n + j];
+    a[j * n + j] = 1.0 / root(a[j * n + j]);
+    for (std::int64_t i = j + 1; i < n; ++i) {
+      Lanes const factor = a[i * n + j] = a[i * n + j] * a[j * n + j];
+      for (std::int64_t k = j + 1; k <= i; ++k) a[i * n + k] -= factor * a[k * n + j];
     }
   }
 }
 
 // Replace a symmetric positive definite matrix (n, n) by its inverse, by Cholesky's factor; nan if it is not definite.
 inline void invert(std::int64_t n, Lanes *a, Lanes *l) {
-  cholesky(n, a, l);
-  for (std::int64_t j = 0; j < n; ++j) {  // L^-1, below the diagonal
-    for (std::int64_t i = j + 1; i < n; ++i) {
-      Lanes sum = l[i * n + j] * l[j * n + j];
-      for (std::int64_t k = j + 1; k < i; ++k) sum += l[i * n + k] * l[k * n + j];
-      l[i * n + j] = -sum * l[i * n + i];
+  cholesky(n, a);
+  for (std::int64_t i = 0; i < n; ++i) {  // L^-1
+    Lanes *row = l + i * n;
+    for (std::int64_t j = 0; j < i; ++j) row[j] = a[i * n + j] * l[j * n + j];
+    for (std::int64_t k = 0; k < i; ++k) {
+      for (std::int64_t j = 0; j < k; ++j) row[j] += a[i * n + k] * l[k * n + j];
+    }
+    for (std::int64_t j = 0; j < i; ++j) row[j] = -row[j] * a[i * n + i];
+    row[i] = a[i * n + i];
+  }
+  for (std::int64_t i = 0; i < n * n; ++i) a[i] = {};
+  for (std::int64_t k = 0; k < n; ++k) {
+    for (std::int64_t i = 0; i <= k; ++i) {
+      for (std::int64_t j = 0; j <= i; ++j) a[i * n + j] += l[k * n + i] * l[k * n + j];
     }
   }
   for (std::int64_t i = 0; i < n; ++i) {
-    for (std::int64_t j = 0; j <= i; ++j) {
-      Lanes sum{};
-      for (std::int64_t k = i; k < n; ++k) sum += l[k * n + i] * l[k * n + j];
-      a[i * n + j] = a[j * n + i] = sum;
-    }
+    for (std::int64_t j = 0; j < i; ++j) a[j * n + i] = a[i * n + j];
   }
 }
 
-// Solve L y = x in place, with the factor of `cholesky`.
-inline void solve_lower(std::int64_t n, Lanes const *l, Lanes *x) {
+// Solve L Y = X in place, with the factor of `cholesky`, for X (n, columns).
+template <int columns>
+void solve_lower(std::int64_t n, Lanes const *l, Lanes *x) {
   for (std::int64_t i = 0; i < n; ++i) {
-    for (std::int64_t k = 0; k < i; ++k) x[i] -= l[i * n + k] * x[k];
-    x[i] = x[i] * l[i * n + i];
+    for (std::int64_t k = 0; k < i; ++k) {
+      for (int c = 0; c < columns; ++c) x[i * columns + c] -= l[i * n + k] * x[k * columns + c];
+    }
+    for (int c = 0; c < columns; ++c) x[i * columns + c] = x[i * columns + c] * l[i * n + i];
   }
 }
 
-// Solve L^T y = x in place.
-inline void solve_upper(std::int64_t n, Lanes const *l, Lanes *x) {
+// Solve L^T Y = X in place.
+template <int columns>
+void solve_upper(std::int64_t n, Lanes const *l, Lanes *x) {
   for (std::int64_t i = n - 1; i >= 0; --i) {
-    for (std::int64_t k = i + 1; k < n; ++k) x[i] -= l[k * n + i] * x[k];
-    x[i] = x[i] * l[i * n + i];
+    for (std::int64_t k = i + 1; k < n; ++k) {
+      for (int c = 0; c < columns; ++c) x[i * columns + c] -= l[k * n + i] * x[k * columns + c];
+    }
+    for (int c = 0; c < columns; ++c) x[i * columns + c] = x[i * columns + c] * l[i * n + i];
   }
 }
 

@@ -17,6 +17,7 @@ namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
 constexpr int AXES = 6, POSE = 7, SWEEPS = 12;
+constexpr double CLEAR = 1e-20;  // least entry off the diagonal that is turned away, as a share of the diagonal
 char const *const TREE = "batchpid.KinematicTree";
 
 enum Decoupling { FULL, PARTIAL, NONE };
@@ -38,10 +39,27 @@ struct Table {
 
   explicit operator bool() const { return data != nullptr; }
   double *row(std::int64_t at) const { return data + (rows == 1 ? 0 : at) * columns; }
-  Lanes get(std::int64_t column, std::int64_t first) const { return gather(data, columns, column, first, rows); }
-  void set(Lanes value, std::int64_t column, std::int64_t first) const {
-    if (data != nullptr) scatter(value, data, columns, column, first, rows);
+  // Copy columns of the rows from `first` on; the last row stands for those that there are not.
+  void load(std::int64_t first, std::int64_t count, Lanes *out) const {
+    double const *const end = data + (rows - 1) * columns, *from[WIDTH];
+    for (int k = 0; k < WIDTH; ++k) from[k] = first + k < rows ? data + (first + k) * columns : end;
+    for (std::int64_t c = 0; c < count; ++c) {
+      for (int k = 0; k < WIDTH; ++k) out[c].of[k] = from[k][c];
+    }
   }
+  void load(std::int64_t first, Lanes *out) const { load(first, columns, out); }
+  void store(std::int64_t first, std::int64_t count, Lanes const *values) const {
+    if (data == nullptr) return;
+    double *const to = data + first * columns;
+    if (first + WIDTH <= rows) {
+      for (std::int64_t c = 0; c < count; ++c) {
+        for (int k = 0; k < WIDTH; ++k) to[k * columns + c] = values[c].of[k];
+      }
+    } else {
+      for (std::int64_t c = 0; c < count; ++c) scatter(values[c], data, columns, c, first, rows);
+    }
+  }
+  void store(std::int64_t first, Lanes const *values) const { store(first, columns, values); }
 };
 
 // Arrays of Python as tables of doubles; None is a table without data.
@@ -113,10 +131,10 @@ void write_quaternion(double const (&x)[3], double const (&y)[3], double const (
 // Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
 enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
 
-void set_vector(Table const &table, Vector<Lanes> const &v, std::int64_t at, std::int64_t stride, std::int64_t first) {
-  table.set(v.x, at, first);
-  table.set(v.y, at + stride, first);
-  table.set(v.z, at + 2 * stride, first);
+void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
+  out[0] = v.x;
+  out[stride] = v.y;
+  out[2 * stride] = v.z;
 }
 
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
@@ -125,13 +143,14 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   auto const size = static_cast<std::size_t>(dof);
   std::int32_t const *above = tree.tree.data();
   std::vector<Lanes> q(size), v(size), cosine(size), sine(size), effort(size), matrix(size * size);
+  std::vector<Lanes> jacobian(AXES * size);  // 0 for joints that are not between base and tool
   std::vector<BodyState<Lanes>> bodies(size);
   std::vector<BodyMotion<Lanes>> motions(size);
   double const still[3] = {0.0, 0.0, 0.0};
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    table[QPOS].load(first, q.data());
+    if (table[QVEL]) table[QVEL].load(first, v.data());
     for (std::int64_t i = 0; i < dof; ++i) {
-      q[i] = table[QPOS].get(i, first);
-      if (table[QVEL]) v[i] = table[QVEL].get(i, first);
       for (int k = 0; k < WIDTH; ++k) {
         cosine[i].of[k] = std::cos(q[i].of[k]);
         sine[i].of[k] = std::sin(q[i].of[k]);
@@ -140,17 +159,19 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
     place_bodies(dof, above, tree.bodies(), cosine.data(), sine.data(), q.data(), bodies.data());
     if (table[QVEL]) move_bodies(dof, above, bodies.data(), v.data(), still, motions.data());
     if (table[TOOL]) {
+      Lanes frame[12];
+      table[TOOL].load(first, frame);
       Vector<Lanes> columns[4];  // of the tool's frame: axes and place
       for (int k = 0; k < 4; ++k) {
-        auto const entry = [&](int row) { return table[TOOL].get(4 * row + k, first); };
-        columns[k] = {entry(0), entry(1), entry(2)};
+        columns[k] = {frame[k], frame[4 + k], frame[8 + k]};
         if (body < 0) continue;
         columns[k] = in_axes(bodies[body].axes, columns[k].x, columns[k].y, columns[k].z);
         if (k == 3) columns[k] = bodies[body].origin + columns[k];
       }
       Vector<Lanes> const place = columns[3];
       if (table[TOOL_POSE]) {
-        set_vector(table[TOOL_POSE], place, 0, 1, first);
+        put(place, frame);
+        table[TOOL_POSE].store(first, 3, frame);
         for (int k = 0; k < WIDTH && first + k < rows; ++k) {
           double axes[3][3];
           for (int c = 0; c < 3; ++c) {
@@ -162,22 +183,19 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
         }
       }
       if (table[JACOBIAN]) {
-        for (int k = 0; k < WIDTH && first + k < rows; ++k) {
-          double *matrix_row = table[JACOBIAN].data + (first + k) * AXES * dof;
-          std::fill(matrix_row, matrix_row + AXES * dof, 0.0);
-        }
         for (std::int64_t j = body; j >= 0; j = above[2 * j]) {
           Vector<Lanes> const w = turning(bodies[j], above[2 * j + 1]);
-          Vector<Lanes> const linear = moving(bodies[j], above[2 * j + 1]) + cross(w, place);
-          set_vector(table[JACOBIAN], linear, j, dof, first);
-          set_vector(table[JACOBIAN], w, j + 3 * dof, dof, first);
+          put(moving(bodies[j], above[2 * j + 1]) + cross(w, place), &jacobian[j], dof);
+          put(w, &jacobian[j + 3 * dof], dof);
         }
+        table[JACOBIAN].store(first, jacobian.data());
       }
       if (table[JACOBIAN_RATE]) {
         BodyMotion<Lanes> const base{}, &at = body < 0 ? base : motions[body];
         Vector<Lanes> const inward = cross(at.turning, at.moving + cross(at.turning, place));
-        set_vector(table[JACOBIAN_RATE], at.moving_change + cross(at.turning_change, place) + inward, 0, 1, first);
-        set_vector(table[JACOBIAN_RATE], at.turning_change, 3, 1, first);
+        put(at.moving_change + cross(at.turning_change, place) + inward, frame);
+        put(at.turning_change, frame + 3);
+        table[JACOBIAN_RATE].store(first, frame);
       }
     }
     if (table[BIAS]) {
@@ -188,12 +206,12 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
         motions[i].torque = motions[i].torque + cross(tree.gravity, bodies[i].inertia.first);
       }
       efforts_of_wrenches(dof, above, bodies.data(), motions.data(), effort.data());
-      for (std::int64_t i = 0; i < dof; ++i) table[BIAS].set(effort[i], i, first);
+      table[BIAS].store(first, effort.data());
     }
     if (table[MASS_MATRIX]) {
       composite_mass_matrix(dof, above, bodies.data(), matrix.data());
       for (std::int64_t i = 0; i < dof; ++i) matrix[i * dof + i] += tree.armature[i];
-      for (std::int64_t i = 0; i < dof * dof; ++i) table[MASS_MATRIX].set(matrix[i], i, first);
+      table[MASS_MATRIX].store(first, matrix.data());
     }
   }
 }
@@ -236,8 +254,10 @@ enum Projections {
   PROJECTIONS
 };
 
-// Write the eigenvalues and, as columns, the eigenvectors of a symmetric matrix, which is overwritten: Jacobi's method.
-void eigen(double (&a)[AXES][AXES], double (&vectors)[AXES][AXES]) {
+// Write the eigenvalues (6,) and, as columns, the eigenvectors of symmetric matrices, of which the upper triangle is used
+// and overwritten: Jacobi's method. A lane whose entry is clear is not turned, so that it ends at the same sweep in any
+// company.
+void eigen(Lanes (&a)[AXES][AXES], Lanes (&vectors)[AXES][AXES]) {
   for (int i = 0; i < AXES; ++i) {
     for (int j = 0; j < AXES; ++j) vectors[i][j] = i == j ? 1.0 : 0.0;
   }
@@ -245,53 +265,55 @@ void eigen(double (&a)[AXES][AXES], double (&vectors)[AXES][AXES]) {
     bool turned = false;
     for (int p = 0; p < AXES; ++p) {
       for (int q = p + 1; q < AXES; ++q) {
-        double const off = a[p][q];
-        if (!(std::fabs(off) > 1e-30 * (std::fabs(a[p][p]) + std::fabs(a[q][q])))) continue;
-        turned = true;
-        double const cot = (a[q][q] - a[p][p]) / (2 * off);
-        double const tangent = (cot < 0 ? -1.0 : 1.0) / (std::fabs(cot) + std::sqrt(cot * cot + 1));
-        double const c = 1 / std::sqrt(tangent * tangent + 1), s = tangent * c;
+        Lanes const off = a[p][q], clear = CLEAR * (absolute(a[p][p]) + absolute(a[q][q]));
+        Lanes const turns = absolute(off) - clear;
+        Lanes const cot = (a[q][q] - a[p][p]) / where_positive(turns, 2.0 * off, 1.0);
+        Lanes const sum = absolute(cot) + root(cot * cot + 1.0);
+        Lanes const t = where_positive(turns, where_positive(-cot, -1.0, 1.0) / sum, 0.0);
+        for (int k = 0; k < WIDTH; ++k) turned = turned || turns.of[k] > 0;
+        Lanes const c = 1.0 / root(t * t + 1.0), s = t * c;
+        a[p][p] -= t * off;
+        a[q][q] += t * off;
+        a[p][q] = where_positive(turns, 0.0, off);
         for (int k = 0; k < AXES; ++k) {
-          double const x = a[k][p], y = a[k][q];
-          a[k][p] = c * x - s * y;
-          a[k][q] = s * x + c * y;
-        }
-        for (int k = 0; k < AXES; ++k) {
-          double const x = a[p][k], y = a[q][k];
-          a[p][k] = c * x - s * y;
-          a[q][k] = s * x + c * y;
-          double const v = vectors[k][p], w = vectors[k][q];
+          Lanes const v = vectors[k][p], w = vectors[k][q];
           vectors[k][p] = c * v - s * w;
           vectors[k][q] = s * v + c * w;
+          if (k == p || k == q) continue;
+          Lanes &to_p = k < p ? a[k][p] : a[p][k], &to_q = k < q ? a[k][q] : a[q][k];
+          Lanes const x = to_p, y = to_q;
+          to_p = c * x - s * y;
+          to_q = s * x + c * y;
         }
-        a[p][q] = a[q][p] = 0.0;
       }
     }
     if (!turned) break;
   }
 }
 
-// Write lane k of the bounded inverse by eigenvalues; return whether any is below s0.
-bool write_bounded(Lanes const *matrix, double s0, int k, Lanes *out) {
-  double a[AXES][AXES], vectors[AXES][AXES], scale[AXES];
+// Write the bounded inverses by eigenvalues in the lanes of `unsure`; `near` gets 1.0 where any is below s0.
+void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes &near) {
+  Lanes a[AXES][AXES], vectors[AXES][AXES], scale[AXES], low{};
   for (int i = 0; i < AXES; ++i) {
-    for (int j = 0; j < AXES; ++j) a[i][j] = matrix[i * AXES + j].of[k];
+    // The lanes that are left out are diagonal, and end at once.
+    for (int j = 0; j < AXES; ++j) a[i][j] = where_positive(unsure, matrix[i * AXES + j], i == j ? 1.0 : 0.0);
   }
   eigen(a, vectors);
-  bool low = false;
   for (int i = 0; i < AXES; ++i) {
-    double const s = a[i][i];
-    low = low || !(s >= s0);
-    scale[i] = s >= s0 ? 1 / s : (s < 0 ? 0.0 : s) / (s0 * s0);
+    Lanes const s = a[i][i];
+    Lanes const large = at_least_mask(s, s0);
+    low = where_positive(large, low, 1.0);
+    scale[i] = where_positive(large, 1.0 / s, at_least(s, 0.0) / (s0 * s0));
   }
+  near = where_positive(unsure * low, 1.0, near);
   for (int i = 0; i < AXES; ++i) {
     for (int j = 0; j <= i; ++j) {
-      double sum = 0.0;
+      Lanes sum{};
       for (int c = 0; c < AXES; ++c) sum += scale[c] * vectors[i][c] * vectors[j][c];
-      out[i * AXES + j].of[k] = out[j * AXES + i].of[k] = sum;
+      Lanes const entry = where_positive(unsure, sum, out[i * AXES + j]);
+      out[i * AXES + j] = out[j * AXES + i] = entry;
     }
   }
-  return low;
 }
 
 // Write the bounded inverse of A over the selected axes; `near` gets 1.0 in the lanes where it is bounded.
@@ -310,10 +332,9 @@ void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *axes, L
   invert(AXES, out, factor);
   Lanes square{};
   for (Lanes const &entry : out) square += entry * entry;
-  Lanes const bound = root(square) * s0;
-  for (int k = 0; k < WIDTH; ++k) {
-    if (bound.of[k] <= 1.0) continue;  // no eigenvalue is below s0; false for nan
-    if (write_bounded(matrix, s0.of[k], k, out)) near.of[k] = 1.0;
+  Lanes const sure = at_least_mask(1.0, root(square) * s0);  // no eigenvalue is below s0; 0.0 for nan
+  if (sure.of[0] + sure.of[1] + sure.of[2] + sure.of[3] < WIDTH) {
+    bound_inverses(matrix, s0, 1.0 - sure, out, near);
   }
   if (axes == nullptr) return;
   for (int i = 0; i < AXES; ++i) {
@@ -335,34 +356,37 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
   std::vector<std::int64_t> chain, others;
   for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain : others).push_back(i);
   auto const links = static_cast<std::int64_t>(chain.size());
-  std::vector<Lanes> jacobian(AXES * n), mass(n * n), inner(n * n), factor(n * n), white(AXES * n), a_n(n), x(n), y(n);
+  std::vector<Lanes> jacobian(AXES * n), mass(n * n), factor(n * n), white(AXES * n), a_n(n), both(2 * n);
+  std::vector<Lanes> base(n), feedforward(n), task(n), posture(n), of_task(n), of_posture(n);  // 0 for joints that have no part in it
   Lanes mobility[AXES * AXES], task_inertia[AXES * AXES], null_inertia[AXES * AXES], axes[AXES], allowed[AXES];
-  Lanes acceleration[AXES], force[AXES], drop[AXES];
+  Lanes acceleration[AXES], force[AXES], drop[AXES], added[AXES];
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (std::int64_t i = 0; i < AXES * dof; ++i) jacobian[i] = table[TASK_JACOBIAN].get(i, first);
-    for (std::int64_t i = 0; i < dof * dof; ++i) mass[i] = table[TASK_MASS].get(i, first);
+    table[TASK_JACOBIAN].load(first, jacobian.data());
+    table[TASK_MASS].load(first, mass.data());
     for (std::int64_t i = 0; i < links; ++i) {
-      for (std::int64_t j = 0; j < links; ++j) inner[i * links + j] = mass[chain[i] * dof + chain[j]];
+      for (std::int64_t j = 0; j <= i; ++j) factor[i * links + j] = mass[chain[i] * dof + chain[j]];
+      for (int axis = 0; axis < AXES; ++axis) white[i * AXES + axis] = jacobian[axis * dof + chain[i]];
     }
-    cholesky(links, inner.data(), factor.data());
-    for (int axis = 0; axis < AXES; ++axis) {  // L^-1 J^T
-      Lanes *column = &white[axis * links];
-      for (std::int64_t i = 0; i < links; ++i) column[i] = jacobian[axis * dof + chain[i]];
-      solve_lower(links, factor.data(), column);
-      for (int other = 0; other <= axis; ++other) {
-        Lanes const entry = along(column, &white[other * links], links);
-        mobility[axis * AXES + other] = mobility[other * AXES + axis] = entry;
+    cholesky(links, factor.data());
+    solve_lower<AXES>(links, factor.data(), white.data());  // L^-1 J^T
+    std::fill(mobility, mobility + AXES * AXES, Lanes{});
+    for (std::int64_t i = 0; i < links; ++i) {
+      Lanes const *row = &white[i * AXES];
+      for (int a = 0; a < AXES; ++a) {
+        for (int b = 0; b <= a; ++b) mobility[a * AXES + b] += row[a] * row[b];
       }
+    }
+    for (int a = 0; a < AXES; ++a) {
+      for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
     }
 
     Table const &selected = table[SELECTED], &force_axes = table[FORCE_AXES];
     bool const select = bool(selected), force_too = select && force_axes;
-    for (int axis = 0; axis < AXES && select; ++axis) {
-      allowed[axis] = axes[axis] = selected.get(axis, first);
-      if (force_too) allowed[axis] = at_least(axes[axis], force_axes.get(axis, first));
-    }
-    Lanes const s0 = table[SMALLEST].get(0, first);
-    Lanes near{};
+    if (select) selected.load(first, axes);
+    if (force_too) force_axes.load(first, added);
+    for (int axis = 0; axis < AXES; ++axis) allowed[axis] = force_too ? at_least(axes[axis], added[axis]) : axes[axis];
+    Lanes s0, near{};
+    table[SMALLEST].load(first, &s0);
     selected_inverse(mobility, select ? allowed : nullptr, s0, null_inertia, near);
     Lanes *inertia = null_inertia;
     if (decoupling == PARTIAL || (decoupling == FULL && force_too)) {
@@ -377,59 +401,61 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
       inertia = task_inertia;
     }
 
-    for (int axis = 0; axis < AXES; ++axis) {
-      acceleration[axis] = table[ACCELERATION].get(axis, first);
-      if (decoupling != NONE) acceleration[axis] -= table[TASK_RATE].get(axis, first);
+    table[ACCELERATION].load(first, acceleration);
+    if (decoupling != NONE) {
+      table[TASK_RATE].load(first, added);
+      for (int axis = 0; axis < AXES; ++axis) acceleration[axis] -= added[axis];
     }
+    if (table[WRENCH]) table[WRENCH].load(first, added);
     for (int axis = 0; axis < AXES; ++axis) {
       force[axis] = decoupling != NONE ? along(inertia + axis * AXES, acceleration, AXES)
                     : select           ? axes[axis] * acceleration[axis]
                                        : acceleration[axis];
-      if (table[WRENCH]) force[axis] += table[WRENCH].get(axis, first);
-      table[FORCE].set(force[axis], axis, first);
+      if (table[WRENCH]) force[axis] += added[axis];
     }
+    table[FORCE].store(first, force);
 
-    for (std::int64_t i = 0; i < dof; ++i) a_n[i] = table[POSTURE_ACCELERATION].get(i, first);
+    table[POSTURE_ACCELERATION].load(first, a_n.data());
     for (int axis = 0; axis < AXES; ++axis) {  // J a_n of the chain
       acceleration[axis] = {};
       for (std::int64_t i : chain) acceleration[axis] += jacobian[axis * dof + i] * a_n[i];
     }
     for (int axis = 0; axis < AXES; ++axis) drop[axis] = along(null_inertia + axis * AXES, acceleration, AXES);
 
-    for (std::int64_t i : others) {
-      table[TASK].set({}, i, first);
-      table[POSTURE].set({}, i, first);
-    }
     for (std::int64_t c = 0; c < links; ++c) {
       std::int64_t const i = chain[c];
-      x[c] = y[c] = {};
-      for (int axis = 0; axis < AXES; ++axis) x[c] += jacobian[axis * dof + i] * force[axis];
-      for (std::int64_t j : chain) y[c] += mass[i * dof + j] * a_n[j];
-      for (int axis = 0; axis < AXES; ++axis) y[c] -= jacobian[axis * dof + i] * drop[axis];
-      table[TASK].set(x[c], i, first);
-      table[POSTURE].set(y[c], i, first);
+      Lanes x{}, y{};
+      for (int axis = 0; axis < AXES; ++axis) {
+        x += jacobian[axis * dof + i] * force[axis];
+        y -= jacobian[axis * dof + i] * drop[axis];
+      }
+      for (std::int64_t j : chain) y += mass[i * dof + j] * a_n[j];
+      task[i] = both[2 * c] = x;
+      posture[i] = both[2 * c + 1] = y;
     }
+    table[TASK].store(first, task.data());
+    table[POSTURE].store(first, posture.data());
+    table[TASK_BIAS].load(first, base.data());
+    if (table[FEEDFORWARD]) table[FEEDFORWARD].load(first, feedforward.data());
     for (std::int64_t i = 0; i < dof; ++i) {
-      Lanes base = table[TASK_BIAS].get(i, first);
-      for (std::int64_t j : others) base += mass[i * dof + j] * a_n[j];
-      if (table[FEEDFORWARD]) base += table[FEEDFORWARD].get(i, first);
-      table[BASE].set(base, i, first);
+      for (std::int64_t j : others) base[i] += mass[i * dof + j] * a_n[j];
+      if (table[FEEDFORWARD]) base[i] += feedforward[i];
     }
-    Projections const results[2] = {TASK_OF_OTHERS, POSTURE_OF_OTHERS};
-    std::vector<Lanes> *const efforts[2] = {&x, &y};
-    for (int part = 0; part < 2; ++part) {  // M_oc M_cc^-1 of task and posture
-      Lanes *effort = efforts[part]->data();
-      for (std::int64_t i : chain) table[results[part]].set({}, i, first);
-      if (others.empty()) continue;
-      solve_lower(links, factor.data(), effort);
-      solve_upper(links, factor.data(), effort);
-      for (std::int64_t i : others) {
-        Lanes sum{};
-        for (std::int64_t c = 0; c < links; ++c) sum += mass[i * dof + chain[c]] * effort[c];
-        table[results[part]].set(sum, i, first);
+    table[BASE].store(first, base.data());
+    if (!others.empty()) {  // M_oc M_cc^-1 of task and posture
+      solve_lower<2>(links, factor.data(), both.data());
+      solve_upper<2>(links, factor.data(), both.data());
+    }
+    for (std::int64_t i : others) {
+      of_task[i] = of_posture[i] = {};
+      for (std::int64_t c = 0; c < links; ++c) {
+        of_task[i] += mass[i * dof + chain[c]] * both[2 * c];
+        of_posture[i] += mass[i * dof + chain[c]] * both[2 * c + 1];
       }
     }
-    table[NEAR_SINGULAR].set(near, 0, first);
+    table[TASK_OF_OTHERS].store(first, of_task.data());
+    table[POSTURE_OF_OTHERS].store(first, of_posture.data());
+    table[NEAR_SINGULAR].store(first, &near);
   }
 }
 

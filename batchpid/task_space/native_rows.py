@@ -10,16 +10,19 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from functools import cache
+from collections.abc import Callable
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.availability import SWITCH
+from batchpid.native.availability import SWITCH, program_status
+from batchpid.native.array_program import ArrayProgram
 from batchpid.native.extensions import StaleExtensionError, load
 from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, TASK_SPACE
+from batchpid.native.tracing import trace
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 Float64 = NDArray[np.float64]
@@ -136,6 +139,28 @@ def projections(decoupling: str, chain: Any, arrays: tuple[Any, ...]) -> list[An
     native.projections(rows, dof, DECOUPLING.index(decoupling), chain, *map(_contiguous, arrays), *found)
     found[-1] = found[-1][:, 0] > 0
     return found
+
+
+def elementwise(function: Callable[..., list[Any]], *arrays: Any) -> list[Any]:
+    """Return ``function(*arrays)``, elementwise over arrays (envs | 1, columns) of NumPy as a traced program.
+
+    The program is the function itself, with its rounding: a minimum over columns is repeated in all of them.
+    """
+    shapes = [array.shape for array in arrays if type(array) is np.ndarray and array.ndim == 2]
+    given = tuple([array is not None for array in arrays])
+    if len(shapes) < sum(given) or not program_status().active:
+        return function(*arrays)
+    program = _program(function, given, max(shapes))
+    return list(program(*[_contiguous(array) for array in arrays if array is not None]))
+
+
+@lru_cache(maxsize=256)
+def _program(function: Callable[..., list[Any]], given: tuple[bool, ...], shape: tuple[int, int]) -> ArrayProgram:
+    def traced(*symbols: Any) -> list[Any]:
+        rest = iter(symbols)
+        return function(*(next(rest) if one else None for one in given))
+
+    return ArrayProgram(trace(traced, 0, sum(given)), (), sum(given), shape, threads=1)
 
 
 def _for_rows(like: Any, *arrays: Any) -> Any:

@@ -31,6 +31,7 @@ IEEE Journal on Robotics and Automation 3 (1987).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
+from batchpid.task_space.native_rows import elementwise
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
@@ -163,19 +165,16 @@ def _advance(
             None if x is None else in_axes(turn, x[..., None])[..., 0] for x in (error, near, rate, acceleration)
         )
         d = in_tool_axes(d)
-    a = k.stiffness * near + k.damping * rate
-    a = a if acceleration is None else a + acceleration
-    a_n = k.posture_stiffness * (state.posture - q) - k.posture_damping * v
+    (a,) = elementwise(_accelerations, k.stiffness, k.damping, near, rate, acceleration)
+    (a_n,) = elementwise(_posture_accelerations, k.posture_stiffness, k.posture_damping, state.posture, q, v)
     p = projections(k, d, a, a_n, wrench, feedforward)
-
-    s1, s2 = _shares(p.base, p.task, p.posture, k, xp)
-    driven = s1[..., None] * (p.task + p.task_of_others) + s2[..., None] * (p.posture + p.posture_of_others)
-    effort = clip(p.base + driven, k.effort_min, k.effort_max, xp)
+    parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
     if not terms:
-        return state, effort
-    others = s1[..., None] * p.task_of_others + s2[..., None] * p.posture_of_others
-    whole = p.base + p.task + p.posture + others
-    return state, effort, OSCTerms(error, p.force, p.task, p.posture, whole, effort.copy(), s1, s2, p.near_singular)
+        return state, elementwise(_effort, *parts)[0]
+    effort, whole, s1, s2 = elementwise(_saturated, *parts)
+    return state, effort, OSCTerms(
+        error, p.force, p.task, p.posture, whole, effort.copy(), s1[..., 0], s2[..., 0], p.near_singular
+    )
 
 
 def _errors(k: OSCParams, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
@@ -196,17 +195,37 @@ def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def _shares(base: Any, task: Any, null: Any, k: OSCParams, xp: Any) -> tuple[Any, Any]:
-    """Return s1 and s2 (envs,)."""
-    low = -xp.inf if k.effort_min is None else k.effort_min
-    high = xp.inf if k.effort_max is None else k.effort_max
-    able = (base >= low) & (base <= high)
+def _accelerations(kp: Any, kd: Any, near: Any, rate: Any, acceleration: Any) -> list[Any]:
+    """Return a (envs, 6)."""
+    a = kp * near + kd * rate
+    return [a if acceleration is None else a + acceleration]
+
+
+def _posture_accelerations(kp: Any, kd: Any, posture: Any, q: Any, v: Any) -> list[Any]:
+    """Return a_n (envs, dof)."""
+    return [kp * (posture - q) - kd * v]
+
+
+def _effort(*parts: Any) -> list[Any]:
+    return _saturated(*parts)[:1]
+
+
+def _saturated(
+    base: Any, task: Any, null: Any, task_of_others: Any, null_of_others: Any, low: Any, high: Any
+) -> list[Any]:
+    """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
+    xp = namespace(base, task, null, task_of_others, null_of_others, low, high)
+    least, most = -math.inf if low is None else low, math.inf if high is None else high
+    able = (base >= least) & (base <= most)
 
     def share(effort: Any, at: Any) -> Any:
-        room = xp.maximum(xp.where(effort > 0, high - at, at - low), 0.0)
+        room = xp.maximum(xp.where(effort > 0, most - at, at - least), 0.0)
         size = xp.abs(effort)
         limited = able & (size > room)
-        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1)
+        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(axis=-1, keepdims=True)
 
     s1 = share(task, base)
-    return s1, share(null, base + s1[..., None] * task)
+    s2 = share(null, base + s1 * task)
+    others = s1 * task_of_others + s2 * null_of_others
+    effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
+    return [effort, base + task + null + others, s1, s2]
