@@ -74,10 +74,12 @@ class OSCTerms(NamedTuple):
         return array_summary(self, "envs", "joints")
 
 
-def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None) -> TaskDynamics:
+def task_dynamics(
+    tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, bias: Any = None
+) -> TaskDynamics:
     """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
 
-    ``qpos`` and ``qvel`` are (envs, dof).
+    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the place of the tree's.
 
     Raises
     ------
@@ -87,10 +89,10 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
     index = tree.index(link)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
     chain = xp.asarray(tree.chain(link), dtype=q.dtype)
-    wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias"
+    wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
     found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
     if found is not None:
-        return TaskDynamics(*found, chain=chain)
+        return TaskDynamics(*found[:4], bias=found[4] if bias is None else bias, chain=chain)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         velocities = velocities_of(tree, motions, v, xp)
@@ -100,7 +102,7 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
             jacobian=jacobian_at(tree, bodies, motions, index, tool[..., 3]),
             jacobian_rate=rate_at(tree, velocities, index, tool[..., 3]),
             mass_matrix=mass_matrix_of(tree, bodies, motions, xp),
-            bias=effort_of(tree, bodies, motions, velocities, xp),
+            bias=effort_of(tree, bodies, motions, velocities, xp) if bias is None else bias,
             chain=chain,
         )
 
