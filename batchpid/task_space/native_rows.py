@@ -18,8 +18,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.availability import SWITCH, program_status
 from batchpid.native.array_program import ArrayProgram
+from batchpid.native.availability import SWITCH, program_status
 from batchpid.native.extensions import StaleExtensionError, load
 from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, TASK_SPACE
 from batchpid.native.tracing import trace

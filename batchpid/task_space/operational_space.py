@@ -40,8 +40,8 @@ from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
-from batchpid.task_space.native_rows import elementwise
 from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.native_rows import elementwise
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
 from batchpid.task_space.projections import projections
@@ -172,8 +172,10 @@ def _advance(
     if not terms:
         return state, elementwise(_effort, *parts)[0]
     effort, whole, s1, s2 = elementwise(_saturated, *parts)
-    return state, effort, OSCTerms(
-        error, p.force, p.task, p.posture, whole, effort.copy(), s1[..., 0], s2[..., 0], p.near_singular
+    return (
+        state,
+        effort,
+        OSCTerms(error, p.force, p.task, p.posture, whole, effort.copy(), s1[..., 0], s2[..., 0], p.near_singular),
     )
 
 

@@ -68,8 +68,9 @@ def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = Non
     indices = [tree.index(link) for link in chosen]
     (q,), bodies, xp = prepared(tree, qpos=qpos)
     found = [native_rows.kinematics(tree, ("pose",), q, None, index) for index in indices]
-    if None not in found:
-        return np.stack([pose for (pose,) in found], axis=-2)
+    poses = [each[0] for each in found if each is not None]
+    if len(poses) == len(indices):
+        return np.stack(poses, axis=-2)
     frames = frames_of_bodies(tree, bodies, q, xp)
     with quiet():
         return xp.stack([pose_of(frame_of_link(tree, bodies, frames, index)) for index in indices], axis=-2)

@@ -43,7 +43,7 @@ def pose_of(of, qpos, name):
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize("name", ["panda", "six_joints"])
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
-    """5 cm of radius, once in 2 s; the orientation is held. The acceleration that is not given costs r w^2/kp: 0.5 mm."""
+    """5 cm of radius, once in 2 s; the orientation is held. It is r w^2/kp = 0.5 mm too wide."""
     if engine == "mujoco":
         pytest.importorskip("mujoco")
     of = request.getfixturevalue(name)
@@ -96,7 +96,8 @@ def test_results_do_not_depend_on_workers_and_a_snapshot_goes_on(panda):
 def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     control = OperationalSpace(panda, HAND, joints=["panda_finger_joint2"], posture_stiffness=400.0)
     assert control.command.labels[7:] == ("panda_finger_joint2 [m]",)
-    goals = np.tile(np.append(pose_of(panda, START, HAND) + [0, 0.02, 0, 0, 0, 0, 0], 0.035), (4, 1))
+    goals = np.tile([*pose_of(panda, START, HAND), 0.035], (4, 1))
+    goals[:, 1] += 0.02
     goals[1, 3:7] *= -50.0
     goals[2, 3:7] = 0.0
     with Runner(panda, 4, control=control, **OPTIONS) as runner:
