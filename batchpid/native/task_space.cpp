@@ -73,7 +73,10 @@ class Tables {
     Py_ssize_t const given = PyObject_Size(object);
     if (given < 0) return false;
     std::int64_t const own = given == 1 && !output ? 1 : rows;
-    if (!buffer.open(object, own * columns, sizeof(double), PyBUF_C_CONTIGUOUS | (output ? PyBUF_WRITABLE : 0))) {
+    int const flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (output ? PyBUF_WRITABLE : 0);
+    if (!buffer.open(object, own * columns, sizeof(double), flags)) return false;
+    if (!buffer.is_double()) {
+      PyErr_SetString(PyExc_ValueError, "an array is not float64");
       return false;
     }
     table = Table{buffer.as<double>(), columns, own};

@@ -77,9 +77,9 @@ def kinematics(
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
     shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
     found = {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
-    inputs = [None if x is None else np.ascontiguousarray(x, np.float64).reshape(rows, dof) for x in (qpos, qvel)]
+    inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     results = [found.get(name) for name in KINEMATICS[3:]]
-    native.kinematics(own.tree, tree.link_bodies[index], rows, *inputs, tool.reshape(-1, 12), *results)
+    _call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool.reshape(-1, 12), *results)
     return tuple(found.values())
 
 
@@ -121,7 +121,7 @@ def errors(goal: Any, pose: Any, limits: tuple[Any, Any], jacobian: Any, qvel: A
         return None
     rows, dof = qvel.shape
     found = [np.empty((rows, 6)) for _ in range(3)]
-    native.errors(rows, dof, *map(_contiguous, arrays), *found)
+    _call(native.errors, rows, dof, *arrays, *found)
     return found
 
 
@@ -135,8 +135,7 @@ def projections(decoupling: str, chain: Any, arrays: tuple[Any, ...]) -> list[An
         return None
     rows, dof = arrays[3].shape
     found = [np.empty((rows, size)) for size in (6, dof, dof, dof, dof, dof, 1)]
-    chain = _contiguous(chain)[None]
-    native.projections(rows, dof, DECOUPLING.index(decoupling), chain, *map(_contiguous, arrays), *found)
+    _call(native.projections, rows, dof, DECOUPLING.index(decoupling), chain, *arrays, *found)
     found[-1] = found[-1][:, 0] > 0
     return found
 
@@ -150,8 +149,10 @@ def elementwise(function: Callable[..., list[Any]], *arrays: Any) -> list[Any]:
     given = tuple([array is not None for array in arrays])
     if len(shapes) < sum(given) or not program_status().active:
         return function(*arrays)
-    program = _program(function, given, max(shapes))
-    return list(program(*[_contiguous(array) for array in arrays if array is not None]))
+    arrays = tuple([array for array in arrays if array is not None])
+    if any([array.dtype != np.float64 for array in arrays]):
+        arrays = tuple(map(_contiguous, arrays))
+    return list(_program(function, given, max(shapes))(*arrays))
 
 
 @lru_cache(maxsize=256)
@@ -167,6 +168,14 @@ def _for_rows(like: Any, *arrays: Any) -> Any:
     """Return the extension for arrays of NumPy, where ``like`` is (envs, columns)."""
     plain = all([array is None or isinstance(array, np.ndarray) for array in arrays])
     return in_use() if plain and like.ndim == 2 else None
+
+
+def _call(function: Callable[..., None], *arguments: Any) -> None:
+    """Call a function of the extension, which takes contiguous arrays of float64 only; others are converted."""
+    try:
+        function(*arguments)
+    except (ValueError, BufferError):
+        function(*[_contiguous(one) if isinstance(one, np.ndarray) else one for one in arguments])
 
 
 def _contiguous(array: Any) -> Any:

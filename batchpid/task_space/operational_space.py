@@ -134,10 +134,13 @@ def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: A
     """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
     envs = np.shape(qpos)[0]
     for name, (value, size) in arrays.items():
-        if value is not None and np.shape(value) not in ((envs, size), (1, size)):
-            problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
+        if value is None:
+            continue
+        shape = value.shape if hasattr(value, "shape") else np.shape(value)
+        if shape not in ((envs, size), (1, size)):
+            problem = f"has shape {shape}, not ({envs}, {size})"
             raise InvalidArgumentError(name, problem, remedy="give one row for each env")
-    for name, leaf in params._asdict().items():
+    for name, leaf in zip(params._fields, params, strict=True):
         if hasattr(leaf, "shape") and leaf.shape[0] not in (1, envs):
             problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")

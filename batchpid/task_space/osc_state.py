@@ -88,7 +88,7 @@ def task_dynamics(
     """
     index = tree.index(link)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
-    chain = xp.asarray(tree.chain(link), dtype=q.dtype)
+    chain = xp.asarray(tree.chains[tree.link_bodies[index]], dtype=q.dtype)
     wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
     found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
     if found is not None:
