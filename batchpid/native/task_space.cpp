@@ -17,7 +17,8 @@ namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
 constexpr int AXES = 6, POSE = 7, SWEEPS = 12;
-constexpr double CLEAR = 1e-20;  // least entry off the diagonal that is turned away, as a share of the diagonal
+constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
+                                 // the rounding of the matrix itself
 char const *const TREE = "batchpid.KinematicTree";
 
 enum Decoupling { FULL, PARTIAL, NONE };
@@ -264,11 +265,14 @@ void eigen(Lanes (&a)[AXES][AXES], Lanes (&vectors)[AXES][AXES]) {
   for (int i = 0; i < AXES; ++i) {
     for (int j = 0; j < AXES; ++j) vectors[i][j] = i == j ? 1.0 : 0.0;
   }
+  Lanes trace{};
+  for (int i = 0; i < AXES; ++i) trace += absolute(a[i][i]);
+  Lanes const clear = CLEAR * trace;
   for (int sweep = 0; sweep < SWEEPS; ++sweep) {
     bool turned = false;
     for (int p = 0; p < AXES; ++p) {
       for (int q = p + 1; q < AXES; ++q) {
-        Lanes const off = a[p][q], clear = CLEAR * (absolute(a[p][p]) + absolute(a[q][q]));
+        Lanes const off = a[p][q];
         Lanes const turns = absolute(off) - clear;
         Lanes const cot = (a[q][q] - a[p][p]) / where_positive(turns, 2.0 * off, 1.0);
         Lanes const sum = absolute(cot) + root(cot * cot + 1.0);
