@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import SWITCH, program_status
 from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, TASK_SPACE
+from batchpid.native.task_space_extension import BODY, DECOUPLING, KINEMATICS, TASK_SPACE
 from batchpid.native.tracing import trace
 from batchpid.task_space.kinematic_tree import KinematicTree
 
@@ -97,7 +97,7 @@ def _native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
         rows.append(np.concatenate([np.ravel(part) for part in parts]))
         kinds.append((above, int(bodies.slides[joint, 0])))
     tools = np.stack([turns[body].T @ own for body, own in zip(tree.link_bodies, bodies.link_frames, strict=True)])
-    table = np.array(rows, np.float64).reshape(tree.dof, -1)
+    table = np.array(rows, np.float64).reshape(tree.dof, sum(BODY.values()))
     arguments = np.array(kinds, np.int32), table, np.array(bodies.armature), tuple(bodies.gravity.tolist())
     _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments), tools)
     return own

@@ -92,7 +92,8 @@ def task_dynamics(
     wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
     found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
     if found is not None:
-        return TaskDynamics(*found[:4], found[4] if bias is None else bias, chain)
+        pose, matrix, rate, mass, *own = found
+        return TaskDynamics(pose, matrix, rate, mass, own[0] if own else bias, chain)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         velocities = velocities_of(tree, motions, v, xp)
