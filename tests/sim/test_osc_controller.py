@@ -110,6 +110,17 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     np.testing.assert_allclose(rollout.qpos[-1, 0, 7:], [panda.start[7], 0.035], atol=1e-3)
 
 
+def test_xla_computes_the_same(panda):
+    control = OperationalSpace(panda, HAND, joints=["panda_finger_joint1"], twist=True)
+    setpoint = control.command.neutral + np.eye(14)[1] * 0.02
+    ends = []
+    for backend in ("numpy", "jax"):
+        with Runner(panda, 1, control=control, backend=backend, **OPTIONS) as runner:
+            runner.reset(START)
+            ends.append(runner.rollout(np.broadcast_to(setpoint, (10, 14))).qpos[-1])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
 def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
     point = [0.0, 0.0, 0.1]
     control = OperationalSpace(panda, HAND, point=point, posture=START)
