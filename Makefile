@@ -21,7 +21,8 @@ PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
 ARGS :=
 
 # Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
-NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py sim/engine/native/interface.py \
+NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py batchpid/native/task_space_extension.py \
+	sim/engine/native/interface.py \
 	$(foreach room,batchpid/native sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 

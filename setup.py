@@ -14,7 +14,12 @@ REQUIRED = os.environ.get("BATCHPID_REQUIRE_NATIVE", "0")
 """Environment variable: "1" makes an extension that cannot be built an error, as for wheels that are published."""
 if REQUIRED not in ("0", "1"):
     sys.exit(f"batchpid: BATCHPID_REQUIRE_NATIVE is {REQUIRED!r}; set it to 1, or to 0 for a build without a compiler")
-MODULES = ("batchpid.native.extensions", "batchpid.native.operations", "batchpid.sim.engine.native.interface")
+MODULES = (
+    "batchpid.native.extensions",
+    "batchpid.native.operations",
+    "batchpid.native.task_space_extension",
+    "batchpid.sim.engine.native.interface",
+)
 """Definitions of the extensions, each after those that it imports."""
 
 

@@ -31,6 +31,7 @@ from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
+from batchpid.sim.operational_space import OperationalSpace
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
@@ -64,6 +65,7 @@ __all__ = [
     "MujocoSolver",
     "Normal",
     "Observation",
+    "OperationalSpace",
     "Physics",
     "Randomization",
     "Ray",

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
 from batchpid.errors import InvalidArgumentError
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
@@ -171,6 +172,9 @@ class _Search:
     def _error(self, goal: Float64, qpos: Float64) -> tuple[Float64, Float64]:
         """Return the errors (n, 6) and Jacobians (n, 6, dof)."""
         tree, bodies = self._tree, self._tree.bodies
+        found = native_rows.kinematics(tree, ("pose", "jacobian"), qpos, None, self._index, self._point)
+        if found is not None:
+            return pose_error(goal, found[0]), found[1]
         motions = motions_of(tree, bodies, qpos, np)
         tool = tool_frame(tree, bodies, motions.frames, self._index, self._point)
         return pose_error(goal, pose_of(tool)), jacobian_at(tree, bodies, motions, self._index, tool[..., 3])

@@ -157,8 +157,14 @@ class KinematicTree:
 
     def chain(self, link: str) -> NDArray[np.bool_]:
         """Return the mask (dof,) of the joints between the base and ``link``."""
-        body = self.link_bodies[self.index(link)]
-        return self.bodies.moves[body] > 0 if body >= 0 else np.zeros(self.dof, bool)
+        return self.chains[self.link_bodies[self.index(link)]] > 0
+
+    @cached_property
+    def chains(self) -> Float64:
+        """1.0 for the joints between the base and each body (dof + 1, dof); the last row is that of the base, -1."""
+        rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
+        rows.setflags(write=False)
+        return rows
 
     @property
     def link_bodies(self) -> tuple[int, ...]:

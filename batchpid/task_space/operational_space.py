@@ -31,17 +31,21 @@ IEEE Journal on Robotics and Automation 3 (1987).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.kinematic_tree import KinematicTree
-from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.native_rows import elementwise
+from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
-from batchpid.task_space.symmetric import bounded_inverse, gram, product, quiet, whitened
+from batchpid.task_space.projections import projections
+from batchpid.task_space.symmetric import product, quiet
 
 
 def init(params: OSCParams, qpos: Any) -> OSCState:
@@ -130,10 +134,13 @@ def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: A
     """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
     envs = np.shape(qpos)[0]
     for name, (value, size) in arrays.items():
-        if value is not None and np.shape(value) not in ((envs, size), (1, size)):
-            problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
+        if value is None:
+            continue
+        shape = value.shape if hasattr(value, "shape") else np.shape(value)
+        if shape not in ((envs, size), (1, size)):
+            problem = f"has shape {shape}, not ({envs}, {size})"
             raise InvalidArgumentError(name, problem, remedy="give one row for each env")
-    for name, leaf in params._asdict().items():
+    for name, leaf in zip(params._fields, params, strict=True):
         if hasattr(leaf, "shape") and leaf.shape[0] not in (1, envs):
             problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")
@@ -153,80 +160,37 @@ def _advance(
     terms: bool,
 ) -> Any:
     xp = namespace(*k, *state, *d, setpoint, q, v, twist, acceleration, wrench, feedforward)
-    error = pose_error(setpoint, d.pose)
+    error, near, tool_twist = _errors(k, d, setpoint, v, xp)
+    rate = -tool_twist if twist is None else twist - tool_twist
     if k.frame is not None:
         turn = matrix_of(d.pose[..., 3:])
-        error, twist, acceleration = (
-            None if x is None else in_axes(turn, x[..., None])[..., 0] for x in (error, twist, acceleration)
+        error, near, rate, acceleration = (
+            None if x is None else in_axes(turn, x[..., None])[..., 0] for x in (error, near, rate, acceleration)
         )
         d = in_tool_axes(d)
-    j, m = d.jacobian, d.mass_matrix
-    limits = (k.position_error_limit, k.rotation_error_limit)
-    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
-    rate = -product(j, v) if twist is None else twist - product(j, v)
-    a = k.stiffness * xp.concatenate(near, axis=-1) + k.damping * rate
-    a = a if acceleration is None else a + acceleration
-
-    chain, eye = d.chain, xp.eye(m.shape[-1], dtype=m.dtype)
-    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
-    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
-    task_inertia, null_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
-    f = product(task_inertia, a - d.jacobian_rate) if task_inertia is not None else _selected(k.axes, a)
-    f = f if wrench is None else f + wrench
-    task = gram(j, f[..., None])[..., 0]
-
-    a_n = k.posture_stiffness * (state.posture - q) - k.posture_damping * v
-    a_c, a_o = a_n * chain, a_n * (1 - chain)
-    null = product(m, a_c) - gram(j, product(null_inertia, product(j, a_c))[..., None])[..., 0]
-    null = null * chain
-    base = d.bias + product(m, a_o)
-    base = base if feedforward is None else base + feedforward
-
-    s1, s2 = _shares(base, task, null, k, xp)
-    driven = s1[..., None] * task + s2[..., None] * null
-    inverse_root = y[..., 6:]
-    a_c = chain * gram(inverse_root, product(inverse_root, driven)[..., None])[..., 0]
-    others = (1 - chain) * product(m, a_c)
-    effort = clip(base + driven + others, k.effort_min, k.effort_max, xp)
+    (a,) = elementwise(_accelerations, k.stiffness, k.damping, near, rate, acceleration)
+    (a_n,) = elementwise(_posture_accelerations, k.posture_stiffness, k.posture_damping, state.posture, q, v)
+    p = projections(k, d, a, a_n, wrench, feedforward)
+    parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
     if not terms:
-        return state, effort
-    whole = base + task + null + others
-    return state, effort, OSCTerms(error, f, task, null, whole, effort.copy(), s1, s2, singular)
+        return state, elementwise(_effort, *parts)[0]
+    effort, whole, s1, s2 = elementwise(_saturated, *parts)
+    return (
+        state,
+        effort,
+        OSCTerms(error, p.force, p.task, p.posture, whole, effort.copy(), s1[..., 0], s2[..., 0], p.near_singular),
+    )
 
 
-def _inertias(k: OSCParams, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
-    """Return L, None with decoupling "none", and L_n of the mobility A (envs, 6, 6), and where either is bounded."""
-    s0 = k.smallest_eigenvalue[..., 0]
-    allowed = k.axes
-    if k.force_axes is not None and k.axes is not None:
-        allowed = xp.maximum(k.axes, k.force_axes)
-    null, near = _selected_inverse(mobility, allowed, s0, xp)
-    if isinstance(k.decoupling, NoDecoupling):
-        return None, null, near
-    partial = isinstance(k.decoupling, PartialDecoupling)
-    if allowed is k.axes and not partial:
-        return null, null, near
-    if partial:
-        half = xp.asarray([1.0] * 3 + [0.0] * 3, dtype=mobility.dtype)
-        mobility = mobility * (half[:, None] * half + (1 - half)[:, None] * (1 - half))
-    task, bounded = _selected_inverse(mobility, k.axes, s0, xp)
-    return task, null, near | bounded
-
-
-def _selected_inverse(mobility: Any, axes: Any, smallest: Any, xp: Any) -> tuple[Any, Any]:
-    """Return S^T (S A S^T)^-1 S, bounded, for the selected ``axes`` (1 | envs, 6), and where it is bounded."""
-    if axes is None:
-        return bounded_inverse(mobility, smallest)
-    both = axes[..., :, None] * axes[..., None, :] > 0
-    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
-    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
-    alone = free * xp.maximum(smallest, 1.0)[..., None, None]
-    inverse, near = bounded_inverse(xp.where(both, mobility, alone), smallest)
-    return xp.where(both, inverse, xp.zeros_like(inverse)), near
-
-
-def _selected(axes: Any, vector: Any) -> Any:
-    return vector if axes is None else axes * vector
+def _errors(k: OSCParams, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
+    """Return the error (envs, 6), the same with limited norms, and the twist of the tool J q', in the world."""
+    limits = k.position_error_limit, k.rotation_error_limit
+    found = native_rows.errors(setpoint, d.pose, limits, d.jacobian, v)
+    if found is not None:
+        return found
+    error = pose_error(setpoint, d.pose)
+    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
+    return error, xp.concatenate(near, axis=-1), product(d.jacobian, v)
 
 
 def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
@@ -236,17 +200,37 @@ def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def _shares(base: Any, task: Any, null: Any, k: OSCParams, xp: Any) -> tuple[Any, Any]:
-    """Return s1 and s2 (envs,)."""
-    low = -xp.inf if k.effort_min is None else k.effort_min
-    high = xp.inf if k.effort_max is None else k.effort_max
-    able = (base >= low) & (base <= high)
+def _accelerations(kp: Any, kd: Any, near: Any, rate: Any, acceleration: Any) -> list[Any]:
+    """Return a (envs, 6)."""
+    a = kp * near + kd * rate
+    return [a if acceleration is None else a + acceleration]
+
+
+def _posture_accelerations(kp: Any, kd: Any, posture: Any, q: Any, v: Any) -> list[Any]:
+    """Return a_n (envs, dof)."""
+    return [kp * (posture - q) - kd * v]
+
+
+def _effort(*parts: Any) -> list[Any]:
+    return _saturated(*parts)[:1]
+
+
+def _saturated(
+    base: Any, task: Any, null: Any, task_of_others: Any, null_of_others: Any, low: Any, high: Any
+) -> list[Any]:
+    """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
+    xp = namespace(base, task, null, task_of_others, null_of_others, low, high)
+    least, most = -math.inf if low is None else low, math.inf if high is None else high
+    able = (base >= least) & (base <= most)
 
     def share(effort: Any, at: Any) -> Any:
-        room = xp.maximum(xp.where(effort > 0, high - at, at - low), 0.0)
+        room = xp.maximum(xp.where(effort > 0, most - at, at - least), 0.0)
         size = xp.abs(effort)
         limited = able & (size > room)
-        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1)
+        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(axis=-1, keepdims=True)
 
     s1 = share(task, base)
-    return s1, share(null, base + s1[..., None] * task)
+    s2 = share(null, base + s1 * task)
+    others = s1 * task_of_others + s2 * null_of_others
+    effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
+    return [effort, base + task + null + others, s1, s2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_of
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.symmetric import quiet
@@ -14,6 +15,7 @@ from batchpid.task_space.tree_kinematics import (
     motions_of,
     prepared,
     rate_at,
+    read_point,
     tool_frame,
     velocities_of,
 )
@@ -72,10 +74,12 @@ class OSCTerms(NamedTuple):
         return array_summary(self, "envs", "joints")
 
 
-def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None) -> TaskDynamics:
+def task_dynamics(
+    tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, bias: Any = None
+) -> TaskDynamics:
     """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
 
-    ``qpos`` and ``qvel`` are (envs, dof).
+    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the place of the tree's.
 
     Raises
     ------
@@ -84,6 +88,12 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
     """
     index = tree.index(link)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    chain = xp.asarray(tree.chains[tree.link_bodies[index]], dtype=q.dtype)
+    wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
+    found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
+    if found is not None:
+        pose, matrix, rate, mass, *own = found
+        return TaskDynamics(pose, matrix, rate, mass, own[0] if own else bias, chain)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         velocities = velocities_of(tree, motions, v, xp)
@@ -93,8 +103,8 @@ def task_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point
             jacobian=jacobian_at(tree, bodies, motions, index, tool[..., 3]),
             jacobian_rate=rate_at(tree, velocities, index, tool[..., 3]),
             mass_matrix=mass_matrix_of(tree, bodies, motions, xp),
-            bias=effort_of(tree, bodies, motions, velocities, xp),
-            chain=xp.asarray(tree.chain(link), dtype=q.dtype),
+            bias=effort_of(tree, bodies, motions, velocities, xp) if bias is None else bias,
+            chain=chain,
         )
 
 

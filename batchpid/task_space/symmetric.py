@@ -15,8 +15,8 @@ import numpy as np
 from batchpid.arrays.elementwise import namespace
 from batchpid.errors import InvalidArgumentError
 
-SWEEPS = 7
-"""Sweeps of Jacobi's method; convergence is quadratic, and matrices of six rows need five at most."""
+SWEEPS = 12
+"""Sweeps of Jacobi's method; matrices of six rows need five, or twelve where several eigenvalues are 0."""
 
 
 def quiet() -> np.errstate:

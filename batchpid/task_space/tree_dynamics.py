@@ -19,9 +19,10 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, multiply, rotate
 from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
-from batchpid.task_space.symmetric import quiet, solve
+from batchpid.task_space.symmetric import product, quiet, solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
     Velocities,
@@ -42,6 +43,8 @@ def mass_matrix(tree: KinematicTree, qpos: Any) -> Any:
         The shape is wrong.
     """
     (q,), bodies, xp = prepared(tree, qpos=qpos)
+    if (found := native_rows.kinematics(tree, ("mass_matrix",), q)) is not None:
+        return found[0]
     with quiet():
         return mass_matrix_of(tree, bodies, motions_of(tree, bodies, q, xp), xp)
 
@@ -55,6 +58,8 @@ def bias(tree: KinematicTree, qpos: Any, qvel: Any) -> Any:
         A shape is wrong.
     """
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    if (found := native_rows.kinematics(tree, ("bias",), q, v)) is not None:
+        return found[0]
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         return effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)
@@ -74,6 +79,9 @@ def inverse_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, qacc: Any) -> An
         A shape is wrong.
     """
     (q, v, a), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)
+    if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
+        with quiet():
+            return product(found[0], a) + found[1]
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         still = velocities_of(tree, motions, v, xp)
@@ -94,6 +102,9 @@ def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> 
     """
     check_masses(tree)
     (q, v, u), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)
+    if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
+        with quiet():
+            return solve(found[0], (u - found[1])[..., None])[..., 0]
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         force = effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)

@@ -25,7 +25,8 @@ import numpy as np
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import choice, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.frames import cross, in_axes, pose_of, rotate, turned
+from batchpid.task_space import native_rows
+from batchpid.task_space.frames import cross, in_axes, matrix_of, pose_of, rotate, turned
 from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
 from batchpid.task_space.symmetric import quiet
 
@@ -66,6 +67,10 @@ def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = Non
         raise InvalidArgumentError("links", "must be a list of names", value=links, remedy=f"pass [{links!r}]")
     indices = [tree.index(link) for link in chosen]
     (q,), bodies, xp = prepared(tree, qpos=qpos)
+    found = [native_rows.kinematics(tree, ("pose",), q, None, index) for index in indices]
+    poses = [each[0] for each in found if each is not None]
+    if len(poses) == len(indices):
+        return np.stack(poses, axis=-2)
     frames = frames_of_bodies(tree, bodies, q, xp)
     with quiet():
         return xp.stack([pose_of(frame_of_link(tree, bodies, frames, index)) for index in indices], axis=-2)
@@ -88,6 +93,10 @@ def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, fr
     """
     index, _ = tree.index(link), choice("frame", frame, FRAMES)
     (q,), bodies, xp = prepared(tree, qpos=qpos)
+    found = native_rows.kinematics(tree, ("pose", "jacobian"), q, None, index, read_point(q, point))
+    if found is not None:
+        pose, matrix = found
+        return matrix if frame == "world" else in_axes(matrix_of(pose[..., 3:]), matrix)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         tool = tool_frame(tree, bodies, motions.frames, index, point)
@@ -105,6 +114,10 @@ def jacobian_rate(
     """
     index, _ = tree.index(link), choice("frame", frame, FRAMES)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    found = native_rows.kinematics(tree, ("pose", "jacobian_rate"), q, v, index, read_point(q, point))
+    if found is not None:
+        pose, rate = found
+        return rate if frame == "world" else in_axes(matrix_of(pose[..., 3:]), rate[..., None])[..., 0]
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         tool = tool_frame(tree, bodies, motions.frames, index, point)
@@ -191,13 +204,21 @@ def tool_frame(tree: KinematicTree, bodies: Bodies, frames: Any, index: int, poi
     frame = frame_of_link(tree, bodies, frames, index)
     if point is None:
         return frame
-    xp = namespace(frame, point)
-    at = read_array("point", point).astype(np.float64, copy=False) if xp is np else xp.asarray(point, frame.dtype)
-    if at.shape not in ((3,), (*frame.shape[:-2], 3)):
-        problem = f"has shape {at.shape}, not (3,) or {(*frame.shape[:-2], 3)}"
-        raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
+    xp, at = namespace(frame, point), read_point(frame[..., 0, :], point)
     place = rotate(frame[..., :3], at + xp.zeros_like(frame[..., 3])) + frame[..., 3]
     return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
+
+
+def read_point(like: Any, point: Any) -> Any:
+    """Return ``point`` as a checked array (3,) or (..., 3), where ``like`` is (..., n); None where it is None."""
+    if point is None:
+        return None
+    xp = namespace(like, point)
+    at = read_array("point", point).astype(np.float64, copy=False) if xp is np else xp.asarray(point, like.dtype)
+    if at.shape not in ((3,), (*like.shape[:-1], 3)):
+        problem = f"has shape {at.shape}, not (3,) or {(*like.shape[:-1], 3)}"
+        raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
+    return at
 
 
 def jacobian_at(tree: KinematicTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.native.task_space_extension import BODY
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.native.interface import BODY
 
 Float64 = NDArray[np.float64]
 

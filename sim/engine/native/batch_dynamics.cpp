@@ -3,45 +3,16 @@
 
 #include <algorithm>
 #include <memory>
+#include <vector>
 
-#include "buffer.h"
+#include "batchpid/native/buffer.h"
 #include "batchpid/native/extension.h"
-#include "rigid_body.h"
+#include "batchpid/native/lanes.h"
+#include "batchpid/native/rigid_body.h"
 
 using namespace batchpid;
 
 namespace {
-
-// Compile a function twice, for processors with AVX2 and without; the results are the same, since no operation is fused.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2"), flatten))
-#else
-#define FOR_EACH_PROCESSOR
-#endif
-
-constexpr int WIDTH = 4;
-
-// Numbers of WIDTH robots. Each is rounded as a double is, so that results do not depend on a robot's company.
-struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherwise with AVX2 than without
-  typedef double Packed __attribute__((vector_size(WIDTH * sizeof(double))));
-  Packed of;
-
-  Lanes() : of{} {}
-  Lanes(Packed packed) : of(packed) {}
-  Lanes(double each) : of(Packed{} + each) {}
-  void operator+=(Lanes b) { of += b.of; }
-  void operator-=(Lanes b) { of -= b.of; }
-  friend Lanes operator-(Lanes a) { return -a.of; }
-  friend Lanes operator+(Lanes a, Lanes b) { return a.of + b.of; }
-  friend Lanes operator-(Lanes a, Lanes b) { return a.of - b.of; }
-  friend Lanes operator*(Lanes a, Lanes b) { return a.of * b.of; }
-  friend Lanes operator/(Lanes a, Lanes b) { return a.of / b.of; }
-  friend Lanes at_least(Lanes a, Lanes low) { return a.of < low.of ? low.of : a.of; }
-  friend Lanes at_most(Lanes a, Lanes high) { return a.of > high.of ? high.of : a.of; }
-  friend Lanes zero_outside(Lanes a, Lanes low, Lanes q, Lanes high) {
-    return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
-  }
-};
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
 char const *const TREE = "batchpid.Tree";
@@ -102,18 +73,6 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
     return nullptr;
   }
   return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
-}
-
-// Copy a column of each of WIDTH rows, from row `first` on; the last row stands for those that there are not.
-Lanes gather(double const *table, std::int64_t columns, std::int64_t column, std::int64_t first, std::int64_t rows) {
-  Lanes out;
-  for (int k = 0; k < WIDTH; ++k) out.of[k] = table[std::min(first + k, rows - 1) * columns + column];
-  return out;
-}
-
-void scatter(Lanes value, double *table, std::int64_t columns, std::int64_t column, std::int64_t first,
-             std::int64_t rows) {
-  for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = value.of[k];
 }
 
 // Set positions, velocities, cosines and sines of all joints from those of the logged ones.
@@ -194,36 +153,6 @@ PyObject *dynamics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Replace a symmetric positive definite matrix (n, n) by its inverse, by Cholesky's factor; nan if it is not definite.
-void invert(std::int64_t n, std::vector<Lanes> &matrix, std::vector<Lanes> &factor) {
-  auto const root = [](Lanes x) {
-    for (int k = 0; k < WIDTH; ++k) x.of[k] = std::sqrt(x.of[k]);
-    return x;
-  };
-  Lanes *a = matrix.data(), *l = factor.data();
-  for (std::int64_t j = 0; j < n; ++j) {  // L, with the inverses of its diagonal
-    for (std::int64_t i = j; i < n; ++i) {
-      Lanes sum = a[i * n + j];
-      for (std::int64_t k = 0; k < j; ++k) sum -= l[i * n + k] * l[j * n + k];
-      l[i * n + j] = i == j ? 1.0 / root(sum) : sum * l[j * n + j];
-    }
-  }
-  for (std::int64_t j = 0; j < n; ++j) {  // L^-1, below the diagonal
-    for (std::int64_t i = j + 1; i < n; ++i) {
-      Lanes sum = l[i * n + j] * l[j * n + j];
-      for (std::int64_t k = j + 1; k < i; ++k) sum += l[i * n + k] * l[k * n + j];
-      l[i * n + j] = -sum * l[i * n + i];
-    }
-  }
-  for (std::int64_t i = 0; i < n; ++i) {
-    for (std::int64_t j = 0; j <= i; ++j) {
-      Lanes sum{};
-      for (std::int64_t k = i; k < n; ++k) sum += l[k * n + i] * l[k * n + j];
-      a[i * n + j] = a[j * n + i] = sum;
-    }
-  }
-}
-
 // Arrays of `step`: STEP in interface.py.
 enum Leaf { QPOS, QVEL, FRICTION, MATRIX, EFFORT, ADDED, LIMIT, KEEP, CREEP, LOW, HIGH, LEAVES };
 
@@ -243,7 +172,7 @@ FOR_EACH_PROCESSOR void step_rows(std::int64_t rows, std::int64_t joints, double
       inverse[k] = gather(table[MATRIX], joints * joints, k, first, rows);
     }
     for (std::int64_t j = 0; j < joints; ++j) inverse[j * joints + j] += at(ADDED, j);
-    invert(joints, inverse, factor);
+    invert(joints, inverse.data(), factor.data());
     Lanes const keep = gather(table[KEEP], 1, 0, first, rows);
     for (std::int64_t j = 0; j < joints; ++j) effort[j] = at(EFFORT, j);
     for (std::int64_t j = 0; j < joints; ++j) {

@@ -10,7 +10,7 @@
 #include <typeinfo>
 #include <vector>
 
-#include "buffer.h"
+#include "batchpid/native/buffer.h"
 
 namespace sapien::physx {
 class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used

@@ -1,7 +1,7 @@
 """Interface between Python and the native extensions: files, flags and tables.
 
 The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` imports this module without its
-package, so it may import only that module, :mod:`batchpid.native.operations` and the standard library.
+package, so it may import only that module, others that it lists before this one, and the standard library.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
 from batchpid.native.operations import HEADERS, PROGRAM
+from batchpid.native.task_space_extension import BODY, BUFFER, LANES, RIGID_BODY
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -22,8 +23,6 @@ SYMBOLS = (
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 STATUS = ("left_region", "contacts", "not_finite", "too_fast", "failed")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
-BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
-"""Numbers in a row of constants of a body, as BodyRow in rigid_body.h."""
 DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
 """Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
 STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
@@ -108,14 +107,14 @@ EXTENSIONS = {
         (
             *_files(
                 "gateway.cpp",
-                "buffer.h",
                 "gateway.h",
                 "mujoco_step.h",
-                "rigid_body.h",
                 "sim_step.h",
                 "tick.h",
                 "xla_call.h",
             ),
+            BUFFER,
+            RIGID_BODY,
             *HEADERS,
         ),
         (*ROUNDED, "-pthread"),
@@ -123,7 +122,7 @@ EXTENSIONS = {
     ),
     "_batch_dynamics": Extension(
         "batchpid.sim.engine.native._batch_dynamics",
-        _files("batch_dynamics.cpp", "buffer.h", "rigid_body.h"),
+        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY),
         (*ROUNDED, "-Wno-psabi"),
         _batch_dynamics_tables,
     ),

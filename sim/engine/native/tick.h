@@ -6,7 +6,7 @@
 #pragma once
 
 #include "batchpid/native/make_program.h"
-#include "rigid_body.h"
+#include "batchpid/native/rigid_body.h"
 #include "sim_step.h"
 
 #pragma GCC visibility push(hidden)

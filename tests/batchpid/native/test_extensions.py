@@ -19,12 +19,13 @@ from batchpid.native import array_program, availability, extensions, operations
 from batchpid.native.availability import every_operation, first_difference, program_status
 from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
 from batchpid.native.operations import OPERATIONS, PROGRAM
+from batchpid.native.task_space_extension import TASK_SPACE
 from batchpid.native.tracing import Namespace, Symbol, trace
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no compiler")
-ALL = {each.name: each for each in (PROGRAM, *EXTENSIONS.values())}
+ALL = {each.name: each for each in (PROGRAM, TASK_SPACE, *EXTENSIONS.values())}
 PERMUTED = (*OPERATIONS[:4], *OPERATIONS[5:3:-1], *OPERATIONS[6:])
 """With maximum and minimum exchanged."""
 

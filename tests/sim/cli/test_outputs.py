@@ -22,6 +22,7 @@ WORDS = {
     "bench": ("bench",),
     "tune": ("tune", "arm.urdf"),
     "compare": ("compare", "arm.urdf"),
+    "parity": ("parity", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.npz"),

@@ -29,6 +29,8 @@ class Buffer {
   T *as() const {
     return static_cast<T *>(view_.buf);
   }
+  // Whether the numbers are doubles, for a buffer opened with PyBUF_FORMAT.
+  bool is_double() const { return view_.format != nullptr && view_.format[0] == 'd' && view_.format[1] == '\0'; }
   Py_ssize_t itemsize() const { return view_.itemsize; }
 
  private:

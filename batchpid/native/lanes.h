@@ -1,0 +1,127 @@
+// Numbers of several robots at once, and linear algebra on small matrices of them.
+
+#pragma once
+
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+// Compile a function twice, for processors with AVX2 and without; the results are the same, since no operation is fused.
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("default", "avx2"), flatten))
+#else
+#define FOR_EACH_PROCESSOR
+#endif
+
+constexpr int WIDTH = 4;
+
+// Numbers of WIDTH robots. Each is rounded as a double is, so that results do not depend on a robot's company.
+struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherwise with AVX2 than without
+  typedef double Packed __attribute__((vector_size(WIDTH * sizeof(double))));
+  Packed of;
+
+  Lanes() : of{} {}
+  Lanes(Packed packed) : of(packed) {}
+  Lanes(double each) : of(Packed{} + each) {}
+  void operator+=(Lanes b) { of += b.of; }
+  void operator-=(Lanes b) { of -= b.of; }
+  friend Lanes operator-(Lanes a) { return -a.of; }
+  friend Lanes operator+(Lanes a, Lanes b) { return a.of + b.of; }
+  friend Lanes operator-(Lanes a, Lanes b) { return a.of - b.of; }
+  friend Lanes operator*(Lanes a, Lanes b) { return a.of * b.of; }
+  friend Lanes operator/(Lanes a, Lanes b) { return a.of / b.of; }
+  friend Lanes at_least(Lanes a, Lanes low) { return a.of < low.of ? low.of : a.of; }
+  friend Lanes at_most(Lanes a, Lanes high) { return a.of > high.of ? high.of : a.of; }
+  friend Lanes zero_outside(Lanes a, Lanes low, Lanes q, Lanes high) {
+    return (q.of < low.of) | (q.of > high.of) ? Packed{} : a.of;
+  }
+  friend Lanes where_positive(Lanes mask, Lanes a, Lanes b) { return mask.of > 0.0 ? a.of : b.of; }
+  // 1.0 where a >= b, else 0.0, also for nan.
+  friend Lanes at_least_mask(Lanes a, Lanes b) { return a.of >= b.of ? Packed{} + 1.0 : Packed{}; }
+  friend Lanes absolute(Lanes a) { return a.of < 0.0 ? -a.of : a.of; }
+  friend Lanes root(Lanes x) {
+    for (int k = 0; k < WIDTH; ++k) x.of[k] = std::sqrt(x.of[k]);
+    return x;
+  }
+};
+
+// Copy a column of each of WIDTH rows, from row `first` on; the last row stands for those that there are not.
+inline Lanes gather(double const *table, std::int64_t columns, std::int64_t column, std::int64_t first,
+                    std::int64_t rows) {
+  Lanes out;
+  for (int k = 0; k < WIDTH; ++k) out.of[k] = table[std::min(first + k, rows - 1) * columns + column];
+  return out;
+}
+
+inline void scatter(Lanes value, double *table, std::int64_t columns, std::int64_t column, std::int64_t first,
+                    std::int64_t rows) {
+  for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = value.of[k];
+}
+
+// Overwrite the lower triangle of a symmetric matrix (n, n) by Cholesky's factor L, with the inverses of its diagonal;
+// nan if it is not definite. Inner loops have independent sums: a chain of dependent ones takes four times as long.
+inline void cholesky(std::int64_t n, Lanes *a) {
+  for (std::int64_t j = 0; j < n; ++j) {
+    a[j * n + j] = 1.0 / root(a[j * n + j]);
+    for (std::int64_t i = j + 1; i < n; ++i) {
+      Lanes const factor = a[i * n + j] = a[i * n + j] * a[j * n + j];
+      for (std::int64_t k = j + 1; k <= i; ++k) a[i * n + k] -= factor * a[k * n + j];
+    }
+  }
+}
+
+// Replace a symmetric positive definite matrix (n, n) by its inverse, by Cholesky's factor; nan if it is not definite.
+inline void invert(std::int64_t n, Lanes *a, Lanes *l) {
+  cholesky(n, a);
+  for (std::int64_t i = 0; i < n; ++i) {  // L^-1
+    Lanes *row = l + i * n;
+    for (std::int64_t j = 0; j < i; ++j) row[j] = a[i * n + j] * l[j * n + j];
+    for (std::int64_t k = 0; k < i; ++k) {
+      for (std::int64_t j = 0; j < k; ++j) row[j] += a[i * n + k] * l[k * n + j];
+    }
+    for (std::int64_t j = 0; j < i; ++j) row[j] = -row[j] * a[i * n + i];
+    row[i] = a[i * n + i];
+  }
+  for (std::int64_t i = 0; i < n * n; ++i) a[i] = {};
+  for (std::int64_t k = 0; k < n; ++k) {
+    for (std::int64_t i = 0; i <= k; ++i) {
+      for (std::int64_t j = 0; j <= i; ++j) a[i * n + j] += l[k * n + i] * l[k * n + j];
+    }
+  }
+  for (std::int64_t i = 0; i < n; ++i) {
+    for (std::int64_t j = 0; j < i; ++j) a[j * n + i] = a[i * n + j];
+  }
+}
+
+// Solve L Y = X in place, with the factor of `cholesky`, for X (n, columns).
+template <int columns>
+void solve_lower(std::int64_t n, Lanes const *l, Lanes *x) {
+  for (std::int64_t i = 0; i < n; ++i) {
+    for (std::int64_t k = 0; k < i; ++k) {
+      for (int c = 0; c < columns; ++c) x[i * columns + c] -= l[i * n + k] * x[k * columns + c];
+    }
+    for (int c = 0; c < columns; ++c) x[i * columns + c] = x[i * columns + c] * l[i * n + i];
+  }
+}
+
+// Solve L^T Y = X in place.
+template <int columns>
+void solve_upper(std::int64_t n, Lanes const *l, Lanes *x) {
+  for (std::int64_t i = n - 1; i >= 0; --i) {
+    for (std::int64_t k = i + 1; k < n; ++k) {
+      for (int c = 0; c < columns; ++c) x[i * columns + c] -= l[k * n + i] * x[k * columns + c];
+    }
+    for (int c = 0; c < columns; ++c) x[i * columns + c] = x[i * columns + c] * l[i * n + i];
+  }
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop

@@ -1,0 +1,39 @@
+"""The extension for kinematics and operational space of many robots, and the headers of rigid bodies.
+
+``setup.py`` imports this module without its package: it may import the standard library and the module of extensions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.native.extensions import ROUNDED, Extension
+
+BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
+"""Numbers in a row of constants of a body, as BodyRow in rigid_body.h."""
+KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias")
+"""Arrays of ``kinematics`` in task_space.cpp, after the tree and the body of the tool; those after the tool are
+results."""
+PROJECTIONS = (
+    *("chain", "jacobian", "jacobian_rate", "mass_matrix", "bias", "acceleration", "posture_acceleration", "wrench"),
+    *("feedforward", "axes", "force_axes", "smallest_eigenvalue"),
+    *("force", "task", "posture", "base", "task_of_others", "posture_of_others", "near_singular"),
+)
+"""Arrays of ``projections``; those after the smallest eigenvalue are results."""
+DECOUPLING = ("full", "partial", "none")
+"""Kinds of decoupling, as Decoupling in task_space.cpp."""
+
+BUFFER, LANES, RIGID_BODY = (f"batchpid/native/{name}" for name in ("buffer.h", "lanes.h", "rigid_body.h"))
+
+
+def _tables() -> tuple[Any, ...]:
+    return list(BODY.items()), KINEMATICS, PROJECTIONS, DECOUPLING
+
+
+TASK_SPACE = Extension(
+    "batchpid.native._task_space",
+    ("batchpid/native/task_space.cpp", "batchpid/native/extension.h", BUFFER, LANES, RIGID_BODY),
+    (*ROUNDED, "-Wno-psabi"),
+    _tables,
+)
+EXTENSIONS = {TASK_SPACE.name: TASK_SPACE}

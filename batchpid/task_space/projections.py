@@ -1,0 +1,103 @@
+"""Inertia of the tool, and the efforts of accelerations of the task and of the posture.
+
+The equations stand in :mod:`batchpid.task_space.operational_space`, with their symbols.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.elementwise import namespace
+from batchpid.task_space import native_rows
+from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_state import TaskDynamics
+from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
+
+
+class Projections(NamedTuple):
+    """Efforts before saturation, arrays (envs, dof)."""
+
+    force: Any
+    """Wrench F of the task (envs, 6)."""
+    task: Any
+    """J^T F."""
+    posture: Any
+    """N^T M_cc a_n of the chain."""
+    base: Any
+    """h + M a_o + feedforward."""
+    task_of_others: Any
+    """M_oc M_cc^-1 task."""
+    posture_of_others: Any
+    """M_oc M_cc^-1 posture."""
+    near_singular: Any
+    """Whether L or L_n is bounded (envs,)."""
+
+
+def projections(
+    k: OSCParams, d: TaskDynamics, a: Any, a_n: Any, wrench: Any = None, feedforward: Any = None
+) -> Projections:
+    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture."""
+    kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
+    dynamics = d.jacobian, d.jacobian_rate, d.mass_matrix, d.bias
+    options = k.axes, k.force_axes, k.smallest_eigenvalue
+    found = native_rows.projections(kind, d.chain, (*dynamics, a, a_n, wrench, feedforward, *options))
+    if found is not None:
+        return Projections(*found)
+    xp = namespace(*k, *d, a, a_n, wrench, feedforward)
+    j, m, chain = d.jacobian, d.mass_matrix, d.chain
+    eye = xp.eye(m.shape[-1], dtype=m.dtype)
+    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
+    y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
+    task_inertia, null_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
+    f = product(task_inertia, a - d.jacobian_rate) if task_inertia is not None else _selected(k.axes, a)
+    f = f if wrench is None else f + wrench
+    task = gram(j, f[..., None])[..., 0]
+
+    a_c, a_o = a_n * chain, a_n * (1 - chain)
+    null = product(m, a_c) - gram(j, product(null_inertia, product(j, a_c))[..., None])[..., 0]
+    null = null * chain
+    base = d.bias + product(m, a_o)
+    base = base if feedforward is None else base + feedforward
+
+    inverse_root = y[..., 6:]
+
+    def of_others(effort: Any) -> Any:
+        moved = chain * gram(inverse_root, product(inverse_root, effort)[..., None])[..., 0]
+        return (1 - chain) * product(m, moved)
+
+    return Projections(f, task, null, base, of_others(task), of_others(null), singular)
+
+
+def _inertias(k: OSCParams, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
+    """Return L, None with decoupling "none", and L_n of the mobility A (envs, 6, 6), and where either is bounded."""
+    s0 = k.smallest_eigenvalue[..., 0]
+    allowed = k.axes
+    if k.force_axes is not None and k.axes is not None:
+        allowed = xp.maximum(k.axes, k.force_axes)
+    null, near = _selected_inverse(mobility, allowed, s0, xp)
+    if isinstance(k.decoupling, NoDecoupling):
+        return None, null, near
+    partial = isinstance(k.decoupling, PartialDecoupling)
+    if allowed is k.axes and not partial:
+        return null, null, near
+    if partial:
+        half = xp.asarray([1.0] * 3 + [0.0] * 3, dtype=mobility.dtype)
+        mobility = mobility * (half[:, None] * half + (1 - half)[:, None] * (1 - half))
+    task, bounded = _selected_inverse(mobility, k.axes, s0, xp)
+    return task, null, near | bounded
+
+
+def _selected_inverse(mobility: Any, axes: Any, smallest: Any, xp: Any) -> tuple[Any, Any]:
+    """Return S^T (S A S^T)^-1 S, bounded, for the selected ``axes`` (1 | envs, 6), and where it is bounded."""
+    if axes is None:
+        return bounded_inverse(mobility, smallest)
+    both = axes[..., :, None] * axes[..., None, :] > 0
+    free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
+    # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
+    alone = free * xp.maximum(smallest, 1.0)[..., None, None]
+    inverse, near = bounded_inverse(xp.where(both, mobility, alone), smallest)
+    return xp.where(both, inverse, xp.zeros_like(inverse)), near
+
+
+def _selected(axes: Any, vector: Any) -> Any:
+    return vector if axes is None else axes * vector

@@ -1,0 +1,73 @@
+"""Cost of operational-space control of a panda, per env step: native rows against NumPy.
+
+"regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a straight arm, where
+each needs its eigenvalues. ``step`` is the law with the dynamics of a tree; the shares below it are timed alone.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from unittest import mock
+
+import numpy as np
+import pytest
+
+import batchpid.task_space as ts
+from batchpid.native.availability import SWITCH
+from batchpid.sim import Robot
+from batchpid.task_space import native_rows
+from batchpid.task_space.projections import projections
+
+LINK = "panda_hand"
+POSES = {
+    "regular": [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02],
+    "bounded": [0.0, 0.0, 0.0, -0.07, 0.0, 0.01, 0.0, 0.02, 0.02],
+}
+SMALLEST_EIGENVALUE = {"regular": 0.02, "bounded": 0.2}
+
+
+def best(call, seconds):
+    """Return the least time of a call [s]."""
+    call()
+    times, until = [], time.perf_counter() + seconds
+    while not times or time.perf_counter() < until:
+        began = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+@pytest.mark.benchmark(group="task space")
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("num_envs", [1, 16, 64, 1024])
+def test_osc_step(benchmark, compare, most, num_envs, pose):
+    if native_rows.in_use() is None:
+        pytest.skip("there is no extension")
+    robot = Robot.load("panda")
+    tree, rows, rng = robot.kinematic_tree(), int(min(num_envs, most.rows)), np.random.default_rng(0)
+    qpos = POSES[pose] + 0.01 * rng.normal(size=(rows, tree.dof))
+    qvel = 0.1 * rng.normal(size=qpos.shape)
+    options = {"effort_limit": robot.effort_limit, "smallest_eigenvalue": SMALLEST_EIGENVALUE[pose]}
+    params = ts.make_osc_params(tree, **options)
+    state, goal = ts.init(params, qpos), ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0]
+    d, a = ts.task_dynamics(tree, qpos, qvel, LINK), rng.normal(size=(rows, 6))
+
+    def step(**options):
+        return ts.step(params, state, tree, LINK, goal, qpos, qvel, **options)
+
+    near = step(terms=True)[2].near_singular
+    assert near.all() if pose == "bounded" else not near.any()
+    seconds = min(0.3, most.seconds)
+    with mock.patch.dict(os.environ, {SWITCH: "0"}):
+        in_numpy = best(step, seconds)
+    benchmark.pedantic(step, rounds=int(min(2000, most.rounds)), warmup_rounds=2)
+    least = benchmark.stats.stats.min
+    parts = {
+        "dynamics": best(lambda: ts.task_dynamics(tree, qpos, qvel, LINK), seconds),
+        "projections": best(lambda: projections(params, d, a, qvel), seconds),
+    }
+    for name, time_of_part in {"step": least, **parts, "step in NumPy": in_numpy}.items():
+        benchmark.extra_info[f"{name} [us]"] = 1e6 * time_of_part / rows
+    print("", *(f"{name} {us:.2f}" for name, us in benchmark.extra_info.items()), sep="\n")
+    compare(f"{num_envs} envs, {pose}", "native", "numpy", in_numpy / least, least=4)

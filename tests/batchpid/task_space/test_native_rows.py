@@ -1,0 +1,132 @@
+"""Native kinematics, dynamics and law against NumPy's, over random trees, rows and options."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trees import planar, states, tool_of, tree_of
+
+import batchpid.task_space as ts
+from batchpid.native.availability import SWITCH
+from batchpid.native.extensions import StaleExtensionError
+from batchpid.task_space import native_rows
+
+pytestmark = pytest.mark.skipif(native_rows.in_use() is None, reason="there is no extension")
+
+TREES = ["panda", "jaco2", *range(8)]
+MASKS = st.lists(st.booleans(), min_size=6, max_size=6)
+
+
+def both(function):
+    """Return the results of native code and of NumPy."""
+    found = function()
+    with mock.patch.dict("os.environ", {SWITCH: "0"}):
+        return found, function()
+
+
+def assert_same(found, wanted, tolerance):
+    wanted = np.asarray(wanted)
+    assert found.shape == wanted.shape
+    assert found.dtype == wanted.dtype
+    assert np.abs(found - wanted).max(initial=0) <= tolerance * np.abs(wanted).max(initial=1.0)
+
+
+@settings(max_examples=60)
+@given(
+    name=st.sampled_from(TREES), rows=st.integers(0, 9), seed=st.integers(0, 2**31), pointed=st.sampled_from([0, 1, 2])
+)
+def test_kinematics_and_dynamics(name, rows, seed, pointed):
+    tree, tool = tree_of(name), tool_of(name)
+    qpos, qvel = states(tree, rows, seed)
+    rng = np.random.default_rng(seed)
+    point = [None, rng.normal(size=3), rng.normal(size=(rows, 3))][pointed]
+    link = tree.links[rng.integers(len(tree.links))] if seed % 2 else tool
+    for function in (
+        lambda: ts.jacobian(tree, qpos, link, point=point),
+        lambda: ts.jacobian(tree, qpos, link, point=point, frame="tool"),
+        lambda: ts.jacobian_rate(tree, qpos, qvel, link, point=point),
+        lambda: ts.jacobian_rate(tree, qpos, qvel, link, point=point, frame="tool"),
+        lambda: ts.mass_matrix(tree, qpos),
+        lambda: ts.bias(tree, qpos, qvel),
+        lambda: ts.inverse_dynamics(tree, qpos, qvel, qvel[::-1]),
+        lambda: ts.link_poses(tree, qpos[:, None]),
+    ):
+        assert_same(*both(function), 1e-12)
+    for leaf, other in zip(*both(lambda: ts.task_dynamics(tree, qpos, qvel, link, point=point)), strict=True):
+        assert_same(leaf, other, 1e-12)
+
+
+@settings(max_examples=80)
+@given(
+    name=st.sampled_from(["panda", "jaco2", 0, 1, 2]),
+    rows=st.integers(1, 9),
+    seed=st.integers(0, 2**31),
+    axes=st.none() | MASKS,
+    forces=st.none() | MASKS,
+    kind=st.sampled_from(["full", "partial", "none"]),
+    frame=st.sampled_from(["world", "tool"]),
+    smallest=st.sampled_from([0.02, 0.5, 10.0]),
+    extras=st.integers(0, 15),
+)
+def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
+    tree, tool = tree_of(name), tool_of(name)
+    qpos, qvel = states(tree, rows, seed)
+    goal = ts.link_poses(tree, states(tree, rows, seed + 1)[0], [tool])[:, 0]
+    rng = np.random.default_rng(seed)
+    forces = None if forces is None else np.array(forces) & ~np.array(axes or [True] * 6)
+    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": 200.0}
+    stiffness = rng.uniform(50, 200, (1 if seed % 3 else rows, 6))
+    params = ts.make_osc_params(tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options)
+    names = "twist", "acceleration", "wrench", "feedforward"
+    given = {
+        key: rng.normal(size=(rows, tree.dof if key == "feedforward" else 6))
+        for bit, key in enumerate(names)
+        if extras >> bit & 1
+    }
+    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
+    found, wanted = both(lambda: ts.step(params, state, tree, tool, goal, qpos, qvel, terms=True, **given)[2])
+    np.testing.assert_array_equal(found.near_singular, wanted.near_singular)
+    # The inverse amplifies the rounding of A, which is relative to its norm, by 1/s0 at most.
+    d = ts.task_dynamics(tree, qpos, qvel, tool)
+    mobility = d.jacobian @ np.linalg.solve(d.mass_matrix, d.jacobian.swapaxes(1, 2))
+    tolerance = 1e-12 * (1 + np.abs(mobility).max() / smallest)
+    for key in ("error", "wrench", "task", "posture", "unsaturated", "effort"):
+        assert_same(getattr(found, key), getattr(wanted, key), tolerance)
+    for key in ("task", "posture"):  # the share of an effort of 1e-15 N m may be 0 or 1
+        parts = [getattr(terms, f"{key}_share")[:, None] * getattr(terms, key) for terms in (found, wanted)]
+        assert_same(*parts, 10 * tolerance)
+
+
+def test_a_row_is_the_same_in_any_company():
+    """Also for ten thousand rows, in which every fourth is near a singularity and one is NaN."""
+    tree, tool, rows = tree_of("panda"), tool_of("panda"), 10_000
+    qpos, qvel = states(tree, rows)
+    qpos[::4, 3] = -1e-3
+    qpos[7, 2] = np.nan
+    params = ts.make_osc_params(tree, effort_limit=80.0, smallest_eigenvalue=0.05)
+    goal = ts.link_poses(tree, 0.9 * np.nan_to_num(qpos), [tool])[:, 0]
+    _, effort, terms = ts.step(params, ts.init(params, qpos), tree, tool, goal, qpos, qvel, terms=True)
+    assert 0.2 < terms.near_singular.mean() < 0.9
+    assert np.flatnonzero(~np.isfinite(effort).all(1)).tolist() == [7]
+    for chosen in (slice(0, 1), slice(4, 9), slice(8, 9), slice(9998, 10_000)):
+        part = ts.init(params, qpos[chosen])
+        _, alone = ts.step(params, part, tree, tool, goal[chosen], qpos[chosen], qvel[chosen])
+        np.testing.assert_array_equal(alone, effort[chosen])
+
+
+def test_a_stale_extension_is_a_warning_and_numpy_computes():
+    tree, qpos = planar(), np.ones((2, 2))
+    native_rows._extension.cache_clear()
+    try:
+        with (
+            mock.patch.object(native_rows, "load", side_effect=StaleExtensionError("was built from other sources")),
+            pytest.warns(RuntimeWarning, match="only NumPy: _task_space was built from other sources"),
+        ):
+            ts.mass_matrix(tree, qpos)
+    finally:
+        native_rows._extension.cache_clear()
+    assert native_rows.in_use() is not None
