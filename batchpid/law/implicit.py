@@ -38,14 +38,10 @@ E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.elementwise import namespace
-from batchpid.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from batchpid.law.params import PIDParams
+from batchpid.law.params import PIDParams
 
 
 class ImplicitGains(NamedTuple):
@@ -94,14 +90,3 @@ def as_explicit(params: PIDParams, dt: Any) -> PIDParams:
         return params
     kp, ki, kd, b, _, c = implicit_gains(params, dt)
     return params._replace(kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None)
-
-
-def check_implicit(gain_units: Any, filter_time: Any) -> None:
-    """Raise InvalidArgumentError for options that the implicit law does not have."""
-    if not isinstance(gain_units, PerMassMatrix):
-        problem = "'implicit' predicts accelerations, which needs gain_units 'mass_matrix'"
-        raise InvalidArgumentError("discretization", problem, remedy="use these gain_units, or 'explicit'")
-    if filter_time is not None:
-        problem = "is not available with discretization 'implicit', which predicts with the unfiltered rate"
-        remedy = "leave it out or 0: the implicit law is stable without; or use 'explicit'"
-        raise InvalidArgumentError("derivative_filter_time", problem, remedy=remedy)

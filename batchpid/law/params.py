@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.choices import CHOICES, Everywhere
+from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
 from batchpid.arrays.display import params_summary
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import at_least, is_traced
 from batchpid.errors import InvalidArgumentError
-from batchpid.law.implicit import check_implicit
 
 
 class PIDParams(NamedTuple):
@@ -256,7 +255,7 @@ def make_params(
     filter_time = build.option("derivative_filter_time", derivative_filter_time, neutral=0.0)
     units, implicit = build.choice("gain_units", gain_units), build.choice("discretization", discretization)
     if implicit is not None:
-        check_implicit(units, filter_time)
+        _check_implicit(units, filter_time)
         d = build.array("kd", 0.0, 0.0) if d is None else d
     effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
     integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
@@ -294,3 +293,14 @@ _SIGNED = ("effort_min", "effort_max", "integral_min", "integral_max")
 def _is_array(leaf: Any) -> bool:
     """Return whether an entry of the params is an array, neither off nor a choice."""
     return leaf is not None and not isinstance(leaf, tuple)
+
+
+def _check_implicit(gain_units: Any, filter_time: Any) -> None:
+    """Raise InvalidArgumentError for options that the implicit law does not have."""
+    if not isinstance(gain_units, PerMassMatrix):
+        problem = "'implicit' predicts accelerations, which needs gain_units 'mass_matrix'"
+        raise InvalidArgumentError("discretization", problem, remedy="use these gain_units, or 'explicit'")
+    if filter_time is not None:
+        problem = "is not available with discretization 'implicit', which predicts with the unfiltered rate"
+        remedy = "leave it out or 0: the implicit law is stable without; or use 'explicit'"
+        raise InvalidArgumentError("derivative_filter_time", problem, remedy=remedy)
