@@ -27,10 +27,12 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.operational_space import OperationalSpace
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators
+from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -97,6 +99,7 @@ class RunnerOptions:
     control: ControlMode | Controller = field(
         default="pid", metadata=_in(snapshot="control_name", recording="control_name")
     )
+    tool: str | None = None
     backend: Backend = field(default="numpy", metadata=_in("snapshot"))
     dtype: Precision = field(default="float64", metadata=_in("snapshot"))
     compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
@@ -132,7 +135,8 @@ class RunnerOptions:
         own |= {
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
-            "control": _control(self.control),
+            "control": _control(self.control, robot, given["tool"]),
+            "tool": None,  # it is in the control
             "backend": choice("backend", self.backend, get_args(Backend)),
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
@@ -370,11 +374,17 @@ def keyword_parameters() -> list[Parameter]:
     return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
-def _control(value: object) -> Any:
+def _control(value: object, robot: Robot, tool: Any) -> Any:
+    """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
+    if tool is not None and value != "osc":
+        raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+    if value == "osc":
+        kinematics = Kinematics(robot)
+        return OperationalSpace(robot, kinematics.links[kinematics.tool] if tool is None else tool)
     if callable(value) and callable(getattr(value, "init", None)):
         own_command(value)  # raises for an invalid command
         return value
-    return choice("control", value, get_args(ControlMode))
+    return choice("control", value, (*get_args(ControlMode), "osc"))
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:

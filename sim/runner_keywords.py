@@ -71,9 +71,13 @@ class RunnerKeywords(TypedDict, total=False):
     """Time step of simulation and control [s]; default 1/2000."""
     substeps: int
     """Sim steps of one tick, all under the same setpoint; the control runs at every one of them. Default 20."""
-    control: ControlMode | Controller
-    """``"pid"``, the default; ``"drive"``: PhysX's internal PD drive, with the params' kp and kd as stiffness and
-    damping; ``"effort"``: the setpoint is the joint effort; or a :class:`Controller`."""
+    control: ControlMode | Literal["osc"] | Controller
+    """``"pid"``, the default; ``"drive"``: the engine's internal PD drive, with the params' kp and kd as stiffness and
+    damping; ``"effort"``: the setpoint is the joint effort; ``"osc"``: operational-space control of the link ``tool``,
+    whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
+    :class:`Controller`."""
+    tool: str | None
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Backend
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
     of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,

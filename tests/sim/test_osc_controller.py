@@ -152,3 +152,30 @@ def test_arguments_are_checked(panda, options, message):
 def test_the_robot_is_that_of_the_runner(panda, six_joints):
     with pytest.raises(InvalidArgumentError, match="make it for the robot of the runner"):
         Runner(panda, 1, control=OperationalSpace(six_joints, "l6"), **OPTIONS)
+
+
+def test_control_osc_is_that_of_a_link(panda):
+    goal = pose_of(panda, START, HAND) + [0.05, 0, -0.05, 0, 0, 0, 0]
+    with Runner(panda, 2, control="osc", tool=HAND, **OPTIONS) as runner:
+        runner.reset(START)
+        rollout = runner.rollout(np.broadcast_to(goal, (80, 7)))
+    np.testing.assert_allclose(pose_of(panda, rollout.qpos[-1], HAND)[:, :3], np.tile(goal[:3], (2, 1)), atol=2e-3)
+    with Runner(panda, 2, control=OperationalSpace(panda, HAND), **OPTIONS) as runner:
+        runner.reset(START)
+        again = runner.rollout(np.broadcast_to(goal, (80, 7)))
+    np.testing.assert_array_equal(rollout.qpos, again.qpos)
+    with Runner(panda, 1, control="osc", workers=0) as runner:  # the hand, and not a finger
+        np.testing.assert_allclose(runner.command.neutral, pose_of(panda, panda.start, HAND))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"control": "osc", "tool": "hand"}, "unknown link.*panda_hand"),
+        ({"tool": HAND}, "tool: is for control 'osc'"),
+        ({"control": "ocs"}, "'osc'"),
+    ],
+)
+def test_a_wrong_tool_is_refused(panda, options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Runner(panda, 1, workers=0, **options)
