@@ -154,8 +154,8 @@ def test_the_robot_is_that_of_the_runner(panda, six_joints):
         Runner(panda, 1, control=OperationalSpace(six_joints, "l6"), **OPTIONS)
 
 
-def test_control_osc_is_that_of_a_link(panda):
-    goal = pose_of(panda, START, HAND) + [0.05, 0, -0.05, 0, 0, 0, 0]
+def test_control_osc_moves_a_link(panda):
+    goal = np.add(pose_of(panda, START, HAND), [0.05, 0, -0.05, 0, 0, 0, 0])
     with Runner(panda, 2, control="osc", tool=HAND, **OPTIONS) as runner:
         runner.reset(START)
         rollout = runner.rollout(np.broadcast_to(goal, (80, 7)))
