@@ -31,8 +31,8 @@ from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
-from batchpid.sim.operational_space import OperationalSpace
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray

@@ -27,7 +27,7 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import Capability, Engine, require
-from batchpid.sim.operational_space import OperationalSpace
+from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray

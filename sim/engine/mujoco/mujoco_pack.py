@@ -33,6 +33,8 @@ Float64 = NDArray[np.float64]
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 """Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
+_JOINTS = ("dof_armature", "actuator_biasprm", "actuator_forcerange")
+"""Fields of ``mujoco.MjModel`` that joints and drives change."""
 
 
 class MujocoPack(SingleOwner):
@@ -236,10 +238,12 @@ class MujocoPack(SingleOwner):
         self._share()
 
     def _share(self) -> None:
-        """Return to one shared model if masses do not vary and all robots have the same armature."""
+        """Return to one shared model if neither masses nor armature nor drives of the robots differ."""
         first = self._models[0]
         if not self._masses_vary and all(
-            np.array_equal(first.dof_armature, model.dof_armature) for model in self._models[1:]
+            np.array_equal(getattr(first, field), getattr(model, field))
+            for model in self._models[1:]
+            for field in _JOINTS
         ):
             self._models = [first] * self.size
         self._update(range(self.size))

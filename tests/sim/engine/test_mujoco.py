@@ -237,6 +237,23 @@ def test_an_env_alone(control):
         assert_same_env(alone, among, env)
 
 
+def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
+    """Motors change the joints of the models, after which envs with equal models share one."""
+
+    def run_drives(*stiffness):
+        params = panda.params(kp=np.outer(stiffness, np.ones(panda.dof)), ki=0.0, kd=10.0)
+        options = {"actuators": bp.make_actuators(panda.dof, armature=0.05), "params": params, "control": "drive"}
+        with Runner(panda, len(stiffness), engine="mujoco", workers=0, **options) as runner:
+            runner.reset()
+            for _ in range(10):
+                obs = runner.step(np.clip(panda.start + 0.1, panda.lower, panda.upper))
+            return obs
+
+    both = run_drives(50.0, 200.0)
+    for env, stiffness in enumerate((50.0, 200.0)):
+        assert_same_env(run_drives(stiffness), both, env)
+
+
 def test_contact_does_not_depend_on_the_company(panda):
     """The grippers close with full effort, and the arms push against themselves or the ground."""
     setpoints = panda.sample(6, seed=3)
