@@ -1,7 +1,8 @@
-"""Baselines of the benchmark that step SAPIEN without a Runner, in worker processes."""
+"""Baselines of the benchmark that step an engine without a Runner, in worker processes."""
 
 from __future__ import annotations
 
+import copy
 import gc
 import multiprocessing
 import os
@@ -79,7 +80,7 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
 
         return Case(workload.steps * envs, reset, run, close, len(used))
 
-    return {name: case(name) for name in (*TUTORIALS, *ENGINES)}
+    return {name: case(name) for name in (*TUTORIALS, *(ENGINES if workload.engine == "sapien" else ["bare engine"]))}
 
 
 def _start(process: BaseProcess) -> None:
@@ -103,7 +104,8 @@ def single_threaded() -> Iterator[None]:
 
 def _serve(connection: Connection, workload: Workload, share: int) -> None:
     """Reset to the start, and then run a round of, each case whose name comes; until the connection is closed."""
-    cases: dict[str, TutorialLoop | _DriveLoop] = {}
+    cases: dict[str, TutorialLoop | _DriveLoop | _MujocoLoop] = {}
+    drive_loop = _DriveLoop if workload.engine == "sapien" else _MujocoLoop
     gc.disable()
     try:
         while True:
@@ -112,7 +114,7 @@ def _serve(connection: Connection, workload: Workload, share: int) -> None:
                 cases[name] = (
                     TutorialLoop(workload.robot, workload.target, start=workload.start)
                     if name in TUTORIALS
-                    else _DriveLoop(name, workload, share)
+                    else drive_loop(name, workload, share)
                 )
             cases[name].reset()
             connection.send(None)
@@ -147,3 +149,28 @@ class _DriveLoop:
                 for _ in range(at_once):
                     pack.step()
         return self._packs[0].read_qpos()[0]
+
+
+class _MujocoLoop:
+    """The same robots in MuJoCo's ``mujoco.batch``, under its position actuators, all stepped by one call."""
+
+    def __init__(self, name: str, workload: Workload, share: int) -> None:
+        import mujoco.batch
+
+        from batchpid.sim.engine.mujoco.model_builder import robot_model
+
+        settings = tutorial_settings(workload.robot)
+        robot = robot_model(workload.scene(gravity=False), drives=True)
+        self._start, self._columns, model = workload.start, robot.qpos, copy.copy(robot.model)
+        model.actuator_biasprm[:, 1:3] = -settings.drive_stiffness, -settings.drive_damping
+        self._batch = mujoco.batch.Batch(model, share, nthread=1, persistent=True)
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._batch.bind("ctrl")[...] = settings.drive_stiffness * workload.target
+
+    def reset(self) -> None:
+        self._qpos[:, self._columns], self._qvel[...] = self._start, 0.0
+
+    def run(self, steps: int) -> Float64:
+        for _ in range(steps):
+            self._batch.step()
+        return self._qpos[0, self._columns].copy()

@@ -1,8 +1,8 @@
 """Speed of the runner and of its baselines in one run: ``batchpid bench`` and ``bench/`` are made of this.
 
-Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and with SAPIEN's own friction
-and damping, so that the cases differ in the way of stepping and not in the motion. Baselines run in separate worker
-processes, as many as the runner has.
+Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in SAPIEN, with its own
+friction and damping, so that the cases differ in the way of stepping and not in the motion. Baselines run in separate
+worker processes, as many as the runner has.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.sim.benchmark.baselines import make_baselines
+from batchpid.sim.benchmark.baselines import ENGINES, make_baselines
 from batchpid.sim.benchmark.peers import make_peers
 from batchpid.sim.benchmark.policy import ResidualPolicy
 from batchpid.sim.benchmark.workload import Case, Workload, run_round
@@ -26,7 +26,6 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.workers.shared_memory import SharedArrays
 
@@ -52,6 +51,10 @@ XLA_CASES = {
     "closed loop, no shapes, free, XLA": "the closed loop in XLA without collision shapes, with physics 'free'",
 }
 """Cases of the Runner that compile for some seconds first."""
+MUJOCO = {
+    "bare engine": "mujoco.batch: its position actuators, no control, no gravity, all robots stepped in one call",
+}
+"""Baselines of an engine "mujoco", beside those of the tutorial's loop in SAPIEN."""
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 PHASES = {
     # phase of a sim step: the calls on the pack that it consists of
@@ -80,6 +83,15 @@ class Result:
     def over(self, other: Result) -> float:
         """Return the median over the rounds, which are paired, of our rate over the other's."""
         return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
+
+
+def cases_in(engine: str = "sapien", xla: bool = False) -> dict[str, str]:
+    """Return the descriptions of the cases in ``engine``, by name, with those in XLA if asked."""
+    named = CASES | (XLA_CASES if xla else {})
+    if engine == "sapien":
+        return named
+    sapiens = {name for name in ENGINES if name not in MUJOCO}
+    return {name: MUJOCO.get(name, text) for name, text in named.items() if name not in sapiens}
 
 
 def make_closed_loops(workload: Workload, names: Collection[str] = tuple(CASES)) -> dict[str, Case]:
@@ -169,9 +181,11 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
-    robot = Robot.load(workload.robot.path, dissipation="sapien")
+    robot = workload.simulated_robot
     shared = SharedArrays(Arrays.layout(1, share, robot.dof))
-    options = RunnerOptions(robot, share, physics=workload.physics, collisions=collisions)
+    options = RunnerOptions(
+        robot, share, physics=workload.physics, collisions=collisions, engine=workload.engine
+    )  # fmt: skip
     loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
     loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, workload.robot.dof)))
     loop.ticks[0].command.setpoint[...] = workload.target

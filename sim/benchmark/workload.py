@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError
 from batchpid.sim.benchmark.tutorial import tutorial_settings
-from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import PhysicsPreset
+from batchpid.sim.runner_keywords import EngineName, PhysicsPreset
 
 Float64 = NDArray[np.float64]
 TIMESTEP = 1 / 2000
@@ -38,6 +38,7 @@ class Workload:
     num_envs: int = 64
     workers: int = 2
     physics: PhysicsPreset = "accurate"
+    engine: EngineName = "sapien"
     substeps: int = 20
     ticks: int = 100
     rounds: int = 5
@@ -72,17 +73,24 @@ class Workload:
         """Number of processes that step: the workers, or this process."""
         return max(self.workers, 1)
 
+    @property
+    def simulated_robot(self) -> Robot:
+        """The robot: in SAPIEN with SAPIEN's own friction and damping, as in the tutorial's loop."""
+        return Robot.load(self.robot.path, dissipation="sapien" if self.engine == "sapien" else "urdf")
+
     def scene(self, gravity: bool, collisions: bool = True) -> SceneSpec:
         """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
-        robot, physics = self.robot, PHYSICS[self.physics]
-        options: dict[str, Any] = {"dissipation": "sapien", "collisions": collisions, "ground": collisions}
+        robot, physics = self.simulated_robot, load_engine(self.engine).physics[self.physics]
+        options: dict[str, Any] = {"dissipation": robot.dissipation, "collisions": collisions, "ground": collisions}
+        options["engine"] = self.engine
         spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, physics, **options)
         return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
 
     def runner(self, **options: Any) -> Runner:
-        """Return a runner of the robots with the tutorial's gains and SAPIEN's default friction and damping."""
-        robot = Robot.load(self.robot.path, dissipation="sapien")
+        """Return a runner of the robots with the tutorial's gains."""
+        robot = self.simulated_robot
         ours: dict[str, Any] = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP}
+        ours["engine"] = self.engine
         return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **ours | options)
 
     def check_motion(self, case: str, final: Float64) -> None:

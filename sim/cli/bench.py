@@ -30,6 +30,8 @@ class BenchCommand:
 
     robot: flags.RobotName = "panda"
     num_envs: flags.NumEnvs = 64
+    engine: flags.Engine = "sapien"
+    """Engine of the closed loops and of the bare engine; the tutorial's loop is in SAPIEN."""
     physics: flags.Physics = "accurate"
     substeps: int = 20
     """Sim steps of a tick of the closed loop."""
@@ -51,25 +53,28 @@ class BenchCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.sim.benchmark.benchmark import CASES, OURS, XLA_CASES, measure_phases, measure_rates
+        from batchpid.sim.benchmark.benchmark import OURS, cases_in, measure_phases, measure_rates
         from batchpid.sim.benchmark.peers import PEERS, installed_peers
         from batchpid.sim.benchmark.workload import Workload
         from batchpid.sim.cli.report import table
+        from batchpid.sim.engine.engines import load_engine
         from batchpid.sim.engine.native import status as native_status
 
         out = Outputs(force=self.force).path("out", self.out, (".json",))
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        load_engine(self.engine)
         workload = Workload(
             Robot.load(self.robot, missing_meshes=self.missing_meshes),
             num_envs=integer("num_envs", self.num_envs, 1, 1_000_000),
             workers=integer("workers", workers, 0, 1024),
             physics=self.physics,
+            engine=self.engine,
             substeps=integer("substeps", self.substeps, 1, 1_000_000),
             ticks=integer("ticks", self.ticks, 1, 1_000_000),
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
         peers = installed_peers() if self.peers else ()
-        names = CASES | XLA_CASES if self.xla else CASES
+        names = cases_in(self.engine, self.xla)
         descriptions = names | {name: PEERS[name].description for name in peers}
         advance = iter(bar("bench")(range(workload.rounds * len(descriptions))))
         results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers, names=names)
@@ -79,7 +84,8 @@ class BenchCommand:
 
         print(
             f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, "
-            f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds, {native_status()}\n"
+            f"physics {workload.physics!r}, {workload.substeps} substeps, {workload.rounds} rounds, "
+            f"{native_status().describe(load_engine(self.engine).title)}\n"
         )
         ours = results[OURS]
         ratios = {case: ours.over(result) for case, result in results.items()}

@@ -25,12 +25,13 @@ from batchpid.sim.robot.description import RobotDescription
 
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
-Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "sapien_dissipation"]
+Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "partial_force", "sapien_dissipation"]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"missed_contacts"``: robots without shapes report contacts that they would have had;
 - ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
+- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone, and those of floating bases;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 FAILED = 1 << STATUS.index("failed")
@@ -233,8 +234,8 @@ class Engine(description.RobotFunctions, Protocol):
 
     Attributes
     ----------
-    name
-        Value of the option ``engine``.
+    name, title
+        Value of the option ``engine``, and name of the library in texts.
     capabilities
         Its optional features.
     physics
@@ -247,6 +248,7 @@ class Engine(description.RobotFunctions, Protocol):
     """
 
     name: str
+    title: str
     capabilities: frozenset[Capability]
     physics: Mapping[str, Any]
     group_size: int

@@ -21,20 +21,26 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     engine = options.load_engine()
     if "compiled_steps" not in engine.capabilities:
         return f"the sim steps of {engine.name!r} are calls of Python"
+    if "gravity" in options.compensate and "partial_force" not in engine.capabilities:
+        if not options.robot.fixed_base:
+            return f"{engine.title} needs NumPy for the passive force of a floating base"
+        if "coriolis" not in options.compensate:
+            return f"{engine.title} needs NumPy for gravity without Coriolis forces"
     status = xla.status()
     return "" if status.active else status.reason
 
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return the library of the law, and the kind of the calls into the engine, with reasons."""
+    engine = options.load_engine().title
+    calls = native.status().describe(engine)
+    if options.control == "drive":
+        return f"law in {engine} (control 'drive'), {calls}"
     if options.backend == "numpy":
         compiled = options.control == "pid" and native.status().active
-        return f"law {'as a native program' if compiled else 'in NumPy'}, {native.status()}"
-    if options.control == "drive":
-        return f"law in PhysX (control 'drive'), {native.status()}"
+        return f"law {'as a native program' if compiled else 'in NumPy'}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"
     if not reason:
         return f"{law}, in one program with native sim steps"
-    calls = "native" if native.status().active else "Python"
-    return f"{law}, a call each sim step ({reason}), {calls} calls into SAPIEN"
+    return f"{law}, a call each sim step ({reason}), {calls.partition(' (')[0]}"

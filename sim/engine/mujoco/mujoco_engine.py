@@ -23,8 +23,8 @@ from batchpid.sim.robot.self_collision import SelfContact
 class MujocoEngine:
     """MuJoCo on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
-    name = "mujoco"
-    capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts"})
+    name, title = "mujoco", "MuJoCo"
+    capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts", "compiled_steps"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
     shares_systems = False

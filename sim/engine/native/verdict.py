@@ -51,8 +51,9 @@ class NativeStatus(NamedTuple):
     warning: str = ""
     """Text of a warning, if the reason is a fault of the installation."""
 
-    def __str__(self) -> str:
-        return "native calls into SAPIEN" if self.active else f"Python calls into SAPIEN ({self.reason})"
+    def describe(self, engine: str) -> str:
+        """Return the kind of the calls into ``engine``, with the reason."""
+        return f"native calls into {engine}" if self.active else f"Python calls into {engine} ({self.reason})"
 
 
 def status() -> NativeStatus:

@@ -22,7 +22,7 @@ from batchpid.sim.robot.self_collision import SelfContact
 class SapienEngine:
     """SAPIEN with PhysX on the CPU, with all capabilities. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
-    name = "sapien"
+    name, title = "sapien", "SAPIEN"
     capabilities: frozenset[Capability] = frozenset(get_args(Capability))
     physics: Mapping[str, Any] = PHYSICS
     group_size = 16

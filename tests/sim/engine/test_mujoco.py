@@ -370,6 +370,18 @@ def test_the_solver_of_mujoco_is_refused_by_sapien(panda):
         assert runner.options.solver.iterations == 7
 
 
+def test_the_backend_names_the_engine(panda):
+    def backend(**options):
+        with Runner(panda, 1, engine="mujoco", workers=0, **options) as runner:
+            return runner.backend
+
+    assert "calls into MuJoCo" in backend()
+    assert backend(control="drive").startswith("law in MuJoCo")
+    alone = backend(backend="jax", compensate="gravity")
+    assert "call each sim step" in alone
+    assert "into MuJoCo" in alone
+
+
 def test_sapiens_own_friction_is_refused():
     with pytest.raises(InvalidArgumentError, match="sapien_dissipation"):
         Runner(Robot.load("panda", dissipation="sapien"), 1, workers=0, engine="mujoco")

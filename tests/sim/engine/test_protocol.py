@@ -137,7 +137,7 @@ class Solver:
 class ToyEngine:
     """Engine without any capability."""
 
-    name, capabilities, physics = "toy", frozenset(), {"accurate": Solver(1)}
+    name, title, capabilities, physics = "toy", "Toy", frozenset(), {"accurate": Solver(1)}
     group_size, shares_systems = 4, False
 
     def is_physics(self, settings):

@@ -41,6 +41,7 @@ CASES = {
     "efforts": ("panda", {"params": "panda"}),
     "tuned": ("panda", {}),
     "rubbing": (RUBBING, {}),
+    "MuJoCo": ("panda", {"engine": "mujoco"}),
 }
 
 
@@ -48,7 +49,9 @@ CASES = {
 def test_motion_is_that_of_the_law_in_numpy(case):
     name, options = CASES[case]
     robot = load_bundled(name)
-    options = {"params": robot.params()} if "params" in options else {}
+    if "engine" in options:
+        pytest.importorskip("mujoco.batch")
+    options = options | ({"params": robot.params()} if "params" in options else {})
     ours, theirs = (rollout(robot, backend, **options) for backend in ("jax", "numpy"))
     np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=0, atol=1e-5)
     np.testing.assert_allclose(ours.effort, theirs.effort, rtol=0, atol=0.05)
@@ -71,15 +74,16 @@ def test_two_seconds_of_motion(name, physics, dtype):
 @needs_extension
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("options", [{}, {"speed_limit": 60.0, "on_fault": "reset"}, {"compensate": "none"}], ids=str)
-def test_contacts_and_faults_are_those_of_the_loop_in_numpy(panda, options):
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_contacts_and_faults_are_those_of_the_loop_in_numpy(panda, engine, options):
     """Sums of efforts are exact, so that the results are: in contact, with robots isolated on the way and faults."""
+    pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     rng = np.random.default_rng(3)
     efforts = rng.normal(size=(20, N, panda.dof)) * np.minimum(panda.effort_limit, 50)
+    options = {"engine": engine, **({"pack_size": 3} if engine == "sapien" else {}), **options}
     results = []
     for backend in ("jax", "numpy"):
-        with Runner(
-            panda, N, control="effort", backend=backend, workers=0, substeps=10, pack_size=3, **options
-        ) as runner:
+        with Runner(panda, N, control="effort", backend=backend, workers=0, substeps=10, **options) as runner:
             rows = runner.rollout(efforts)
             results.append((rows, list(runner.faults)))
     assert_identical(results[0][0], results[1][0])
@@ -253,7 +257,7 @@ def test_options(panda):
     with pytest.raises(InvalidArgumentError, match="backend"):
         Runner(panda, 2, backend="torch", workers=0)
     with Runner(panda, 2, control="drive", backend="jax", workers=0) as runner:
-        assert runner.backend.startswith("law in PhysX")
+        assert runner.backend.startswith("law in SAPIEN")
         runner.step(panda.start)
     actuators = bp.make_actuators(panda.dof, strength=0.9)
     with Runner(panda, 2, backend="jax", workers=0, substeps=2, actuators=actuators) as runner:
