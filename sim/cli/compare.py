@@ -13,7 +13,10 @@ from batchpid.sim.tuning.gain_sets import gain_set
 
 @dataclass(frozen=True)
 class CompareCommand:
-    """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter of each."""
+    """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter of each.
+
+    With `--engine sapien mujoco` every set runs in both engines, on the same moves.
+    """
 
     robot: flags.RobotName = "panda"
     gains: flags.GainSets = ()
@@ -26,14 +29,14 @@ class CompareCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
-    engine: flags.Engine = "sapien"
+    engine: flags.Engines = ("sapien",)
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None
     actuators: flags.Actuators = None
     missing_meshes: flags.MissingMeshes = "skip"
     picture: flags.OptionalPath = None
-    """First two sets on the first move, to draw: .png or .svg."""
+    """First two rows of the table on the first move, to draw: .png or .svg."""
     force: flags.Force = False
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
@@ -48,8 +51,10 @@ class CompareCommand:
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]
-        if picture is not None and len(sets) < 2:
-            raise InvalidArgumentError("gains", "is one set", remedy="name two for a picture")
+        if not self.engine:
+            raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
+        if picture is not None and len(sets) * len(set(self.engine)) < 2:
+            raise InvalidArgumentError("gains", "is one set", remedy="name two, or two engines, for a picture")
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
         evaluations = evaluate_sets(
@@ -60,7 +65,7 @@ class CompareCommand:
             randomization=randomization,
             seconds=self.seconds,
             workers=self.workers,
-            engine=self.engine,
+            engines=self.engine,
             physics=self.physics,
             collisions=self.collisions,
         )

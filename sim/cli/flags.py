@@ -66,6 +66,10 @@ Engine = Annotated[
     Literal["sapien", "mujoco"],
     _flag("Physics engine; mujoco is several times as fast, and its contacts differ (extra mujoco)."),
 ]
+Engines = Annotated[
+    tuple[Literal["sapien", "mujoco"], ...],
+    _flag("Physics engines, one or both (mujoco: extra mujoco)."),
+]
 Physics = Annotated[
     Literal["accurate", "fast", "free"],
     _flag("Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact."),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.progress import bar
 from batchpid.sim.cli.report import run_report
+from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from batchpid.sim.tuning.gain_sets import GainSet
@@ -47,22 +49,31 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
 
 
 def evaluate_sets(
-    robot: Robot, sets: Sequence[GainSet], *, moves: int, seed: int, randomization: Randomization | None, **options: Any
+    robot: Robot,
+    sets: Sequence[GainSet],
+    *,
+    moves: int,
+    seed: int,
+    randomization: Randomization | None,
+    engines: Sequence[str] = ("sapien",),
+    **options: Any,
 ) -> list[Evaluation]:
-    """Evaluate ``sets`` on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
+    """Evaluate ``sets`` in ``engines``, on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
 
     ``options`` go to :func:`batchpid.sim.tuning.evaluation.evaluate_gains`. Of the actuators, those at the joints act
     on drives.
     """
+    titles = {engine: load_engine(engine).title for engine in engines}
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
 
-    def evaluate(each: GainSet) -> Evaluation:
+    def evaluate(each: GainSet, engine: str) -> Evaluation:
         drawn = reseeded(randomization, seed + 1)
         drawn = at_the_joints(drawn) if each.control == "drive" else drawn
-        known = options | {"name": each.name, "control": each.control, "randomization": drawn}
+        name = each.name if len(titles) == 1 else f"{each.name}, {titles[engine]}"
+        known = options | {"name": name, "control": each.control, "randomization": drawn, "engine": engine}
         return evaluate_gains(robot, each.params, unseen, **known)
 
-    return [evaluate(each) for each in bar("comparing", unit="set")(sets)]
+    return [evaluate(*each) for each in bar("comparing", unit="set")(list(product(sets, titles)))]
 
 
 def read_variation(

@@ -109,7 +109,7 @@ class TuneCommand:
             randomization=randomization,
             workers=self.workers,
             cluster=self.cluster,
-            engine=self.engine,
+            engines=(self.engine,),
             physics=self.physics,
             collisions=self.collisions,
         )

@@ -147,6 +147,18 @@ def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     assert picture.stat().st_size > 10_000
 
 
+def test_compare_runs_each_set_in_both_engines(batchpid, tmp_path):
+    pytest.importorskip("mujoco.batch")
+    picture = tmp_path / "two.png"
+    flags = ("--moves", 1, "--seconds", 0.9, "--workers", 0, "--picture", picture)
+    status, said, error = batchpid("compare", "--gains", "tuned", "--engine", "sapien", "mujoco", *flags)
+    assert status == 0, error
+    rows = {line.split("  ")[0]: line.split()[2:8] for line in said.splitlines() if " of 2" in line}
+    assert rows.keys() == {"tuned, SAPIEN", "tuned, MuJoCo"}
+    assert rows["tuned, SAPIEN"] == rows["tuned, MuJoCo"]  # settling times in hundredths of a second
+    assert picture.stat().st_size > 10_000
+
+
 def test_each_weight_of_the_search_has_a_flag():
     names = [field.name for field in dataclasses.fields(Weights)]
     flags = [word for index, name in enumerate(names) for word in (f"--{name}", str(index))]
@@ -160,6 +172,7 @@ def test_each_weight_of_the_search_has_a_flag():
         (("compare", "--gains", "nothing.yaml"), "neither a name nor a file"),
         (("compare", "--gains", "drive:a,b"), "DAMPING"),
         (("compare", "--gains", "tuned", "--picture", "x.png"), "name two"),
+        (("compare", "--engine"), "name sapien, mujoco or both"),
         (("tune", "nobody"), "no robot 'nobody'"),
         (("tune", "panda", "--population", "1"), "population"),
         (("tune", "panda", "--out", "gains.txt"), "gains.txt"),
