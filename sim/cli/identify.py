@@ -28,7 +28,8 @@ class IdentifyCommand:
     Finds armature, damping, friction, strength and bias of each joint, the delay of the commands and the payload at the
     tool, by fitting simulated motions; writes them for --actuators of other commands. A log has a header and SI units:
     "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --params FILE, or
-    "time, effort:JOINT ..., qpos:JOINT ...".
+    "time, effort:JOINT ..., qpos:JOINT ...". There is no --engine: the fit has a rigid-body model of its own, whose
+    equations and time steps are those of both engines.
     """
 
     robot: flags.RobotName = "panda"

@@ -22,13 +22,16 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
+    return make_log(tmp_path_factory.mktemp("log"))
+
+
+def make_log(folder, engine="sapien"):
     """Robot, a recording of it with a motor of 0.9 of its strength, and the params that drove it: files."""
-    folder = tmp_path_factory.mktemp("log")
     (folder / "pendulum.urdf").write_text(PENDULUM)
     robot = Robot.load(folder / "pendulum.urdf")
     gains, motion = robot.designed("effort"), excite(robot, seconds=1.0, lowest=1.0, rate=200)
     actuators = bp.make_actuators(robot.dof, strength=0.9)
-    options = {"workers": 0, "substeps": 10, "compensate": "gravity+coriolis", "actuators": actuators}
+    options = {"workers": 0, "substeps": 10, "compensate": "gravity+coriolis", "actuators": actuators, "engine": engine}
     with Runner(robot, 1, params=gains, **options) as runner:
         runner.reset(motion.position[0])
         rollout = runner.rollout(motion.position)
@@ -36,8 +39,11 @@ def log(tmp_path_factory):
     return folder / "pendulum.urdf", write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
 
 
-def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
-    robot, recording, gains = log
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_motors_are_written_for_other_commands(batchpid, tmp_path, engine):
+    """From the motion in either engine, whose model the fit shares."""
+    pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
+    robot, recording, gains = make_log(tmp_path, engine)
     out, details = tmp_path / "motors.yaml", tmp_path / "motors.json"
     options = ("--evaluations", 4, "--workers", 0, "--no-payload", "--out", out, "--json", details)
     status, said, error = batchpid("identify", robot, recording, "--params", gains, *options)
@@ -45,7 +51,7 @@ def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
     assert "hinge" in said
     document = json.loads(details.read_text())
     assert set(document["joints"]["hinge"]) == {"armature", "damping", "friction", "strength", "bias"}
-    assert document["held_out_error"][1] < document["held_out_error"][0]
+    assert document["held_out_error"][1] < document["held_out_error"][0] / 10
     assert Robot.load(robot, actuators=out).actuators is not None
     assert (tmp_path / "motors-fit.png").exists()
     assert not out.with_suffix(".fit.json").exists()
