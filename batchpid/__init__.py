@@ -10,7 +10,8 @@ Params say how to control, a state is carried from step to step, and every array
     effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
-  take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params.
+  take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params;
+  :func:`step_terms` and :func:`advance_terms`, which return all terms of the effort.
 - Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for other controllers' numerics;
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
@@ -42,7 +43,7 @@ from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.drive import drive_target
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, init, reset, step
+from batchpid.law.pid import advance, advance_terms, init, reset, step, step_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
@@ -59,6 +60,7 @@ __all__ = [
     "PIDState",
     "Terms",
     "advance",
+    "advance_terms",
     "design_gains",
     "discretise",
     "drive_target",
@@ -79,5 +81,6 @@ __all__ = [
     "spectral_radius",
     "stability_bound",
     "step",
+    "step_terms",
     "track",
 ]

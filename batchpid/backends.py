@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.errors import MissingDependencyError
 from batchpid.law import pid
-from batchpid.law.coefficients import discretise
+from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.availability import program_status
@@ -18,6 +18,13 @@ from batchpid.native.compiled_law import CompiledLaw
 
 LARGE = 2**18
 """Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
+
+
+def _advance(k: Coefficients, state: PIDState, inputs: Any, terms: bool) -> tuple[PIDState, Any, Terms | None]:
+    if not terms:
+        return *pid.advance(k, state, *inputs), None
+    new, shown = pid.advance_terms(k, state, *inputs)
+    return new, shown.effort, shown
 
 
 def declined(*_: Any) -> Any:
@@ -68,11 +75,11 @@ class NumPyBackend:
         if self._law is not None:
             state, effort, shown, fast = self._law.step(state, inputs, out)
             return state, effort, shown, fast or declined
-        new, effort, *terms = pid.advance(self.coefficients, state, *inputs, terms=self.terms)
+        new, effort, terms = _advance(self.coefficients, state, inputs, self.terms)
         if out is not None:
             out[...] = effort
-            effort, terms = out, [each._replace(effort=out) for each in terms]
-        return new, effort, terms[0] if terms else None, declined
+            effort, terms = out, None if terms is None else terms._replace(effort=out)
+        return new, effort, terms, declined
 
 
 class JAXBackend:
@@ -96,8 +103,7 @@ class JAXBackend:
         self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
         def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-            new, effort, *shown = pid.advance(discretise(params, dt), state, *inputs, terms=terms)
-            return new, effort, shown[0] if shown else None
+            return _advance(discretise(params, dt), state, inputs, terms)
 
         def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:
             out = (spare, jax.numpy.zeros_like(inputs[1]))

@@ -29,7 +29,7 @@ from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import advance
+from batchpid.law.pid import advance, advance_terms
 from batchpid.law.state import PIDState, Terms
 
 
@@ -51,9 +51,7 @@ def advance_with_mass_matrix(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    *,
-    terms: bool = False,
-) -> Any:
+) -> tuple[PIDState, Any]:
     """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
 
     Parameters
@@ -63,27 +61,27 @@ def advance_with_mass_matrix(
     feedforward
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
-    xp = namespace(*k, *state, setpoint, measurement, mass_matrix)
-    low, high = k.effort_min, k.effort_max
-    free = k._replace(effort_min=None, effort_max=None)
-    new, a, *shown = advance(free, state, setpoint, measurement, measurement_rate, setpoint_rate, terms=terms)
-    wanted = _multiply(mass_matrix, a)
-    passive = 0.0 if feedforward is None else feedforward
-    effort = unsaturated = wanted + passive
-    if low is not None or high is not None:
-        share = _share(wanted, passive, low, high, xp)
-        effort = clip(share * wanted + passive, low, high, xp)
-        if k.ki_dt is not None and k.conditional is not None:
-            deeper = (share < 1) & (a * (new.integral - state.integral) > 0)
-            if not isinstance(k.conditional, Everywhere):
-                deeper = deeper & (k.conditional > 0)
-            new = new._replace(integral=xp.where(deeper, state.integral, new.integral))
-    if not terms:
-        return new, effort
-    p, i, d = (_multiply(mass_matrix, term) for term in shown[0][:3])
-    given = xp.zeros_like(wanted) + passive
-    saturated = effort != unsaturated
-    return new, effort, Terms(p, i, d, given, unsaturated, effort.copy(), saturated, shown[0].finite)
+    new, a = advance(_unlimited(k), state, setpoint, measurement, measurement_rate, setpoint_rate)
+    new, effort, _ = _to_effort(k, state, new, a, mass_matrix, feedforward)
+    return new, effort
+
+
+def advance_terms_with_mass_matrix(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    mass_matrix: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+) -> tuple[PIDState, Terms]:
+    """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
+    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, measurement_rate, setpoint_rate)
+    new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
+    p, i, d = (_multiply(mass_matrix, term) for term in terms[:3])
+    given = namespace(effort).zeros_like(effort) + (0.0 if feedforward is None else feedforward)
+    return new, Terms(p, i, d, given, unsaturated, effort, effort != unsaturated, terms.finite)
 
 
 def check_gain_units(params: PIDParams) -> None:
@@ -124,6 +122,29 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
     else:
         integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
     return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
+
+
+def _unlimited(k: Coefficients) -> Coefficients:
+    return k._replace(effort_min=None, effort_max=None)
+
+
+def _to_effort(
+    k: Coefficients, old: PIDState, new: PIDState, a: Any, mass_matrix: Any, feedforward: Any
+) -> tuple[PIDState, Any, Any]:
+    """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
+    xp, low, high = namespace(*k, a, mass_matrix), k.effort_min, k.effort_max
+    wanted = _multiply(mass_matrix, a)
+    passive = 0.0 if feedforward is None else feedforward
+    effort = unsaturated = wanted + passive
+    if low is not None or high is not None:
+        share = _share(wanted, passive, low, high, xp)
+        effort = clip(share * wanted + passive, low, high, xp)
+        if k.ki_dt is not None and k.conditional is not None:
+            deeper = (share < 1) & (a * (new.integral - old.integral) > 0)
+            if not isinstance(k.conditional, Everywhere):
+                deeper = deeper & (k.conditional > 0)
+            new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
+    return new, effort, unsaturated
 
 
 def _multiply(matrix: Any, vector: Any) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 from batchpid.arrays.elementwise import namespace
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import step
+from batchpid.law.pid import step_terms
 from batchpid.law.state import PIDState
 
 
@@ -26,7 +26,7 @@ def drive_target(
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
-    state, _, terms = step(params, state, setpoint, measurement, dt, **inputs, terms=True)
+    state, terms = step_terms(params, state, setpoint, measurement, dt, **inputs)
     xp = namespace(*params, terms.i, setpoint)
     driven = params.kp > 0
     return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)

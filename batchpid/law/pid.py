@@ -67,9 +67,8 @@ def step(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    terms: bool = False,
-) -> Any:
-    """Advance the law by ``dt`` seconds; return ``(state, effort)``, with ``terms`` also :class:`Terms`.
+) -> tuple[PIDState, Any]:
+    """Advance the law by ``dt`` seconds; return the state and the effort.
 
     Arrays are (envs, joints), or (1, joints) for all envs, in the params' dtype; none is written to.
 
@@ -92,8 +91,15 @@ def step(
     InvalidArgumentError
         If dt is a Python number that is not positive and finite.
     """
-    rates = measurement_rate, setpoint_rate
-    return advance(discretise(params, dt), state, setpoint, measurement, *rates, feedforward, terms=terms)
+    k = discretise(params, dt)
+    return advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+
+
+def step_terms(
+    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+) -> tuple[PIDState, Terms]:
+    """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
+    return advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
 
 
 def advance(
@@ -104,10 +110,48 @@ def advance(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-    *,
-    terms: bool = False,
-) -> Any:
+) -> tuple[PIDState, Any]:
     """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`."""
+    new, effort, *_ = _advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    return new, effort
+
+
+def advance_terms(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
+) -> tuple[PIDState, Terms]:
+    """Advance the law with given coefficients; otherwise as :func:`step_terms`."""
+    inputs = setpoint, measurement, measurement_rate, setpoint_rate, feedforward
+    new, effort, u, parts, finite = _advance(k, state, *inputs)
+    xp, changed = namespace(u), effort != u
+    zero = xp.zeros_like(u)
+
+    def shown(term: Any) -> Any:  # a copy, over all envs
+        if term is None:
+            return zero
+        return zero + term if finite is None else xp.where(finite, term, zero)
+
+    p, i, d, given, whole = map(shown, (*parts, u))
+    if finite is None:
+        return new, Terms(p, i, d, given, whole, effort, changed, xp.isfinite(u))
+    return new, Terms(p, i, d, given, whole, effort, finite & changed, finite)
+
+
+def _advance(
+    k: Coefficients,
+    state: PIDState,
+    setpoint: Any,
+    measurement: Any,
+    measurement_rate: Any,
+    setpoint_rate: Any,
+    feedforward: Any,
+) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
+    """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
     finite = None
@@ -122,7 +166,7 @@ def advance(
     p = proportional(k, error, y, origin)
     u = p
 
-    integral = state.integral
+    i, integral = None, state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
         if k.ki_dt2 is not None and r_rate is not None:
@@ -132,7 +176,7 @@ def advance(
         i = state.integral if k.integration is None else integral
         u = u + i
 
-    derivative = None
+    d = derivative = None
     if k.kd is not None:
         rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
@@ -172,28 +216,7 @@ def advance(
     if finite is not None:
         new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
         effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
-    if not terms:
-        return new, effort
-
-    zero = xp.zeros_like(u)
-
-    def shown(term: Any) -> Any:  # a copy, over all envs
-        return zero + term if finite is None else xp.where(finite, term, zero)
-
-    return (
-        new,
-        effort,
-        Terms(
-            p=shown(p),
-            i=zero if k.ki_dt is None else shown(i),
-            d=zero if k.kd is None else shown(d),
-            feedforward=zero if ff is None else shown(ff),
-            unsaturated=shown(u),
-            effort=effort,
-            saturated=effort != u if finite is None else finite & (effort != u),
-            finite=xp.isfinite(u) if finite is None else finite,
-        ),
-    )
+    return new, effort, u, (p, i, d, ff), finite
 
 
 def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.pid import advance
+from batchpid.law.pid import advance, advance_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.tracing import Symbol, Trace, trace
@@ -31,11 +31,9 @@ def _trace(structures: tuple[tuple[Any, ...], ...], terms: bool, dtype: Any) -> 
     def function(*symbols: Symbol) -> list[Any]:
         rest = iter(symbols)
         k, state, inputs = ([next(rest) if one is ... else one for one in leaves] for leaves in structures)
-        new, *others = advance(Coefficients(*k), PIDState(*state), *inputs, terms=terms)
+        new, given = (advance_terms if terms else advance)(Coefficients(*k), PIDState(*state), *inputs)
         kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
-        if terms:
-            others = [*others[1], others[0]]
-        return [*(new[at] for at in kept), *others]
+        return [*(new[at] for at in kept), *([*given, given.effort] if isinstance(given, Terms) else [given])]
 
     counts = [leaves.count(...) for leaves in structures]
     traced = trace(function, counts[0], counts[1] + counts[2], dtype)

@@ -8,7 +8,7 @@ import batchpid as bp
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
+from batchpid.law.computed_torque import advance_terms_with_mass_matrix, advance_with_mass_matrix, per_inertia
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
@@ -85,11 +85,12 @@ class PIDLaw(NamedTuple):
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate = command
         rates = (qvel if self.measures_rate else None, setpoint_rate, feedforward)
-        if self.whole:
-            new, effort, *shown = advance_with_mass_matrix(k, state, setpoint, qpos, matrix, *rates, terms=observed)
-        else:
-            new, effort, *shown = bp.advance(k, state, setpoint, qpos, *rates, terms=observed)
-        return new, effort, shown[0].saturated if shown else None
+        inputs = (setpoint, qpos, matrix, *rates) if self.whole else (setpoint, qpos, *rates)
+        if not observed:
+            new, effort = (advance_with_mass_matrix if self.whole else bp.advance)(k, state, *inputs)
+            return new, effort, None
+        new, terms = (advance_terms_with_mass_matrix if self.whole else bp.advance_terms)(k, state, *inputs)
+        return new, terms.effort, terms.saturated
 
 
 def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:

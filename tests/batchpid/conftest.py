@@ -36,11 +36,11 @@ def backend(request: pytest.FixtureRequest) -> Backend:
     """NumPy on read-only arrays, and JAX compiled under its strict modes, in both float types."""
     dtype = np.float64 if request.param.endswith("64") else np.float32
     if request.param.startswith("numpy"):
-        return Backend(request.param, dtype, lambda value: read_only(value, dtype), bp.step)
+        return Backend(request.param, dtype, lambda value: read_only(value, dtype), bp.step_terms)
     if dtype == np.float64:
         request.getfixturevalue("x64")
     # One of the two as JAX compiles it by default.
-    step = (jax.jit if dtype == np.float64 else quick_jit)(bp.step, static_argnames=("dt", "terms"))
+    step = (jax.jit if dtype == np.float64 else quick_jit)(bp.step_terms, static_argnames="dt")
 
     def strict_step(*args: Any, **keywords: Any) -> Any:
         with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):

@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
+from batchpid.law.computed_torque import (
+    advance_terms_with_mass_matrix,
+    advance_with_mass_matrix,
+    check_gain_units,
+    convert_integral,
+    per_inertia,
+)
 
 DT = 1e-3
 
@@ -33,7 +39,8 @@ def test_the_effort_is_within_limits_and_keeps_the_direction_of_the_acceleration
     y, r = rng.normal(size=(2, envs, joints))
     k = bp.discretise(p, DT)
     state = bp.init(p, y)
-    new, effort, terms = advance_with_mass_matrix(k, state, r, y, matrix, feedforward=passive, terms=True)
+    new, terms = advance_terms_with_mass_matrix(k, state, r, y, matrix, feedforward=passive)
+    effort = terms.effort
     free = k._replace(effort_min=None, effort_max=None)
     _, acceleration = bp.advance(free, state, r, y)
     np.testing.assert_allclose(terms.unsaturated, np.einsum("eij,ej->ei", matrix, acceleration) + passive)
@@ -80,9 +87,9 @@ def test_every_joint_of_a_coupled_robot_responds_alike_and_on_a_straight_line():
         state = bp.init(p, q)
         saturated = False
         for _ in range(400):
-            state, effort, terms = advance_with_mass_matrix(k, state, goal, q, matrix, terms=True)
+            state, terms = advance_terms_with_mass_matrix(k, state, goal, q, matrix)
             saturated |= bool(terms.saturated.any())
-            v = v + DT * np.einsum("eij,ej->ei", inverse, effort)
+            v = v + DT * np.einsum("eij,ej->ei", inverse, terms.effort)
             q = q + DT * v
             progress = (q - start) / (goal - start)
             np.testing.assert_allclose(progress, np.broadcast_to(progress[:, :1], progress.shape), atol=1e-7)
@@ -133,7 +140,7 @@ def test_a_change_of_gain_units_keeps_the_effort_of_the_integral(unit):
     whole, other = params(4), params(4).replace(gain_units=unit)
     state = bp.init(other, y)._replace(integral=rng.normal(size=(3, 4)))
     there = convert_integral(state, other, whole, matrix)
-    *_, terms = advance_with_mass_matrix(bp.discretise(whole, DT), there, y, y, matrix, terms=True)
+    _, terms = advance_terms_with_mass_matrix(bp.discretise(whole, DT), there, y, y, matrix)
     np.testing.assert_allclose(terms.i, state.integral)
     back = convert_integral(there, whole, other, matrix)
     np.testing.assert_allclose(back.integral, state.integral)

@@ -19,7 +19,7 @@ def test_step_equals_the_scalar_law(backend, options, inputs, given):
 
 @pytest.mark.parametrize("given", SOME, ids=" ".join)
 def test_step_equals_the_scalar_law_on_some_inputs(options, inputs, given):
-    compare(Backend("numpy64", np.float64, read_only, bp.step), options, inputs, given)
+    compare(Backend("numpy64", np.float64, read_only, bp.step_terms), options, inputs, given)
 
 
 def compare(backend, options, inputs, given):
@@ -33,13 +33,12 @@ def compare(backend, options, inputs, given):
     saturated = []
     for t in range(len(inputs.setpoint)):
         keywords = {name: backend.array(getattr(inputs, name)[t]) for name in given}
-        state, effort, terms = backend.step(
+        state, terms = backend.step(
             params,
             state,
             backend.array(inputs.setpoint[t]),
             backend.array(inputs.measurement[t]),
             dt=DT,
-            terms=True,
             **keywords,
         )
         expected = np.array(
@@ -56,11 +55,10 @@ def compare(backend, options, inputs, given):
                 for env in range(ENVS)
             ]
         )
-        scale = sum(np.abs(np.asarray(term, float)) for term in terms[:4]) + 1
+        effort, scale = terms.effort, sum(np.abs(np.asarray(term, float)) for term in terms[:4]) + 1
         error = np.abs(np.asarray(effort, float) - expected) / scale
         assert effort.dtype == backend.dtype
         assert error.max() < backend.tolerance, f"step {t}"
-        assert np.array_equal(np.asarray(effort), np.asarray(terms.effort))
         saturated.append(np.asarray(terms.saturated))
         for env, joint in np.ndindex(ENVS, JOINTS):
             gap = abs(pids[env][joint].unsaturated - pids[env][joint].effort)
@@ -74,12 +72,12 @@ def test_terms_add_up(options, inputs):
     params = bp.make_params(JOINTS, **options)
     state = bp.init(params, inputs.measurement[0])
     for t in range(5):
-        state, effort, terms = bp.step(
-            params, state, inputs.setpoint[t], inputs.measurement[t], DT, feedforward=inputs.feedforward[t], terms=True
-        )
+        now, given = (params, state, inputs.setpoint[t], inputs.measurement[t], DT), inputs.feedforward[t]
+        (_, alone), (state, terms) = (function(*now, feedforward=given) for function in (bp.step, bp.step_terms))
+        assert np.array_equal(alone, terms.effort)
         assert np.array_equal(terms.feedforward, inputs.feedforward[t])
         np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)
-        assert np.array_equal(terms.saturated, effort != terms.unsaturated)
+        assert np.array_equal(terms.saturated, terms.effort != terms.unsaturated)
         assert terms.finite.all()
 
 

@@ -21,7 +21,7 @@ def roll(params, r, y, ff=None, state=None):
     """Return the states and the terms of a run."""
     state, states, terms = bp.init(params, y[0]) if state is None else state, [], []
     for t in range(len(r)):
-        state, _, shown = bp.step(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t], terms=True)
+        state, shown = bp.step_terms(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t])
         states.append(state)
         terms.append(shown)
     return states, terms
@@ -120,17 +120,17 @@ def test_a_non_finite_input_affects_its_joint_alone(run, bad, which, policy):
 def test_huge_finite_numbers_do_not_count_as_non_finite():
     params = bp.make_params(2, 1e-9, non_finite="zero")
     r, y = np.array([[np.inf, 1e308]]), np.array([[np.inf, 1e308]])
-    _, effort, terms = bp.step(params, bp.init(params, np.ones((1, 2))), r, y, DT, terms=True)
+    _, terms = bp.step_terms(params, bp.init(params, np.ones((1, 2))), r, y, DT)
     assert terms.finite.tolist() == [[False, True]]
-    assert effort.tolist() == [[0, 0]]
+    assert terms.effort.tolist() == [[0, 0]]
 
 
 def test_without_the_option_a_nan_propagates_in_its_joint():
     params = bp.make_params(2, 1.0, 1.0, 1.0, effort_limit=3.0, anti_windup="conditional")
     y = np.array([[0.0, np.nan]])
-    _, effort, terms = bp.step(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT, terms=True)
-    assert np.isfinite(effort[0, 0])
-    assert np.isnan(effort[0, 1])
+    _, terms = bp.step_terms(params, bp.init(params, y * 0), np.ones((1, 2)), y, DT)
+    assert np.isfinite(terms.effort[0, 0])
+    assert np.isnan(terms.effort[0, 1])
     assert terms.finite.tolist() == [[True, False]]
 
 
@@ -261,7 +261,8 @@ def test_arguments_are_neither_written_to_nor_kept(case, run):
         for leaf in state:
             if leaf is not None:
                 leaf.setflags(write=False)
-        state, effort, terms = bp.step(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2], terms=True)
+        state, terms = bp.step_terms(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2])
+        effort = terms.effort
         kept = effort.copy()
         effort += 1e6  # the caller's own, from here on
     assert np.array_equal(kept, expected.effort)
