@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from batchpid.sim.benchmark.workload import Case, Workload
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.workers.background import BACKGROUND
+from batchpid.sim.processes.background import BACKGROUND
+from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.workers.placement import pinned_cores
-from batchpid.sim.workers.worker import ONE_THREAD
 
 Float64 = NDArray[np.float64]
 TUTORIALS = ("tutorial", "tutorial, a process a core")

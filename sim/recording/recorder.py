@@ -30,10 +30,10 @@ from batchpid.checks.validate import flag, instance, integer
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.observation import RECORDED, Observation, Redraw
+from batchpid.sim.processes.background import Job, start_thread
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.partial_file import PartialFile
 from batchpid.sim.recording.recording_files import RecordingError
-from batchpid.sim.workers.background import Job, start_thread
 
 if TYPE_CHECKING:
     from batchpid.sim.runner import Runner

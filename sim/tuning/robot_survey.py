@@ -25,9 +25,9 @@ from lxml import etree
 
 from batchpid.checks.validate import integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.xml import SIZE_LIMIT
-from batchpid.sim.workers.worker import ONE_THREAD
 
 STAGES = ("reading the URDF", "building it in the engine", "checking it", "drawing moves", "moving it")
 """Stages of a survey of one robot, named in :attr:`RobotReport.error`."""

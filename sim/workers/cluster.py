@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.ray_options import ClusterWarning, Ray
-from batchpid.sim.workers.background import BACKGROUND
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.placement import split_in_shares
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.workers.background import BACKGROUND, Job
+from batchpid.sim.processes.background import BACKGROUND, Job
 from batchpid.sim.workers.cluster import Cluster
 from batchpid.sim.workers.node import Answer, Node, NodeInfo
 from batchpid.sim.workers.requests import Request, Run, Start

@@ -27,7 +27,7 @@ from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.workers.background import BACKGROUND
+from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
 from batchpid.sim.workers.memory import check_memory
 from batchpid.sim.workers.node import NodeInfo, Share

@@ -11,7 +11,6 @@ import select
 import signal
 import socket
 import struct
-import sys
 import time
 from typing import Any
 
@@ -26,9 +25,8 @@ _SPIN_SECONDS = 2e-4
 """Seconds of spinning for the next request before blocking: waking up takes 30 us."""
 
 
-def main() -> None:
-    """Serve; ``argv`` ends with three descriptors: socket, memory, last stack."""
-    channel, memory, trace = map(int, sys.argv[-3:])
+def main(channel: int, memory: int, trace: int) -> None:
+    """Serve, given the descriptors of the socket, the shared memory, and the file for the last stack."""
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     connection = Channel(socket.socket(fileno=channel))

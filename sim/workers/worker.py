@@ -1,15 +1,14 @@
 """Workers as the pool sees them: a loop in this process, or the parent's end of a worker process.
 
-A worker process is started fresh (no fork, no re-import of the caller's ``__main__``), so that it works from notebooks
-and from scripts without a main guard. It shares with its parent one socket and one block of memory, both by file
-descriptor. When the worker dies, its parent sees the socket close; when the parent dies, the kernel kills the worker.
-For the kernel the parent is the thread that started the worker; so that is one that lives as long as the process.
+A worker process is a fork of a fresh Python (:mod:`batchpid.sim.processes.fork_server`), not of the caller, and does
+not import the caller's ``__main__``: it works from notebooks and from scripts without a main guard. It shares with the
+caller one socket and one block of memory, both by file descriptor. When the worker dies, the caller sees the socket
+close; when the caller dies, the kernel kills the worker.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import pickle
 import signal
@@ -26,22 +25,20 @@ import cloudpickle
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
 from batchpid.sim.engine import native
+from batchpid.sim.engine.engines import MODULES
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.workers.background import BACKGROUND, Job
+from batchpid.sim.processes.background import BACKGROUND, Job
+from batchpid.sim.processes.fork_server import Child, fork
 from batchpid.sim.workers.channel import Channel
 from batchpid.sim.workers.liveness import Liveness
 from batchpid.sim.workers.requests import Request, Start
 from batchpid.sim.workers.serve import DONE
 from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
-ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
-"""Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the caller's thread."""
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
-_PR_SET_PDEATHSIG = 1  # of prctl(2): the signal that a process gets when its parent ends, even when it is stopped
 _STOP_LIMIT = 0.7  # seconds: Ctrl-Z and fg stop and continue parent and workers together
 
 
@@ -148,7 +145,7 @@ class ProcessWorker(Worker):
         self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
         self._is_unchecked = False  # since the last request was sent
         self._opening: Job[None] | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Child | None = None
 
     def open(self) -> None:
         self._opening = Job(self._open)
@@ -168,7 +165,12 @@ class ProcessWorker(Worker):
             ours, theirs = map(_above_standard_streams, socket.socketpair())
             undo.enter_context(ours)
             with theirs:
-                process = _spawn(theirs.fileno(), self._memory, self._trace.fileno())
+                process = fork(
+                    "batchpid.sim.workers.serve:main",
+                    (theirs.fileno(), self._memory, self._trace.fileno()),
+                    imports=("batchpid.sim.workers.serve", MODULES[self._start.options.engine]),
+                    environment=native.environment(),
+                )
             undo.pop_all()
         self._name = self._name.replace("(", f"(pid {process.pid}, ")
         self._liveness = Liveness(Path(f"/proc/{process.pid}/stat"))
@@ -261,37 +263,6 @@ def pickled(start: Any) -> bytes:
             f"cannot be sent to a worker process: {error}",
             remedy="let the function use nothing that cannot be pickled, or pass workers=0",
         ) from error
-
-
-def _spawn(*descriptors: int) -> subprocess.Popen[bytes]:
-    """Start :func:`batchpid.sim.workers.serve.main` in a process, given its descriptors."""
-    if not sys.executable:
-        raise OSError("sys.executable does not say which Python to run")
-    paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
-    paths.append(str(Path(__file__).parents[3]))  # where "" led to, before the caller changed the folder
-    program = (
-        f"import ctypes, os, sys; ctypes.CDLL(None).prctl({_PR_SET_PDEATHSIG}, {signal.SIGKILL:d}); "
-        "os.getppid() == int(sys.argv[2]) or os._exit(1); "
-        "import json; sys.path[:] = json.loads(sys.argv[1]); from batchpid.sim.workers.serve import main; main()"
-    )
-    closed = [stream for stream in (1, 2) if not _is_open(stream)]
-    return subprocess.Popen(
-        # -P: without it the working folder comes first, and a json.py in it would run in every worker.
-        [sys.executable, "-P", "-c", program, json.dumps(paths), str(os.getpid()), *map(str, descriptors)],
-        pass_fds=descriptors,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL if 1 in closed else None,
-        stderr=subprocess.DEVNULL if 2 in closed else None,
-        env=os.environ | ONE_THREAD | native.environment(),
-    )
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
 
 
 def _above_standard_streams(end: socket.socket) -> socket.socket:

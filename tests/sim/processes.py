@@ -8,13 +8,17 @@ from collections.abc import Iterable
 
 import psutil
 
+from batchpid.sim.processes.fork_server import server_pid
+
 PATIENCE = 200.0
 """Timeout [s] of events that should happen soon; long enough for a busy machine."""
 
 
 def children() -> set[psutil.Process]:
-    """Return the children of this process; libraries of other tests may have some that stay."""
-    return set(psutil.Process().children())
+    """Return the children of this process and of its fork server; libraries of other tests may have some that stay."""
+    server = server_pid()
+    direct = {child for child in psutil.Process().children() if child.pid != server}
+    return direct if server is None else direct | set(psutil.Process(server).children())
 
 
 def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:

@@ -23,7 +23,7 @@ from robots import load_bundled
 import batchpid.sim.runner
 from batchpid.errors import CallOrderError
 from batchpid.sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
-from batchpid.sim.workers.background import start_thread
+from batchpid.sim.processes.background import start_thread
 
 ROBOT = load_bundled("panda")
 N = 2
