@@ -78,3 +78,9 @@ def test_the_docs_are_built_with_their_warnings():
     recipe = re.search(r"^docs:.*\n\t(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
     assert "--strict" in recipe
     assert "quiet" not in recipe
+
+
+def test_the_tables_of_fields_are_those_of_the_code():
+    tables = importlib.import_module("docs.tables")
+    old = [path.name for path, text in tables.pages().items() if path.read_text() != text]
+    assert old == [], "run python docs/tables.py"

@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, namespace, wrap
+from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
@@ -224,12 +224,10 @@ def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, ke
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load.
     """
-    xp = namespace(*state, *params, measurement, mask)
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
-    chosen = xp.asarray(mask)[:, None]
-    return PIDState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))
+    return replace_envs(state, fresh, mask)
 
 
 def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:

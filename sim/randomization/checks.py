@@ -11,12 +11,11 @@ import batchpid as bp
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.motors.actuator_fields import NEUTRAL, TABLE
+from batchpid.motors.actuator_fields import FIELDS, TABLE
 from batchpid.sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 
-_PAIRED = ("saturation_effort", "no_load_speed")
 _HUGE = 1e300
 
 
@@ -84,20 +83,19 @@ def prepared_actuators(
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
     values: dict[str, NDArray[Any]] = {}
     for leaf, each in randomization.actuators.items():
-        neutral = {**NEUTRAL, TABLE: np.inf}[choice("actuators", leaf, [*NEUTRAL, TABLE])]
+        field = (FIELDS | TABLE)[choice("actuators", leaf, [*FIELDS, *TABLE])]
         nominal = getattr(known, leaf)
-        if nominal is None and np.isinf(neutral):
-            remedy = f"give the runner actuators with {'position_limit' if leaf == TABLE else leaf}"
+        if nominal is None and np.isinf(field.neutral):
+            remedy = f"give the runner actuators with {'position_limit' if leaf in TABLE else leaf}"
             raise InvalidArgumentError(f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy)
-        values[leaf] = np.full((1, robot.dof), neutral) if nominal is None else np.asarray(nominal)
+        values[leaf] = np.full((1, robot.dof), field.neutral) if nominal is None else np.asarray(nominal)
         for _, chosen, distribution in parts(f"actuators.{leaf}", each, robot.joint_names):
             for end in np.clip(distribution.support, -_HUGE, _HUGE):
                 rows = np.array(values[leaf])
                 rows[:, chosen] = distribution.apply(rows[:, chosen], end)
-                options: dict[str, Any] = dict.fromkeys(_PAIRED, 1.0) if leaf in _PAIRED else {}
-                options |= {"position_limit": (known.limit_positions[0], rows[0])} if leaf == TABLE else {leaf: rows}
-                checked = bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
-                delay = max(delay, 0.0 if checked.max_delay is None else float(checked.max_delay[0, 0]))
+                each_joint = rows.reshape(len(rows), robot.dof, -1).min(2)
+                field.checked(leaf, each_joint, robot.joint_names, infinite=leaf in TABLE)
+                delay = max(delay, float(rows.max())) if leaf.endswith("delay") else delay
     like = bp.make_actuators(robot.dof, command_delay=1e-3, position_noise=1.0, max_delay=max(delay, 1e-3))
     noisy = known.seed is None and not values.keys().isdisjoint(("position_noise", "velocity_noise"))
     delayed = not values.keys().isdisjoint(("command_delay", "sensor_delay"))
@@ -111,12 +109,11 @@ def prepared_actuators(
 
 def _check_range(name: str, each: Field, robot: Robot) -> None:
     """Check the results of the least and the largest draws."""
-    columns, nominal = elements(name, robot), nominal_values(name, robot)
-    strict = name == "link_mass"
+    columns, nominal, (_, _, lowest, strict, _) = elements(name, robot), nominal_values(name, robot), PHYSICAL[name]
     for _, chosen, distribution in parts(name, each, columns):
         if name in ("payload", "center_of_mass") and distribution.operation == "scale":
             raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
-        if name == "center_of_mass":
+        if np.isinf(lowest):
             continue
         known = nominal[chosen]
         if strict and distribution.operation == "scale":

@@ -201,7 +201,7 @@ def test_it_is_what_its_dict_describes():
         ({"params": {"deadband": Uniform(0, 1)}}, "params.deadband: is off"),
         ({"params": {"kp": Normal(0, 1)}}, "params.kp, joint 'panda_joint1'"),
         ({"actuators": {"delay": Uniform(0, 1)}}, "actuators: unknown option"),
-        ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay: out of range"),
+        ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay, joint .*: out of range"),
         ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
         ({"actuators": {"limit_efforts": Uniform(0, 2)}}, "actuators.limit_efforts: is off"),
         ({"payload": 0.5}, "payload: is no distribution"),
