@@ -32,10 +32,8 @@ class Field(NamedTuple):
     def checked(self, name: str, values: Any, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
         """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
 
-        Raises
-        ------
-        InvalidArgumentError
-            An entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral`` allows it.
+        Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``
+        allows it.
         """
         if not is_traced(values):
             infinite = infinite or math.isinf(self.neutral)
@@ -54,11 +52,8 @@ def check_leaves(
 ) -> None:
     """Check the leaves of a named tuple that may have been edited by hand.
 
-    Raises
-    ------
-    InvalidArgumentError
-        A leaf has neither one row nor ``num_envs``, not one column per joint, or values out of the bounds of
-        ``fields``; a leaf without a field may hold any numbers.
+    Raises InvalidArgumentError if a leaf has neither one row nor ``num_envs``, not one column per joint, or values out
+    of the bounds of ``fields``; a leaf without a field may hold any numbers.
     """
     for name, leaf in leaves._asdict().items():
         if leaf is None or isinstance(leaf, tuple) or name in WHOLE:

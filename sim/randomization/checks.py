@@ -20,13 +20,7 @@ _HUGE = 1e300
 
 
 def check_robot(randomization: Randomization, robot: Robot) -> None:
-    """Check that the names and ranges of ``randomization`` fit ``robot``.
-
-    Raises
-    ------
-    InvalidArgumentError
-        They do not.
-    """
+    """Check that the names and ranges of ``randomization`` fit ``robot``. Raises InvalidArgumentError if not."""
     for name, each in randomization.given.items():
         if name in PHYSICAL:
             _check_range(name, each, robot)
@@ -42,10 +36,7 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
 def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:
     """Check that the params have the leaves that are drawn, and that no draw makes them invalid.
 
-    Raises
-    ------
-    InvalidArgumentError
-        A leaf is off, or a draw may be out of its range.
+    Raises InvalidArgumentError if a leaf is off, or a draw may be out of its range.
     """
     for leaf, each in randomization.params.items():
         name = f"params.{leaf}"
@@ -66,13 +57,8 @@ def prepared_actuators(
 ) -> bp.Actuators | None:
     """Return ``actuators`` with every field that is drawn on, also where it is neutral, and histories long enough.
 
-    So the state has the same arrays in all envs.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A field is unknown, or has no effect under ``control``, or a draw may be out of its range, or changes a limit
-        that is off.
+    So the state has the same arrays in all envs. Raises InvalidArgumentError if a field is unknown, or has no effect
+    under ``control``, or a draw may be out of its range, or changes a limit that is off.
     """
     if not randomization.actuators:
         return actuators

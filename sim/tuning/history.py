@@ -26,10 +26,7 @@ class HistoryFile:
     def read(self) -> Any:
         """Return the state in the file, None if there is no file.
 
-        Raises
-        ------
-        InvalidArgumentError
-            The file is damaged, or its settings differ; the message names these.
+        Raises InvalidArgumentError if the file is damaged, or its settings differ; the message names these.
         """
         if self._path is None or not self._path.exists():
             return None

@@ -92,10 +92,7 @@ class Cluster:
     def place(self, index: int) -> tuple[Machine, int]:
         """Return the machine for the envs of a node, and the CPUs to reserve: none for a replacement.
 
-        Raises
-        ------
-        WorkerError
-            No machine is left.
+        Raises WorkerError if no machine is left.
         """
         if index not in self._has_started:
             self._has_started.add(index)
@@ -113,13 +110,7 @@ class Cluster:
         self._failures[machine.node_id] += 1
 
     def admit(self, info: NodeInfo, machine: Machine) -> None:
-        """Check that a new node rounds as the first one does.
-
-        Raises
-        ------
-        InvalidArgumentError
-            It does not.
-        """
+        """Check that a new node rounds as the first one does. Raises InvalidArgumentError if not."""
         if self._reference is None:
             self._reference = info
         first = self._reference

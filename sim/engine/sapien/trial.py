@@ -43,10 +43,7 @@ _servers: dict[int, Connection] = {}  # by the process id of the caller, which m
 def in_child(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
     """Call a function of a module in a child process; its result is returned, or its exception raised, here.
 
-    Raises
-    ------
-    RobotError
-        The child process crashed, or took longer than TIME_LIMIT.
+    Raises RobotError if the child process crashed, or took longer than TIME_LIMIT.
     """
     request = pickle.dumps((function, arguments, options))
     with _lock:
