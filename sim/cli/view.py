@@ -87,10 +87,7 @@ class ViewCommand:
             self.num_envs,
             controls=self.control,
             period=1 / self.fps,
-            compensate=self.compensate,
-            engine=self.engine,
-            physics=self.physics,
-            workers=self.workers,
+            **flags.chosen(self, "compensate engine physics workers"),
             params=gains and gains.params,
         )
         if robot.settings is not None:
