@@ -72,12 +72,11 @@ def advance_terms_with_mass_matrix(
     setpoint: Any,
     measurement: Any,
     mass_matrix: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
+    *rates: Any,
     feedforward: Any = None,
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
-    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, measurement_rate, setpoint_rate)
+    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
     p, i, d = (_multiply(mass_matrix, term) for term in terms[:3])
     given = namespace(effort).zeros_like(effort) + (0.0 if feedforward is None else feedforward)

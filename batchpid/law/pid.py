@@ -116,18 +116,9 @@ def advance(
     return new, effort
 
 
-def advance_terms(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
-) -> tuple[PIDState, Terms]:
-    """Advance the law with given coefficients; otherwise as :func:`step_terms`."""
-    inputs = setpoint, measurement, measurement_rate, setpoint_rate, feedforward
-    new, effort, u, parts, finite = _advance(k, state, *inputs)
+def advance_terms(k: Coefficients, state: PIDState, *inputs: Any, **named: Any) -> tuple[PIDState, Terms]:
+    """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
+    new, effort, u, parts, finite = _advance(k, state, *inputs, **named)
     xp, changed = namespace(u), effort != u
     zero = xp.zeros_like(u)
 
@@ -147,9 +138,9 @@ def _advance(
     state: PIDState,
     setpoint: Any,
     measurement: Any,
-    measurement_rate: Any,
-    setpoint_rate: Any,
-    feedforward: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
 ) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
     """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)

@@ -80,10 +80,11 @@ class Uniform(Distribution):
     low: float
     high: float
     kind = "uniform"
+    _lowest = -math.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._numbers("low", "high")
+        self._numbers("low", "high", low=self._lowest)
         self._ordered(self.low, self.high)
 
     @property
@@ -97,22 +98,11 @@ class Uniform(Distribution):
 
 
 @dataclass(frozen=True)
-class LogUniform(Distribution):
+class LogUniform(Uniform):
     """Distribution on [low, high], both > 0, whose logarithm is uniform."""
 
-    low: float
-    high: float
     kind = "log_uniform"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._numbers("low", "high", low=np.finfo(float).tiny)
-        self._ordered(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.low, self.high
+    _lowest = np.finfo(float).tiny
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
