@@ -38,7 +38,9 @@ DT, N = 1e-3, 3
 
 
 def parameters(function):
-    return list(inspect.signature(function).parameters) if inspect.isfunction(function) else None
+    """Return the names of a method's arguments; None for another attribute."""
+    callable_ = inspect.isfunction(function) or inspect.isclass(function)
+    return [name for name in inspect.signature(function).parameters if name != "self"] if callable_ else None
 
 
 @pytest.mark.parametrize(
