@@ -72,7 +72,7 @@ def document(
 def build(
     source: str, document: Any, schema: Schema, joints: dict[str, Any], make: Callable[..., T], **options: Any
 ) -> T:
-    """Return what the constructor ``make`` makes of a document's ``joints``, in their order, and of its head.
+    """Return the result of the constructor ``make`` for a document's ``joints``, in their order, and its head.
 
     Errors name the document and the key. ``options`` are further arguments.
     """
@@ -134,7 +134,7 @@ def check(source: str, document: Any, schema: Schema) -> dict[str, dict[str, Any
             wanted: type = type(neutral)
             for entry in value if isinstance(value, list) and value else [value]:
                 if not (is_number(entry) if wanted is float else isinstance(entry, wanted)):
-                    problem = f"is {reprlib.repr(entry)}, which is no {wanted.__name__}"
+                    problem = f"is {reprlib.repr(entry)}, which is not a {wanted.__name__}"
                     remedy = f"give one, as in '{key}: {neutral}', or a list of one per env"
                     raise error(source, key, problem, remedy, name)
     return joints

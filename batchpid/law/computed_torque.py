@@ -34,7 +34,7 @@ from batchpid.law.state import PIDState, Terms
 
 
 def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
-    """Return the coefficients of an effort law from those of an acceleration law, at ``inertia`` (envs, joints)."""
+    """Return the coefficients ``k`` of an acceleration law times ``inertia`` (envs, joints), for an effort law."""
     return k._replace(
         kp=k.kp * inertia,
         ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,

@@ -15,7 +15,7 @@ With setpoint r, measurement y and step dt, per env and joint::
 
 A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
 whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
-is what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
+the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
 conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
 discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
 """

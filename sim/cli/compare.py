@@ -54,7 +54,7 @@ class CompareCommand:
         if not self.engine:
             raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
         if picture is not None and len(sets) * len(set(self.engine)) < 2:
-            raise InvalidArgumentError("gains", "is one set", remedy="name two, or two engines, for a picture")
+            raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
         options = flags.chosen(self, "moves seed seconds workers physics collisions")

@@ -28,7 +28,9 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
             list(parts(name, each, robot.joint_names))
     if randomization.damping is not None and robot.dissipation != "urdf":
         remedy = "load the robot with dissipation='urdf'"
-        raise InvalidArgumentError("damping", "is the engine's under this dissipation", remedy=remedy)
+        raise InvalidArgumentError(
+            "damping", "cannot be drawn: with this dissipation the engine sets it", remedy=remedy
+        )
     if randomization.payload_link is not None:
         choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
 

@@ -68,7 +68,7 @@ def mapping(name: str, value: object) -> Mapping[str, Any]:
     """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
     if not isinstance(value, Mapping):
         remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
-        raise InvalidArgumentError(name, "is no mapping of fields to distributions", value=value, remedy=remedy)
+        raise InvalidArgumentError(name, "is not a mapping of fields to distributions", value=value, remedy=remedy)
     return value
 
 

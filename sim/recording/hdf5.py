@@ -141,7 +141,7 @@ def _open_dataset(file: Any, name: str) -> Any:
         raise ValueError(f"its {name} is not a dataset")
     storage = dataset.id.get_create_plist()
     if storage.get_layout() == h5py.h5d.VIRTUAL or storage.get_external_count():  # before its shape is asked for
-        raise ValueError(f"its {name} lies in other files")
+        raise ValueError(f"its {name} is stored in other files")
     if dataset.dtype.kind not in "biuf" or not dataset.ndim:
         raise ValueError(f"its {name} is not an array of numbers")
     return dataset

@@ -70,7 +70,9 @@ class Cluster:
         if not machines:
             least = self.options.cpus_per_node or 1
             raise InvalidArgumentError(
-                "cluster", f"has no machine of {least} CPUs", remedy="pass a smaller cpus_per_node, or start more of it"
+                "cluster",
+                f"has no machine of {least} CPUs",
+                remedy="pass a smaller cpus_per_node, or add larger machines",
             )
         packs = -(-options.num_envs // options.inseparable_envs)
         if self.options.placement == "PACK":

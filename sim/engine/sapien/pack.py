@@ -289,7 +289,7 @@ class Pack(SingleOwner):
         self.isolate(np.flatnonzero(isolated).tolist())
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
-        """Apply zero effort and no gravity to the robots of ``mask`` (M,), and both again to the others."""
+        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the others."""
         if (mask == self._suspended).all():
             return
         for robot, suspended in zip(self.robots, mask, strict=True):

@@ -28,7 +28,7 @@ _IDLE_SECONDS = 20.0
 _PROGRAM = """
 import json, os, sys
 if os.fork():
-    os._exit(0)  # the server is no child of the caller
+    os._exit(0)  # the server is not a child of the caller
 sys.path[:] = json.loads(sys.argv[1])
 from batchpid.sim.engine.sapien.trial import serve
 serve(int(sys.argv[2]))

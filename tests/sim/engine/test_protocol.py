@@ -39,8 +39,7 @@ DT, N = 1e-3, 3
 
 def parameters(function):
     """Return the names of a method's arguments; None for another attribute."""
-    callable_ = inspect.isfunction(function) or inspect.isclass(function)
-    return [name for name in inspect.signature(function).parameters if name != "self"] if callable_ else None
+    return [name for name in inspect.signature(function).parameters if name != "self"] if callable(function) else None
 
 
 @pytest.mark.parametrize(

@@ -204,10 +204,10 @@ def test_it_is_what_its_dict_describes():
         ({"actuators": {"command_delay": Uniform(0, 2)}}, "command_delay, joint .*: out of range"),
         ({"actuators": {"effort_limit": Uniform(0, 2)}}, "actuators.effort_limit: is off"),
         ({"actuators": {"limit_efforts": Uniform(0, 2)}}, "actuators.limit_efforts: is off"),
-        ({"payload": 0.5}, "payload: is no distribution"),
-        ({"payload": {"panda_hand": Uniform(0, 1)}}, "payload: is no distribution"),
-        ({"friction": {}}, "friction: is no distribution"),
-        ({"params": Uniform(0, 1)}, "params: is no mapping"),
+        ({"payload": 0.5}, "payload: is not a distribution"),
+        ({"payload": {"panda_hand": Uniform(0, 1)}}, "payload: is not a distribution"),
+        ({"friction": {}}, "friction: is not a distribution"),
+        ({"params": Uniform(0, 1)}, "params: is not a mapping"),
         ({"seed": -1}, "seed: out of range"),
         ({"each": "tick"}, "each: unknown option"),
     ],
@@ -232,10 +232,10 @@ def test_damping_that_the_engine_simulates_is_not_drawn():
     ("known", "message"),
     [
         ({"load": {"uniform": [0, 1]}}, "randomization: unknown option"),
-        ([1], "randomization: is no mapping"),
-        ({"payload": 0.5}, "payload: is no distribution"),
+        ([1], "randomization: is not a mapping"),
+        ({"payload": 0.5}, "payload: is not a distribution"),
         ({"params": {"kp": {"uniform": [2, 1]}}}, "params.kp: high is less than low"),
-        ({"friction": {"panda_joint1": {"normal": [0]}}}, "friction.panda_joint1: is no distribution"),
+        ({"friction": {"panda_joint1": {"normal": [0]}}}, "friction.panda_joint1: is not a distribution"),
     ],
 )
 def test_a_file_that_describes_none_is_refused(known, message):
