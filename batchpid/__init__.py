@@ -41,9 +41,8 @@ from batchpid.gains.stability import spectral_radius, stability_bound
 from batchpid.io.params_files import dumps_params, load_about, load_params, loads_params, save_params
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.drive import drive_target
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, advance_terms, init, reset, step, step_terms
+from batchpid.law.pid import advance, advance_terms, drive_target, init, reset, step, step_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard

@@ -23,10 +23,7 @@ IMPORTED = """
 def prepare() -> None:
     """Check the import path; of the command ``batchpid``, leave the working folder out and end quietly on Ctrl-C.
 
-    Raises
-    ------
-    ImportError
-        A file in the program's folder hides a module that this project imports.
+    Raises ImportError if a file in the program's folder hides a module that this project imports.
     """
     if _is_command():
         if not sys.flags.safe_path and sys.argv[0] == "-m" and sys.path[0] != _package_folder():

@@ -13,7 +13,7 @@ import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, discretise
 from batchpid.sim import Robot
 from batchpid.sim.benchmark.workload import Workload
-from batchpid.sim.loop.noise_blocks import NoiseBlocks
+from batchpid.sim.loop.numpy_executor import NoiseBlocks
 from batchpid.sim.loop.stage_program import compiled_stages
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10

@@ -178,7 +178,7 @@ class Session:
         """Wait for the end of the tick that was sent; return its observation."""
         sent = self._transactions.ready().sent
         if self._transactions.phase is not Phase.UNRECEIVED or sent is None:
-            raise CallOrderError("recv: no tick is under way; call send(setpoint) first")
+            raise CallOrderError("recv: no tick was sent; call send(setpoint) first")
         self._transactions.phase = Phase.IDLE
         self._warn(stacklevel=4)
         return sent

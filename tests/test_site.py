@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import re
 import sys
 import warnings
@@ -78,3 +78,11 @@ def test_the_docs_are_built_with_their_warnings():
     recipe = re.search(r"^docs:.*\n\t(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
     assert "--strict" in recipe
     assert "quiet" not in recipe
+
+
+def test_the_tables_of_fields_are_those_of_the_code():
+    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs/tables.py")
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    old = [path.name for path, text in tables.pages().items() if path.read_text() != text]
+    assert old == [], "run python docs/tables.py"

@@ -27,12 +27,8 @@ def digest(*values: Any) -> str:
 
     Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named tuples and
     dataclasses of these. Numbers of different types, and arrays of different dtypes, have different digests. Byte
-    order, strides, and the order of sets and mappings do not matter.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A value of another type, or an array of objects; the message names its place, such as ``[0].kp``.
+    order, strides, and the order of sets and mappings do not matter. Raises InvalidArgumentError for a value of another
+    type, or an array of objects; the message names its place, such as ``[0].kp``.
     """
     return _of_parts("values", [_digest(value, f"[{index}]") for index, value in enumerate(values)]).hex()
 

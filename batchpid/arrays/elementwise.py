@@ -30,6 +30,17 @@ def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
     return x if high is None else xp.minimum(x, high)
 
 
+def replace_envs(state: Any, fresh: Any, mask: Any) -> Any:
+    """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in ``fresh``."""
+    xp = namespace(*state, mask)
+    chosen = xp.asarray(mask)
+
+    def choose(new: Any, old: Any) -> Any:
+        return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return type(state)(*map(choose, fresh, state))
+
+
 def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
     """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to keep them."""
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)

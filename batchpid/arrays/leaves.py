@@ -15,7 +15,8 @@ import numpy as np
 
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import at_least, choice, entries, integer, is_traced, names, read_array
+from batchpid.arrays.field_tables import Field
+from batchpid.checks.validate import choice, entries, integer, is_traced, names, read_array
 from batchpid.errors import InvalidArgumentError
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
@@ -53,19 +54,18 @@ class LeafBuilder:
         if self.dtype not in (np.float32, np.float64):
             raise InvalidArgumentError("dtype", "unknown dtype", value=str(dtype), remedy="use float32 or float64")
 
-    def array(self, name: str, value: Any, low: float, *, above: bool = False, infinite: bool = False) -> Any:
-        """Return ``value`` as (1 | envs, joints) with every entry >= ``low``, or > where ``above``."""
+    def array(self, name: str, value: Any, field: Field) -> Any:
+        """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``; None stays."""
         if value is None:
             return None
         with np.errstate(over="ignore"):
             array = read_array(name, value, traced=True).astype(self.dtype)
-        array = self._by_env_and_joint(name, array)
-        return array if is_traced(array) else at_least(name, array, low, self.names, above=above, infinite=infinite)
+        return field.checked(name, self._by_env_and_joint(name, array), self.names)
 
-    def option(self, name: str, value: Any, *, neutral: float, above: bool = False, low: float = 0.0) -> Any:
-        """Return an option's leaf: None where it is ``neutral`` on every joint of every env."""
-        array = self.array(name, value, low, above=above, infinite=math.isinf(neutral))
-        return None if _is_everywhere(array, neutral) else self.freeze(array)
+    def option(self, name: str, value: Any, field: Field) -> Any:
+        """Return an option's leaf: None where it is neutral on every joint of every env."""
+        array = self.array(name, value, field)
+        return None if _is_everywhere(array, field.neutral) else self.freeze(array)
 
     def limits(self, name: str, symmetric: Any, low: Any, high: Any) -> tuple[Any, Any]:
         """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere."""
@@ -76,11 +76,11 @@ class LeafBuilder:
                     f"is given together with {name}_min or {name}_max",
                     remedy="give the symmetric limit, or the two ends",
                 )
-            upper = self.array(f"{name}_limit", symmetric, 0.0, infinite=True)
+            upper = self.array(f"{name}_limit", symmetric, Field(neutral=math.inf))
             lower = -upper
         else:
-            lower = self.array(f"{name}_min", low, -math.inf, infinite=True)
-            upper = self.array(f"{name}_max", high, -math.inf, infinite=True)
+            end = Field(neutral=math.inf, low=-math.inf)
+            lower, upper = self.array(f"{name}_min", low, end), self.array(f"{name}_max", high, end)
         if lower is not None and upper is not None and not (is_traced(lower) or is_traced(upper)):
             ends = np.broadcast_arrays(lower, upper)
             entries(f"{name}_min", ends[0], ends[0] <= ends[1], f"exceeds {name}_max", self.names)
@@ -135,7 +135,7 @@ class LeafBuilder:
                     remedy="choose that strategy or leave tracking_time out",
                 )
             return None
-        time = self.array("tracking_time", value, 0.0, infinite=True)
+        time = self.array("tracking_time", value, Field("s", math.inf))
         time = _rule_of_thumb(kp, ki, kd) if time is None else time
         time = namespace(time).where(back, time, math.inf)
         return None if _is_everywhere(time, math.inf) else self.freeze(time)

@@ -108,10 +108,8 @@ def spectral_radius(
     (q, q - q', I, d). Arguments are as in :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
     kp. Where ki is 0 its pole at 1 is left out.
     """
-    gains = {"kp": kp, "ki": ki, "kd": kd}
-    return np.abs(np.linalg.eigvals(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))).max(
-        -1
-    )
+    values = np.linalg.eigvals(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
+    return np.abs(values).max(-1)
 
 
 def oscillation(
@@ -130,8 +128,7 @@ def oscillation(
     Modes that decay faster are not seen in a motion. The other arguments are as in :func:`spectral_radius`. With the
     eigenvalue z of a mode, its continuous one is s = log(z) / dt, zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
     """
-    gains = {"kp": kp, "ki": ki, "kd": kd}
-    values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, filter_time=filter_time, damping=damping, **gains))
+    values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
     joints = values.shape[-1] // 4
     turns = np.abs(values.imag) > 1e-9
     s = np.log(np.where(turns, values, 1j)) / dt
@@ -151,11 +148,10 @@ def oscillation(
     )
 
 
-def _one_step(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> Float64:
+def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
     """Return the matrix (..., 4 joints, 4 joints) of one step on the state (q, q - q', I, d)."""
-    m, p, i, c, tau, b = _columns(
-        mass_matrix, dt, **{name: columns[name] for name in ("kp", "ki", "kd", "filter_time", "damping")}
-    )
+    columns = dict(zip(("kp", "ki", "kd", "filter_time", "damping"), gains, strict=True))
+    m, p, i, c, tau, b = _columns(mass_matrix, dt, **columns)
     shape = m.shape[:-1]
     one, zero = np.broadcast_to(np.eye(shape[-1]), m.shape), np.zeros(m.shape)
 

@@ -6,28 +6,32 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import write_atomically
+
+T = TypeVar("T")
 
 SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
 
 
 class Schema(NamedTuple):
-    """Form of a document."""
+    """Form of a document: ``format``, ``about``, the keys of ``head``, and ``joints``."""
 
     format: str
     """Its name and version."""
     content: str
     """Of the document, as in "params"."""
     head: tuple[str, ...]
-    """Keys of the document."""
-    off: Mapping[str, Any]
-    """Options of a joint, with the value that is off."""
+    """Options for all joints together."""
+    fields: Mapping[str, Field]
+    """Options of a joint."""
     required: tuple[str, ...] = ()
     """Options that every joint must have."""
 
@@ -43,6 +47,46 @@ def read(path: str | os.PathLike[str]) -> Any:
         problem = f"cannot be read: {error.strerror or error}"
         raise InvalidArgumentError(str(path), problem, remedy="check its name and your rights") from None
     return parse(str(path), content, SUFFIXES[path.suffix.lower()])
+
+
+def write(path: str | os.PathLike[str], dump: Callable[[str], str]) -> None:
+    """Write the text of ``dump(format)`` to ``path``; an existing file is replaced as a whole or not at all."""
+    path = file_path("path", path, SUFFIXES)
+    write_atomically(path, dump(SUFFIXES[path.suffix.lower()]))
+
+
+def document(
+    schema: Schema, options: dict[str, Any], joint_names: Sequence[str], about: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return the document of the ``options`` of a constructor: arrays (1 | envs, joints), or one for all joints."""
+    head = {name: options.pop(name) for name in schema.head if name in options}
+    joints = {
+        joint: {name: plain(column[:, index]) for name, column in options.items()}
+        for index, joint in enumerate(joint_names)
+    }
+    kept = {"about": json.loads(json.dumps(dict(about)))} if about else {}
+    head |= {"dtype": str(head["dtype"])} if "dtype" in head else {}
+    return {"format": schema.format, **kept, **head, "joints": joints}
+
+
+def build(
+    source: str, document: Any, schema: Schema, joints: dict[str, Any], make: Callable[..., T], **options: Any
+) -> T:
+    """Return the result of the constructor ``make`` for a document's ``joints``, in their order, and its head.
+
+    Errors name the document and the key. ``options`` are further arguments.
+    """
+    given = columns(source, joints, schema) | {name: document[name] for name in schema.head if name in document}
+    try:
+        return make(len(joints), **given, **options, joint_names=list(joints))
+    except InvalidArgumentError as error:
+        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
+        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None
+
+
+def parse_text(text: str) -> Any:
+    """Return the document in a text: JSON if it begins with a brace, else YAML."""
+    return parse("text", text, "json" if text.lstrip().startswith("{") else "yaml")
 
 
 def parse(source: str, text: str | bytes, format: str) -> Any:
@@ -70,7 +114,7 @@ def check(source: str, document: Any, schema: Schema) -> dict[str, dict[str, Any
         remedy = f"it must contain 'format: {schema.format}'"
         raise InvalidArgumentError(source, f"holds no {schema.content}", remedy=remedy)
     for key in document:
-        choice(f"{source}: key", key, schema.head)
+        choice(f"{source}: key", key, ("format", "about", *schema.head, "joints"))
     if not isinstance(document.get("about", {}), dict):
         raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
     choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
@@ -84,13 +128,14 @@ def check(source: str, document: Any, schema: Schema) -> dict[str, dict[str, Any
             if key not in options:
                 raise error(source, "joints", f"has no {key}", f"give '{key}: <number>'", name)
         for key, value in options.items():
-            if key not in schema.off:
-                raise error(source, key, "unknown option", f"use one of {', '.join(schema.off)}", name)
-            wanted: type = type(schema.off[key])
+            if key not in schema.fields:
+                raise error(source, key, "unknown option", f"use one of {', '.join(schema.fields)}", name)
+            neutral = schema.fields[key].neutral
+            wanted: type = type(neutral)
             for entry in value if isinstance(value, list) and value else [value]:
                 if not (is_number(entry) if wanted is float else isinstance(entry, wanted)):
-                    problem = f"is {reprlib.repr(entry)}, which is no {wanted.__name__}"
-                    remedy = f"give one, as in '{key}: {schema.off[key]}', or a list of one per env"
+                    problem = f"is {reprlib.repr(entry)}, which is not a {wanted.__name__}"
+                    remedy = f"give one, as in '{key}: {neutral}', or a list of one per env"
                     raise error(source, key, problem, remedy, name)
     return joints
 
@@ -101,10 +146,10 @@ def is_number(entry: Any) -> bool:
     return whole or isinstance(entry, float) or entry in ("inf", "-inf")
 
 
-def columns(source: str, joints: dict[str, dict[str, Any]], off: Mapping[str, Any]) -> dict[str, Any]:
+def columns(source: str, joints: dict[str, dict[str, Any]], schema: Schema) -> dict[str, Any]:
     """Return each option that some joint has, as an array (1 or envs, joints)."""
     columns: dict[str, Any] = {}
-    for key, neutral in off.items():
+    for key, (_, neutral, *_) in schema.fields.items():
         if not any(key in options for options in joints.values()):
             continue
         values = {name: options.get(key, neutral) for name, options in joints.items()}

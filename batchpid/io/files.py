@@ -26,12 +26,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path to write a file to, which then replaces the file at ``path``.
 
     It is in the same folder and has the same suffix. After an exception, a crash or a kill the older file is unchanged;
-    a link stays a link. The caller's file is on the disk before it takes its place.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
+    a link stays a link. The caller's file is on the disk before it takes its place. Raises OSError if the file cannot
+    be written.
     """
     path = Path(os.path.realpath(path))
     temporary = _temporary(path)
@@ -72,12 +68,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callab
 def try_writing(path: str | os.PathLike[str]) -> None:
     """Raise OSError unless a file can be written at ``path``, whose folder need not exist; leave nothing behind.
 
-    The trial is a small file in the same folder, or in the nearest folder above that exists.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written to, the disk is full, or ``path`` is not a regular file or may not be changed.
+    The trial is a small file in the same folder, or in the nearest folder above that exists. Raises OSError if the
+    folder cannot be written to, the disk is full, or ``path`` is not a regular file or may not be changed.
     """
     path = Path(os.path.realpath(path))
     try:

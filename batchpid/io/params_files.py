@@ -15,39 +15,17 @@ many digits as it takes to read the same number back. An option left out of a jo
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from batchpid.arrays.choices import CHOICES
-from batchpid.checks.validate import file_path, names
+from batchpid.checks.validate import names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.io.files import write_atomically
-from batchpid.law.params import PIDParams, make_params
+from batchpid.law.params import FIELDS, PIDParams, make_params
 
-FORMAT = "batchpid-params-1"
-OFF = {
-    "kp": 0.0,
-    "ki": 0.0,
-    "kd": 0.0,
-    "effort_min": -math.inf,
-    "effort_max": math.inf,
-    "effort_rate_limit": math.inf,
-    "integral_min": -math.inf,
-    "integral_max": math.inf,
-    "derivative_filter_time": 0.0,
-    "setpoint_weight": 1.0,
-    "setpoint_weight_derivative": 0.0,
-    "deadband": 0.0,
-    "tracking_time": math.inf,
-    "anti_windup": "none",
-    "continuous": False,
-}
-"""Options of a joint, with the value that is off."""
-SCHEMA = documents.Schema(FORMAT, "params", ("format", "about", "dtype", *CHOICES, "joints"), OFF, required=("kp",))
+SCHEMA = documents.Schema("batchpid-params-1", "params", ("dtype", *CHOICES), FIELDS, required=("kp",))
 
 
 def dumps_params(
@@ -70,23 +48,12 @@ def dumps_params(
         Names that do not fit the params, or an unknown format.
     """
     joints = names("joint_names", joint_names, params.num_joints)
-    options = params.options()
-    document: dict[str, Any] = {"format": FORMAT}
-    if about:
-        document["about"] = json.loads(json.dumps(dict(about)))
-    document["dtype"] = str(options.pop("dtype"))
-    document |= {name: options.pop(name) for name in CHOICES}
-    document["joints"] = {
-        joint: {name: documents.plain(column[:, index]) for name, column in options.items()}
-        for index, joint in enumerate(joints)
-    }
-    return documents.render(document, format)
+    return documents.render(documents.document(SCHEMA, params.options(), joints, about), format)
 
 
 def loads_params(text: str, joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
     """Return the params in a text, JSON if it begins with a brace and else YAML; otherwise as :func:`load_params`."""
-    format = "json" if text.lstrip().startswith("{") else "yaml"
-    return _build("text", documents.parse("text", text, format), joint_names)
+    return _build("text", documents.parse_text(text), joint_names)
 
 
 def save_params(
@@ -96,8 +63,7 @@ def save_params(
 
     An existing file is replaced as a whole or not at all.
     """
-    path = file_path("path", path, documents.SUFFIXES)
-    write_atomically(path, dumps_params(params, joint_names, about, documents.SUFFIXES[path.suffix.lower()]))
+    documents.write(path, lambda format: dumps_params(params, joint_names, about, format))
 
 
 def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None = None) -> tuple[PIDParams, list[str]]:
@@ -130,14 +96,8 @@ def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tup
     if missing or unknown:
         problem = f"does not hold these joints: missing {missing}, unknown {unknown}"
         raise InvalidArgumentError(source, problem, remedy=f"the file's joints are {', '.join(joints)}")
-    head = {name: document[name] for name in ("dtype", *CHOICES) if name in document}
     for name in order if any("tracking_time" in entry for entry in joints.values()) else ():
         if "back_calculation" in str(joints[name].get("anti_windup")) and "tracking_time" not in joints[name]:
             problem = "is missing, while other joints have it"
             raise documents.error(source, "tracking_time", problem, "give it too", name)
-    options = documents.columns(source, {joint: joints[joint] for joint in order}, OFF)
-    try:
-        return make_params(len(order), **options, **head, joint_names=order), order
-    except InvalidArgumentError as error:
-        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
-        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None
+    return documents.build(source, document, SCHEMA, {name: joints[name] for name in order}, make_params), order

@@ -34,7 +34,7 @@ from batchpid.law.state import PIDState, Terms
 
 
 def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
-    """Return the coefficients of an effort law from those of an acceleration law, at ``inertia`` (envs, joints)."""
+    """Return the coefficients ``k`` of an acceleration law times ``inertia`` (envs, joints), for an effort law."""
     return k._replace(
         kp=k.kp * inertia,
         ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
@@ -72,12 +72,11 @@ def advance_terms_with_mass_matrix(
     setpoint: Any,
     measurement: Any,
     mass_matrix: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
+    *rates: Any,
     feedforward: Any = None,
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
-    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, measurement_rate, setpoint_rate)
+    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
     p, i, d = (_multiply(mass_matrix, term) for term in terms[:3])
     given = namespace(effort).zeros_like(effort) + (0.0 if feedforward is None else feedforward)

@@ -22,7 +22,7 @@ continuous time. The explicit law with kp = w^2 and kd = 2 w is stable for w dt 
 
 - Setpoint: r is the position for the end of the step. The explicit law takes it for the beginning, and leads by dt r'.
 - Integral: the state is I / D, the acceleration that it contributes. Its limits, anti-windup and bumpless transfer
-  are those of the explicit law. The part n dt ki of kp* is outside of its limits.
+  work as in the explicit law. The part n dt ki of kp* is outside of its limits.
 - Saturation: limits act on u as before. The prediction assumes that a is delivered.
 - Dead zone: P and I see the error less the zone; the predicted motion dt v damps within it, too.
 - Rate: v is the measured rate or the difference of positions, which is the same under semi-implicit Euler. A filter of
@@ -82,7 +82,7 @@ def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
 
 
 def as_explicit(params: PIDParams, dt: Any) -> PIDParams:
-    """Return ``params``, or in place of implicit ones those of the explicit law with the same gains at ``dt`` [s].
+    """Return ``params``; implicit ones as params of the explicit law with the same gains at ``dt`` [s].
 
     Their ``setpoint_weight_derivative`` is for a setpoint rate that is given.
     """

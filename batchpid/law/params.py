@@ -1,7 +1,7 @@
 """The parameters of the control law: build, broadcast, validate.
 
 A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An option
-that is off is ``None``: it is no leaf, so NumPy skips it and ``jax.jit`` compiles a law without it. Choices that carry
+that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a law without it. Choices that carry
 no number, such as the integration order, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
 structure, and so static under every JAX transform.
 """
@@ -16,10 +16,32 @@ import numpy as np
 
 from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
 from batchpid.arrays.display import params_summary
+from batchpid.arrays.field_tables import Field, check_leaves
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.keywords import known_keywords
-from batchpid.checks.validate import at_least, is_traced
+from batchpid.checks.validate import is_traced
 from batchpid.errors import InvalidArgumentError
+
+FIELDS = {
+    "kp": Field("N m/rad or N/m"),
+    "ki": Field("N m/(rad s) or N/(m s)"),
+    "kd": Field("N m s/rad or N s/m"),
+    "effort_min": Field("N m or N", -math.inf, low=-math.inf),
+    "effort_max": Field("N m or N", math.inf, low=-math.inf),
+    "effort_rate_limit": Field("N m/s or N/s", math.inf, above=True),
+    "integral_min": Field("N m or N", -math.inf, low=-math.inf),
+    "integral_max": Field("N m or N", math.inf, low=-math.inf),
+    "derivative_filter_time": Field("s"),
+    "setpoint_weight": Field("1", 1.0),
+    "setpoint_weight_derivative": Field("1"),
+    "deadband": Field("rad or m"),
+    "tracking_time": Field("s", math.inf),
+    "anti_windup": Field(neutral="none"),
+    "continuous": Field(neutral=False),
+}
+"""Options of a joint."""
+_PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"
+"""Options that become a leaf without regard to others."""
 
 
 class PIDParams(NamedTuple):
@@ -132,23 +154,11 @@ class PIDParams(NamedTuple):
 
     def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
         """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
-        shapes = (1, self.num_joints), (num_envs, self.num_joints)
+        check_leaves("params", self, FIELDS, num_envs, joint_names)
         for name, leaf in zip(self._fields, self, strict=True):
-            if not _is_array(leaf):
-                continue
-            if leaf.shape not in shapes:
-                raise InvalidArgumentError(
-                    f"params.{name}",
-                    f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
-                    remedy="slice or rebuild the params",
-                )
-            if leaf.dtype != self.dtype:
-                raise InvalidArgumentError(
-                    f"params.{name}", f"is {leaf.dtype}, but kp is {self.dtype}", remedy="use one dtype"
-                )
-            if not is_traced(leaf):
-                low = -math.inf if name in _SIGNED else 0.0
-                at_least(f"params.{name}", np.asarray(leaf), low, joint_names, infinite=True)
+            if _is_array(leaf) and leaf.dtype != self.dtype:
+                problem = f"is {leaf.dtype}, but kp is {self.dtype}"
+                raise InvalidArgumentError(f"params.{name}", problem, remedy="use one dtype")
 
 
 @known_keywords
@@ -206,7 +216,7 @@ def make_params(
     derivative_filter_time
         Time constant of the derivative's first-order low-pass [s]; 0: unfiltered.
     setpoint_weight, setpoint_weight_derivative
-        b and c: the proportional term acts on b*setpoint - measurement, the derivative on c*setpoint - measurement.
+        b and c: with setpoint r and measurement y, the proportional term acts on b r - y, the derivative on c r - y.
     deadband
         Half width of the dead zone: within it P and I act on an error of 0, outside on the distance to the zone.
     anti_windup
@@ -236,7 +246,7 @@ def make_params(
         :mod:`batchpid.law.computed_torque`).
     discretization
         "explicit": P, I and D act on position and velocity at the beginning of the step, which is unstable at large
-        gains or time steps. "implicit": on those at its end (:mod:`batchpid.law.implicit`), stable at any time step.
+        gains or time steps; "implicit": on those at its end (:mod:`batchpid.law.implicit`), stable at any time step.
         It needs gain_units "mass_matrix" and no derivative_filter_time; without kd, kd is 0.
     joint_names
         Used in error messages.
@@ -248,15 +258,16 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    build = LeafBuilder(joints, joint_names, dtype, locals().values())
+    given = locals()
+    build = LeafBuilder(joints, joint_names, dtype, given.values())
     if kp is None:
         raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
-    p, i, d = (build.array(name, gain, 0.0) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
-    filter_time = build.option("derivative_filter_time", derivative_filter_time, neutral=0.0)
-    units, implicit = build.choice("gain_units", gain_units), build.choice("discretization", discretization)
-    if implicit is not None:
-        _check_implicit(units, filter_time)
-        d = build.array("kd", 0.0, 0.0) if d is None else d
+    p, i, d = (build.array(name, gain, FIELDS[name]) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    options = {name: build.option(name, given[name], FIELDS[name]) for name in _PLAIN}
+    chosen = {name: build.choice(name, given[name]) for name in CHOICES}
+    if chosen["discretization"] is not None:
+        _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
+        d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
     effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
     integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
     clamp, conditional, back = build.strategies(anti_windup)
@@ -267,27 +278,14 @@ def make_params(
         kd=build.freeze(d),
         effort_min=build.freeze(effort_ends[0]),
         effort_max=build.freeze(effort_ends[1]),
-        effort_rate_limit=build.option("effort_rate_limit", effort_rate_limit, neutral=math.inf, above=True),
         integral_min=build.freeze(integral_ends[0]),
         integral_max=build.freeze(integral_ends[1]),
-        derivative_filter_time=filter_time,
-        setpoint_weight=build.option("setpoint_weight", setpoint_weight, neutral=1.0),
-        setpoint_weight_derivative=build.option("setpoint_weight_derivative", setpoint_weight_derivative, neutral=0.0),
-        deadband=build.option("deadband", deadband, neutral=0.0),
         tracking_time=build.tracking_time(tracking_time, back, p, i, d),
         conditional=Everywhere() if conditional is not None and conditional.all() else build.freeze(conditional),
         continuous=build.mask("continuous", continuous),
-        integration=build.choice("integration", integration),
-        first_derivative=build.choice("first_derivative", first_derivative),
-        weight_origin=build.choice("weight_origin", weight_origin),
-        non_finite=build.choice("non_finite", non_finite),
-        measurement_rate=build.choice("measurement_rate", measurement_rate),
-        gain_units=units,
-        discretization=implicit,
+        **options,
+        **chosen,
     )
-
-
-_SIGNED = ("effort_min", "effort_max", "integral_min", "integral_max")
 
 
 def _is_array(leaf: Any) -> bool:

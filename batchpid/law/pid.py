@@ -15,7 +15,7 @@ With setpoint r, measurement y and step dt, per env and joint::
 
 A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
 whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
-is what the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
+the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
 conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
 discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
 """
@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, namespace, wrap
+from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
@@ -116,18 +116,9 @@ def advance(
     return new, effort
 
 
-def advance_terms(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
-) -> tuple[PIDState, Terms]:
-    """Advance the law with given coefficients; otherwise as :func:`step_terms`."""
-    inputs = setpoint, measurement, measurement_rate, setpoint_rate, feedforward
-    new, effort, u, parts, finite = _advance(k, state, *inputs)
+def advance_terms(k: Coefficients, state: PIDState, *inputs: Any, **named: Any) -> tuple[PIDState, Terms]:
+    """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
+    new, effort, u, parts, finite = _advance(k, state, *inputs, **named)
     xp, changed = namespace(u), effort != u
     zero = xp.zeros_like(u)
 
@@ -147,9 +138,9 @@ def _advance(
     state: PIDState,
     setpoint: Any,
     measurement: Any,
-    measurement_rate: Any,
-    setpoint_rate: Any,
-    feedforward: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    feedforward: Any = None,
 ) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
     """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
@@ -224,12 +215,10 @@ def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, ke
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load.
     """
-    xp = namespace(*state, *params, measurement, mask)
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
-    chosen = xp.asarray(mask)[:, None]
-    return PIDState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))
+    return replace_envs(state, fresh, mask)
 
 
 def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
@@ -255,3 +244,25 @@ def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
 def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
     """Return kp (b e - (1 - b) (y - o)), which has no spike where y wraps."""
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))
+
+
+def drive_target(
+    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+) -> tuple[PIDState, Any]:
+    """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as a PID::
+
+        target = setpoint + I / kp          so that kp (target - y) - kd dy/dt = P + I + D
+
+    The drive (SAPIEN's ``set_drive_property(stiffness=kp, damping=kd)``) integrates P and D implicitly and is as
+    stable as without I. I evolves as in :func:`batchpid.step`, whose effort predicts the drive's effort:
+    ``effort_min`` and ``effort_max`` are the drive's force limit, and anti-windup works against it. Where kp is 0 the
+    target is the setpoint.
+
+    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
+    the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
+    in haosulab/SAPIEN#178.
+    """
+    state, terms = step_terms(params, state, setpoint, measurement, dt, **inputs)
+    xp = namespace(*params, terms.i, setpoint)
+    driven = params.kp > 0
+    return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)

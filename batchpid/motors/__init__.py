@@ -10,6 +10,7 @@ Build parameters with :func:`make_actuators`; thread a state through :func:`deli
 See docs/actuators.md.
 """
 
+from batchpid.arrays.elementwise import replace_envs as reset
 from batchpid.motors import actuator_presets as presets
 from batchpid.motors.actuator_dynamics import (
     STAGES,
@@ -23,7 +24,6 @@ from batchpid.motors.actuator_dynamics import (
     init,
     measure,
     measurement_noise,
-    reset,
 )
 from batchpid.motors.actuator_fields import JOINT_SIDE
 from batchpid.motors.actuator_files import dumps_actuators, load_actuators, loads_actuators, save_actuators

@@ -291,17 +291,6 @@ def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) 
     return position, velocity
 
 
-def reset(state: ActuatorState, fresh: ActuatorState, mask: Any) -> ActuatorState:
-    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
-    xp = namespace(*state, mask)
-    chosen = xp.asarray(mask)
-
-    def choose(new: Any, old: Any) -> Any:
-        return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    return ActuatorState(*(choose(new, old) for new, old in zip(fresh, state, strict=True)))
-
-
 def _twice(delay: Any, xp: Any) -> Any:
     return xp.concatenate((delay, delay), axis=1)
 

@@ -4,50 +4,37 @@ from __future__ import annotations
 
 import math
 
-NEUTRAL: dict[str, float] = {
-    "command_delay": 0.0,
-    "sensor_delay": 0.0,
-    "lag": 0.0,
-    "strength": 1.0,
-    "bias": 0.0,
-    "saturation_effort": math.inf,
-    "no_load_speed": math.inf,
-    "effort_limit": math.inf,
-    "coulomb": 0.0,
-    "static": 0.0,
-    "viscous": 0.0,
-    "armature": 0.0,
-    "backlash": 0.0,
-    "position_resolution": 0.0,
-    "velocity_resolution": 0.0,
-    "position_noise": 0.0,
-    "velocity_noise": 0.0,
-}
-"""Numbers of a joint, with the value that is off."""
-TABLE = "limit_efforts"
-"""Numbers of each point of a joint's position-dependent limit."""
-JOINT_SIDE = ("coulomb", "static", "viscous", "armature")
-"""Fields that act on the joint and not on the signals: :class:`batchpid.sim.Runner` gives them to the simulator."""
-SENSOR_SIDE = (
-    "sensor_delay",
-    "backlash",
-    "position_resolution",
-    "velocity_resolution",
-    "position_noise",
-    "velocity_noise",
-)
-"""Fields between the joint's state and its measurement."""
-MOTOR_SIDE = (
-    "command_delay",
-    "lag",
-    "strength",
-    "bias",
-    "saturation_effort",
-    "no_load_speed",
-    "effort_limit",
-    "limit_positions",
-    "limit_efforts",
-)
-"""Fields between the effort asked for and the effort delivered."""
+from batchpid.arrays.field_tables import Field
+
 MAX_DELAY = 1.0
 """Longest delay [s]."""
+MOTOR_SIDE = {
+    "command_delay": Field("s", high=MAX_DELAY),
+    "lag": Field("s"),
+    "strength": Field("1", 1.0),
+    "bias": Field("N m or N", low=-math.inf),
+    "saturation_effort": Field("N m or N", math.inf, above=True),
+    "no_load_speed": Field("rad/s or m/s", math.inf, above=True),
+    "effort_limit": Field("N m or N", math.inf),
+}
+"""Numbers of a joint between the effort asked for and the effort delivered."""
+JOINT_SIDE = {
+    "coulomb": Field("N m or N"),
+    "static": Field("N m or N"),
+    "viscous": Field("N m s/rad or N s/m"),
+    "armature": Field("kg m^2 or kg"),
+}
+"""Numbers that act on the joint and not on the signals: :class:`batchpid.sim.Runner` gives them to the simulator."""
+SENSOR_SIDE = {
+    "sensor_delay": Field("s", high=MAX_DELAY),
+    "backlash": Field("rad or m"),
+    "position_resolution": Field("rad or m"),
+    "velocity_resolution": Field("rad/s or m/s"),
+    "position_noise": Field("rad or m"),
+    "velocity_noise": Field("rad/s or m/s"),
+}
+"""Numbers between the joint's state and its measurement."""
+FIELDS = MOTOR_SIDE | JOINT_SIDE | SENSOR_SIDE
+"""Numbers of a joint."""
+TABLE = {"limit_efforts": Field("N m or N", math.inf)}
+"""Numbers of each point of a joint's position-dependent limit."""

@@ -15,24 +15,21 @@ joint is off there, and a joint that is left out has ideal actuators.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from batchpid.checks.validate import file_path, names
+from batchpid.arrays.field_tables import Field
+from batchpid.checks.validate import names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.io.files import write_atomically
-from batchpid.motors.actuator_fields import NEUTRAL
+from batchpid.motors.actuator_fields import FIELDS
 from batchpid.motors.actuators import Actuators, make_actuators
 
-FORMAT = "batchpid-actuators-1"
-_OFF = {**NEUTRAL, "continuous": False}
-_HEAD = ("format", "about", "dtype", "seed", "max_delay", "joints")
-_SCHEMA = documents.Schema(FORMAT, "actuators", _HEAD, _OFF)
+_FIELDS = {**FIELDS, "continuous": Field(neutral=False)}
+_SCHEMA = documents.Schema("batchpid-actuators-1", "actuators", ("dtype", "seed", "max_delay"), _FIELDS)
 _TABLE = "position_limit"
 
 
@@ -46,18 +43,8 @@ def dumps_actuators(
     env.
     """
     joints, options = names("joint_names", joint_names, actuators.num_joints), actuators.options()
-    document: dict[str, Any] = {"format": FORMAT}
-    if about:
-        document["about"] = json.loads(json.dumps(dict(about)))
-    for name in ("dtype", "seed", "max_delay"):
-        if name in options:
-            value = options.pop(name)
-            document[name] = str(value) if name == "dtype" else value
     table = options.pop(_TABLE, None)
-    document["joints"] = {
-        joint: {name: documents.plain(column[:, index]) for name, column in options.items()}
-        for index, joint in enumerate(joints)
-    }
+    document = documents.document(_SCHEMA, options, joints, about)
     if table is not None and max(map(len, table)) > 1:
         remedy = "save those of one env: actuators.for_envs(slice(k, k + 1))"
         raise InvalidArgumentError("actuators", "have a position_limit for each env, and a file has one", remedy=remedy)
@@ -77,9 +64,7 @@ def save_actuators(
 
     An existing file is replaced as a whole or not at all.
     """
-    path = file_path("path", path, documents.SUFFIXES)
-    text = dumps_actuators(actuators, joint_names, about, documents.SUFFIXES[path.suffix.lower()])
-    write_atomically(path, text)
+    documents.write(path, lambda format: dumps_actuators(actuators, joint_names, about, format))
 
 
 def load_actuators(
@@ -102,8 +87,7 @@ def load_actuators(
 
 def loads_actuators(text: str, joint_names: Sequence[str] | None = None) -> tuple[Actuators, list[str]]:
     """Return the actuators in a text, JSON if it begins with a brace and else YAML; otherwise as the file's."""
-    format = "json" if text.lstrip().startswith("{") else "yaml"
-    return _build("text", documents.parse("text", text, format), joint_names)
+    return _build("text", documents.parse_text(text), joint_names)
 
 
 def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tuple[Actuators, list[str]]:
@@ -114,15 +98,9 @@ def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tup
     if unknown := sorted(set(joints) - set(order)):
         problem, remedy = f"holds unknown joints {unknown}", f"the robot's joints are {', '.join(order)}"
         raise InvalidArgumentError(source, problem, remedy=remedy)
-    options = documents.columns(source, {joint: joints.get(joint, {}) for joint in order}, _OFF)
-    options |= {name: document[name] for name in ("dtype", "seed", "max_delay") if name in document}
-    if tables:
-        options[_TABLE] = _joined(tables, order)
-    try:
-        return make_actuators(len(order), **options, joint_names=order), order
-    except InvalidArgumentError as error:
-        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
-        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None
+    position_limit = {_TABLE: _joined(tables, order)} if tables else {}
+    ordered = {joint: joints.get(joint, {}) for joint in order}
+    return documents.build(source, document, _SCHEMA, ordered, make_actuators, **position_limit), order
 
 
 def _take_tables(source: str, document: Any) -> dict[str, Any]:

@@ -6,18 +6,18 @@ that is off is ``None``: it is not a leaf and costs nothing.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.display import span, summary
+from batchpid.arrays.field_tables import check_leaves
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.keywords import known_keywords
-from batchpid.checks.validate import at_least, entries, integer, is_traced, number, read_array
+from batchpid.checks.validate import entries, integer, is_traced, number, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors.actuator_fields import JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, NEUTRAL, SENSOR_SIDE
+from batchpid.motors.actuator_fields import FIELDS, JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, SENSOR_SIDE, TABLE
 
 
 class Actuators(NamedTuple):
@@ -73,7 +73,7 @@ class Actuators(NamedTuple):
     @property
     def delivers(self) -> bool:
         """True if the efforts delivered differ from those asked for."""
-        return any(getattr(self, name) is not None for name in MOTOR_SIDE)
+        return any(getattr(self, name) is not None for name in (*MOTOR_SIDE, *TABLE))
 
     @property
     def is_ideal(self) -> bool:
@@ -199,7 +199,7 @@ def make_actuators(
     position_noise, velocity_noise
         Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
     seed
-        Of the noise, from 0 to 2^64 - 1.
+        Seed of the noise, from 0 to 2^64 - 1.
     max_delay
         Length of the histories that delayed signals have [s]; None: the largest delay of all envs. A longer one is
         needed where delays are to grow in flight: a delay beyond the history returns its oldest sample.
@@ -217,10 +217,7 @@ def make_actuators(
     """
     given = locals()
     build = LeafBuilder(joints, joint_names, dtype, given.values())
-    leaves: dict[str, Any] = {}
-    for name, neutral in NEUTRAL.items():
-        above, low = name in ("saturation_effort", "no_load_speed"), -math.inf if name == "bias" else 0.0
-        leaves[name] = build.option(name, given[name], neutral=neutral, above=above, low=low)
+    leaves: dict[str, Any] = {name: build.option(name, given[name], field) for name, field in FIELDS.items()}
     longest = MAX_DELAY if max_delay is None else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
     delays = [(name, delay) for name in ("command_delay", "sensor_delay") if (delay := leaves[name]) is not None]
     for name, delay in delays:
@@ -274,15 +271,4 @@ def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Any, Any]
 
 def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
     """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
-    shapes = (1, len(joint_names)), (num_envs, len(joint_names))
-    for name, leaf in actuators._asdict().items():
-        if leaf is None or name in ("max_delay", "seed"):
-            continue
-        if (leaf.shape if leaf.ndim == 2 else leaf.shape[:2]) not in shapes:
-            raise InvalidArgumentError(
-                f"actuators.{name}",
-                f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}",
-                remedy=f"give one row, or one row per env, of {', '.join(joint_names)}",
-            )
-        low = -math.inf if name in ("bias", "limit_positions") else 0.0
-        at_least(f"actuators.{name}", np.asarray(leaf), low, joint_names, infinite=True)
+    check_leaves("actuators", actuators, FIELDS | TABLE, num_envs, joint_names)

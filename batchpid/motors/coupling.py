@@ -48,10 +48,7 @@ class Coupling:
     def __init__(self, joints: int, followers: Sequence[Follower]) -> None:
         """Couple ``followers``, one entry for each; a chain of followers ends at its last leader.
 
-        Raises
-        ------
-        ValueError
-            A joint follows itself, through others or directly.
+        Raises ValueError if a joint follows itself, through others or directly.
         """
         self.leader, self.multiplier, self.offset = np.arange(joints), np.ones(joints), np.zeros(joints)
         self.independent = np.ones(joints, bool)

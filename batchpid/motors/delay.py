@@ -34,10 +34,7 @@ class Delay(NamedTuple):
 def samples_of(longest: Any, dt: float) -> int:
     """Return the samples that a history needs for delays up to ``longest`` (1, 1) [s].
 
-    Raises
-    ------
-    InvalidArgumentError
-        It is traced by JAX, so that its size is not known, or it needs too many samples.
+    Raises InvalidArgumentError if it is traced by JAX, so that its size is not known, or it needs too many samples.
     """
     if is_traced(longest) or is_traced(dt):
         raise InvalidArgumentError("max_delay", "is traced, so that it is not known", remedy="pass samples= to init")

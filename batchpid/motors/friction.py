@@ -157,10 +157,3 @@ def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
     coulomb, band = xp.atleast_2d(coulomb), xp.atleast_2d(band)
     ahead = error if rate is None else error + LOOKAHEAD * rate
     return clip(ahead * (coulomb / band), -coulomb, coulomb, xp)
-
-
-def reset(state: FrictionState, fresh: FrictionState, mask: Any) -> FrictionState:
-    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
-    xp = namespace(*state, mask)
-    chosen = xp.asarray(mask)[:, None]
-    return FrictionState(*(None if o is None else xp.where(chosen, n, o) for n, o in zip(fresh, state, strict=True)))

@@ -24,8 +24,16 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.arrays.field_tables import Field, check_leaves
 from batchpid.arrays.leaves import LeafBuilder
-from batchpid.errors import InvalidArgumentError
+
+FIELDS = {
+    "lower": Field("rad or m", -math.inf, low=-math.inf),
+    "upper": Field("rad or m", math.inf, low=-math.inf),
+    "rate": Field("rad/s or m/s", math.inf, above=True),
+    "acceleration": Field("rad/s^2 or m/s^2", math.inf, above=True),
+}
+"""Options of a joint."""
 
 
 class Guard(NamedTuple):
@@ -94,8 +102,8 @@ def make_guard(
     return Guard(
         lower=build.freeze(low),
         upper=build.freeze(high),
-        rate=build.option("rate", rate, neutral=math.inf, above=True),
-        acceleration=build.option("acceleration", acceleration, neutral=math.inf, above=True),
+        rate=build.option("rate", rate, FIELDS["rate"]),
+        acceleration=build.option("acceleration", acceleration, FIELDS["acceleration"]),
         turns=None if mask is None else build.freeze(mask / TURN),
     )
 
@@ -135,17 +143,6 @@ def _stop(acceleration: Any, distance: Any, dt: float, xp: Any) -> Any:
     return distance / (steps * dt) + (steps - 1) * (0.5 * dt * a)
 
 
-def reset(state: GuardState, fresh: GuardState, mask: Any) -> GuardState:
-    """Return ``state`` with the envs of ``mask`` (envs,) bool as in ``fresh``, which :func:`init` returns."""
-    xp = namespace(*state, mask)
-    chosen = xp.asarray(mask)[:, None]
-    return GuardState(*(xp.where(chosen, new, old) for new, old in zip(fresh, state, strict=True)))
-
-
 def check_guard(guard: Guard, num_envs: int, joint_names: Sequence[str]) -> None:
     """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints)."""
-    shapes = (1, len(joint_names)), (num_envs, len(joint_names))
-    for name, leaf in guard._asdict().items():
-        if leaf is not None and leaf.shape not in shapes:
-            problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
-            raise InvalidArgumentError(f"guard.{name}", problem, remedy=f"give one value for {', '.join(joint_names)}")
+    check_leaves("guard", guard, FIELDS, num_envs, joint_names)

@@ -81,12 +81,8 @@ class ArrayProgram:
 
         An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns) for products of
         matrices and vectors. An array of ``out`` is (rows, columns), of dtype bool for masks. It may be an input of
-        that shape, and must not overlap any other array.
-
-        Raises
-        ------
-        ValueError
-            An array has a wrong shape or dtype, or one of ``out`` overlaps.
+        that shape, and must not overlap any other array. Raises ValueError if an array has a wrong shape or dtype, or
+        one of ``out`` overlaps.
         """
         if out is None:
             out = [np.empty(self.shape, bool if is_mask else self.dtype) for is_mask in self.masks]

@@ -54,7 +54,7 @@ XLA_CASES = {
 MUJOCO = {
     "bare engine": "mujoco.batch: its position actuators, no control, no gravity, all robots stepped in one call",
 }
-"""Baselines of an engine "mujoco", beside those of the tutorial's loop in SAPIEN."""
+"""Baselines of the engine "mujoco", in addition to the tutorial's loop in SAPIEN."""
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 PHASES = {
     # phase of a sim step: the calls on the pack that it consists of

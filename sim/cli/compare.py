@@ -54,21 +54,11 @@ class CompareCommand:
         if not self.engine:
             raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
         if picture is not None and len(sets) * len(set(self.engine)) < 2:
-            raise InvalidArgumentError("gains", "is one set", remedy="name two, or two engines, for a picture")
+            raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
-        evaluations = evaluate_sets(
-            robot,
-            sets,
-            moves=self.moves,
-            seed=self.seed,
-            randomization=randomization,
-            seconds=self.seconds,
-            workers=self.workers,
-            engines=self.engine,
-            physics=self.physics,
-            collisions=self.collisions,
-        )
+        options = flags.chosen(self, "moves seed seconds workers physics collisions")
+        evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
         print(evaluation_table(robot, evaluations))
         if picture is not None:

@@ -61,13 +61,8 @@ class DemoCommand:
         start = start_poses(robot, self.num_envs, 0.3, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-        options: dict[str, Any] = {
-            "params": gains.params,
-            "control": gains.control,
-            "workers": self.workers,
-            "engine": self.engine,
-            "backend": self.backend,
-        }
+        options: dict[str, Any] = {"params": gains.params, "control": gains.control}
+        options |= flags.chosen(self, "workers engine backend")
         with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
             rollout, report = hold_setpoint(runner, start, settings.target, seconds)

@@ -17,6 +17,11 @@ def _flag(help: str | None = None, **options: Any) -> Any:
     return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
 
 
+def chosen(command: Any, names: str) -> dict[str, Any]:
+    """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
+    return {name: getattr(command, name) for name in names.split()}
+
+
 OptionalPath = Annotated[Path | None, _flag()]
 OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
 Switch = Annotated[bool, _flag()]

@@ -28,8 +28,8 @@ class IdentifyCommand:
     Finds armature, damping, friction, strength and bias of each joint, the delay of the commands and the payload at the
     tool, by fitting simulated motions; writes them for --actuators of other commands. A log has a header and SI units:
     "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --params FILE, or
-    "time, effort:JOINT ..., qpos:JOINT ...". There is no --engine: the fit has a rigid-body model of its own, whose
-    equations and time steps are those of both engines.
+    "time, effort:JOINT ..., qpos:JOINT ...". There is no --engine: the fit simulates a separate rigid-body
+    model, with the equations and time steps of both engines.
     """
 
     robot: flags.RobotName = "panda"
@@ -44,7 +44,7 @@ class IdentifyCommand:
     hold: flags.Switch = False
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
     no_payload: flags.Switch = False
-    """There is no payload at the tool."""
+    """The tool carries no payload."""
     evaluations: int = 25
     """Largest number of evaluations of the fit; each simulates the robot and, for each unknown, a perturbed one."""
     seed: int = 0
@@ -88,14 +88,8 @@ class IdentifyCommand:
             robot,
             self.logs,
             params=None if self.params is None else _params(robot, self.params),
-            compensate=self.compensate,
-            timestep=self.timestep,
-            sim_steps=self.sim_steps,
             payload=not self.no_payload,
-            hold=self.hold,
-            evaluations=self.evaluations,
-            seed=self.seed,
-            workers=self.workers,
+            **flags.chosen(self, "compensate timestep sim_steps hold evaluations seed workers"),
             history=history,
             progress=bar("identifying", bar_format=AT_MOST),
         )

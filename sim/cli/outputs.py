@@ -35,13 +35,9 @@ class Outputs:
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
         """Return ``path`` after a check that a file can be written there; None is returned as None.
 
-        The check leaves nothing behind; the folder of ``path`` is made when the file is written.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Its suffix is not one of ``suffixes``, it cannot be written, the command reads it or writes it as another
-            output, or it exists and may not be replaced.
+        The check leaves nothing behind; the folder of ``path`` is made when the file is written. Raises
+        InvalidArgumentError if its suffix is not one of ``suffixes``, it cannot be written, the command reads it or
+        writes it as another output, or it exists and may not be replaced.
         """
         if path is not None:
             file_path(argument, path, suffixes)
@@ -51,12 +47,8 @@ class Outputs:
     def history(self, path: Path, *, resume: bool) -> Path:
         """Return the ``path`` of the state of a search or fit after a check; with ``resume`` the file may exist.
 
-        Without ``resume``, but with ``--force``, the state of a stopped run is removed.
-
-        Raises
-        ------
-        InvalidArgumentError
-            As for :meth:`path`.
+        Without ``resume``, but with ``--force``, the state of a stopped run is removed. Raises InvalidArgumentError as
+        for :meth:`path`.
         """
         remedy = "add --resume to continue the stopped run, --force to begin anew, or choose another --out"
         self._check("out", path, None if self._force or resume else remedy)

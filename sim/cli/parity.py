@@ -40,7 +40,7 @@ class ParityCommand:
         """Run the command."""
         from batchpid.sim import plots
         from batchpid.sim.cli.report import table
-        from batchpid.sim.plots.parity_figure import engine_differences
+        from batchpid.sim.plots.figures import engine_differences
         from batchpid.sim.tuning.engine_parity import compare_engines
 
         outputs = Outputs(force=self.force)

@@ -80,15 +80,7 @@ class RolloutCommand:
             self.num_envs,
             params=gains.params,
             control="drive" if gains.control == "drive" else self.control,
-            workers=self.workers,
-            cluster=self.cluster,
-            timestep=self.timestep,
-            substeps=self.substeps,
-            compensate=self.compensate,
-            engine=self.engine,
-            physics=self.physics,
-            backend=self.backend,
-            collisions=self.collisions,
+            **flags.chosen(self, "workers cluster timestep substeps compensate engine physics backend collisions"),
             randomization=randomization,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"

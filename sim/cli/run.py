@@ -81,10 +81,8 @@ def read_variation(
 ) -> tuple[Robot, Randomization | None]:
     """Return the robot and the randomization that flags of these names ask for; ``variation``: payload and friction.
 
-    Raises
-    ------
-    InvalidArgumentError
-        The file does not fit, or there is ``--variation`` with ``--randomize`` or ``--actuators``.
+    Raises InvalidArgumentError if the file does not fit, or there is ``--variation`` with ``--randomize`` or
+    ``--actuators``.
     """
     if variation is None:
         return robot, None if randomize is None else load_randomization(randomize, robot)
@@ -99,13 +97,8 @@ def read_run(path: Path, robot: str | None, missing_meshes: str, usage: str) -> 
     """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
 
     ``usage`` is a command that names the robot, for the error message. A recording is untrusted input, so no path in it
-    is opened.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The file cannot be read; or no robot is named, and the recorded one is not a bundled robot, or differs from the
-        bundled robot of the same name.
+    is opened. Raises InvalidArgumentError if the file cannot be read; or no robot is named, and the recorded one is not
+    a bundled robot, or differs from the bundled robot of the same name.
     """
     rollout = read_recording(path)
     name, description = rollout.info.robot, rollout.info.urdf

@@ -65,14 +65,9 @@ class SurveyCommand:
         cores = len(os.sched_getaffinity(0))
         reports = survey(
             urdfs,
-            moves=self.moves,
-            seed=self.seed,
-            seconds=self.seconds,
             bandwidth_hz=self.bandwidth,
-            engine=self.engine,
-            physics=self.physics,
-            time_limit=self.time_limit,
             processes=max(1, cores if self.workers is None else self.workers),
+            **flags.chosen(self, "moves seed seconds engine physics time_limit"),
         )
         done = list(bar("surveying", unit="robot", total=len(urdfs))(reports))
         if json_path is not None:

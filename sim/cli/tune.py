@@ -82,36 +82,18 @@ class TuneCommand:
         robot, randomization = read_variation(robot, self.randomize, variation)
         found = tune(
             robot,
-            seed=self.seed,
-            generations=self.generations,
-            population=self.population,
             seconds=self.search_seconds,
-            gain_units=self.gain_units,
-            per_joint=self.per_joint,
-            weights=self.weights,
             randomization=randomization,
-            workers=self.workers,
-            cluster=self.cluster,
-            time_limit=self.time_limit,
             history=history,
             progress=bar("tuning", unit="generation"),
-            engine=self.engine,
-            physics=self.physics,
-            collisions=self.collisions,
+            **flags.chosen(self, "seed generations population gain_units per_joint weights time_limit"),
+            **flags.chosen(self, "workers cluster engine physics collisions"),
         )
         print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
+        options = flags.chosen(self, "seed workers cluster physics collisions")
         evaluations = evaluate_sets(
-            robot,
-            sets,
-            moves=20,
-            seed=self.seed,
-            randomization=randomization,
-            workers=self.workers,
-            cluster=self.cluster,
-            engines=(self.engine,),
-            physics=self.physics,
-            collisions=self.collisions,
+            robot, sets, moves=20, randomization=randomization, engines=(self.engine,), **options
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)

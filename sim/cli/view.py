@@ -81,16 +81,15 @@ class ViewCommand:
         robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes, actuators=self.actuators)
         gains = None if self.gains is None else gain_set(robot, self.gains)
         if gains and gains.control != "pid":
-            raise InvalidArgumentError("gains", "are those of the PID", value=self.gains, remedy="use --control drive")
+            raise InvalidArgumentError(
+                "gains", "must be gains of a PID", value=self.gains, remedy="use --control drive"
+            )
         live = LiveSimulation(
             robot,
             self.num_envs,
             controls=self.control,
             period=1 / self.fps,
-            compensate=self.compensate,
-            engine=self.engine,
-            physics=self.physics,
-            workers=self.workers,
+            **flags.chosen(self, "compensate engine physics workers"),
             params=gains and gains.params,
         )
         if robot.settings is not None:

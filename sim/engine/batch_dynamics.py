@@ -27,13 +27,14 @@ limits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.engines import load_engine, scene_dynamics
 from batchpid.sim.engine.native.interface import DYNAMICS, STEP
 from batchpid.sim.engine.protocol import RobotModel
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -231,3 +232,22 @@ class PinocchioBatchDynamics:
         q = q + dt * v
         low, high = self._joints.low, self._joints.high
         return np.clip(q, low, high), np.where((q < low) | (q > high), 0.0, v), f
+
+
+class NativeMassMatrix:
+    """Mass matrices of the robot of ``spec``, by the native code that also runs within a tick."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self._spec, self._native = spec, native.extension("_gateway")
+
+    @cached_property
+    def _bodies(self) -> tuple[NDArray[Any], ...]:
+        bodies = scene_dynamics(self._spec).bodies
+        return np.ascontiguousarray(bodies.tree, np.int32), np.ascontiguousarray(bodies.table())
+
+    def __call__(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the mass matrices (M, dof, dof) [kg m^2 or kg] at ``qpos`` (M, dof)."""
+        rows = np.ascontiguousarray(qpos, np.float64)
+        out = np.empty((*rows.shape, rows.shape[1]))
+        self._native.mass_matrices(*self._bodies, rows, out, *rows.shape)
+        return out

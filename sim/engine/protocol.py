@@ -31,7 +31,7 @@ Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "par
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"missed_contacts"``: robots without shapes report contacts that they would have had;
 - ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
-- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone, and those of floating bases;
+- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone, and forces of floating bases;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 FAILED = 1 << STATUS.index("failed")

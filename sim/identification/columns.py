@@ -31,7 +31,7 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as bad:
-        raise error(str(path), f"is no text: {bad.reason} at byte {bad.start}", "save it as UTF-8") from None
+        raise error(str(path), f"is not a text: {bad.reason} at byte {bad.start}", "save it as UTF-8") from None
     rows: list[list[float]] = []
     lines: list[int] = []
     header: list[str] | None = None
@@ -69,7 +69,7 @@ def _read_row(path: Path, number: int, header: list[str], cells: list[str]) -> l
             row.append(float(cell) if cell.strip() else math.nan)
         except ValueError:
             if column.partition(":")[0].strip() in (*QUANTITIES, "time"):
-                problem = f"line {number}, column {column!r} is no number"
+                problem = f"line {number}, column {column!r} is not a number"
                 raise error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
             row.append(math.nan)
     return row
@@ -89,7 +89,7 @@ def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
         if name.strip() in columns:
             raise error(str(path), f"has the column {name.strip()!r} twice, apart from blanks", "keep one of them")
         if array.ndim > 1 or not len(array):
-            problem = f"has {name!r} of shape {array.shape}, which is no column"
+            problem = f"has {name!r} of shape {array.shape}, which is not a column"
             raise error(str(path), problem, "give each dataset one number per row")
         columns[name.strip()] = array.astype(np.float64)
     return columns

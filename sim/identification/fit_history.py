@@ -24,10 +24,7 @@ class State(NamedTuple):
 class History:
     """State of a fit before each step, kept in a file unless ``path`` is None.
 
-    Raises
-    ------
-    InvalidArgumentError
-        The file exists, and is damaged or has other settings.
+    Raises InvalidArgumentError if the file exists, and is damaged or has other settings.
     """
 
     def __init__(self, path: Path | str | None, settings: Mapping[str, Any]) -> None:

@@ -40,10 +40,8 @@ class Stretches(NamedTuple):
 def stretches(source: str, time: Float64, row: Callable[[int], str]) -> Stretches:
     """Return the stretches of a log with increasing times (rows,) [s]; ``row`` names a row.
 
-    Raises
-    ------
-    InvalidArgumentError
-        A stretch is too short, and a gap next to it is longer than :data:`DROPOUT`; or all stretches are too short.
+    Raises InvalidArgumentError if a stretch is too short, and a gap next to it is longer than :data:`DROPOUT`; or all
+    stretches are too short.
     """
     with np.errstate(over="ignore"):
         periods = np.diff(time)

@@ -201,7 +201,7 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
             remedy = "give the params that drove the robot" if log.kind == "setpoint" else "give no params"
             raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
         if stopped := at_limits(robot, log):
-            message = "; ".join(stopped) + ": stops are no part of the model; record between the limits"
+            message = "; ".join(stopped) + ": stops are not part of the model; record between the limits"
             warnings.warn(message, LogWarning, stacklevel=4)
     return found
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.elementwise import clip, namespace, wrap
+from batchpid.arrays.elementwise import clip, namespace, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
@@ -320,7 +320,7 @@ def apply_friction(
         def fresh() -> FrictionState:
             matrix = joint_mass_matrix(layout, measured.qpos)
             new = friction_model.refresh(model, friction, matrix, constants.timestep, *constants.drive)
-            return friction_model.reset(friction, new, due)
+            return replace_envs(friction, new, due)
 
         friction = layout.model.when(due, fresh, friction)
         age = xp.where(due, 0, age) + 1

@@ -35,10 +35,7 @@ class OwnController:
     def init(self, envs: int) -> dict[str, NDArray[Any]]:
         """Return a checked copy of the controller's initial state for ``envs`` envs.
 
-        Raises
-        ------
-        InvalidArgumentError
-            An array of the state does not have the envs as its first axis.
+        Raises InvalidArgumentError if an array of the state does not have the envs as its first axis.
         """
         state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
@@ -63,10 +60,7 @@ class OwnController:
     def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[dict[str, Any], Float64]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
 
-        Raises
-        ------
-        InvalidArgumentError
-            The controller returned an effort or a state of a wrong shape or dtype.
+        Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape or dtype.
         """
         own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
         new, wanted = self._controller(unflatten(self._structure, state), *own)
@@ -78,10 +72,8 @@ class OwnController:
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
-        Raises
-        ------
-        InvalidArgumentError
-            JAX cannot trace the controller, or it returns an effort or a state of a wrong shape or dtype.
+        Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a state of a wrong
+        shape or dtype.
         """
         import jax
 
@@ -139,10 +131,7 @@ def _check_effort(effort: Any, qpos: Any) -> None:
 def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arrays of a controller's state in the dtypes of ``before``.
 
-    Raises
-    ------
-    InvalidArgumentError
-        Names or shapes differ, or a dtype cannot be cast.
+    Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
     """
     new = {}
     for name in dict.fromkeys([*before, *leaves]):

@@ -95,10 +95,8 @@ class Loop:
     def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took.
 
-        Raises
-        ------
-        RunError
-            A group failed. The other groups complete the run, so that the first failure does not depend on grouping.
+        Raises RunError if a group failed. The other groups complete the run, so that the first failure does not depend
+        on grouping.
         """
         began = time.perf_counter()
         failures = []

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import ControllerError
+from batchpid.motors import ActuatorState, Coefficients, measurement_noise
+from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
 from batchpid.sim.engine.engines import scene_dynamics
-from batchpid.sim.engine.native_mass_matrix import NativeMassMatrix
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
@@ -19,7 +20,6 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
 from batchpid.sim.loop.law_program import LawProgram
-from batchpid.sim.loop.noise_blocks import NoiseBlocks
 from batchpid.sim.loop.stage_program import compiled_stages
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
@@ -154,3 +154,31 @@ def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:
     """Return the effective mass matrix of the joints, armature of the motors included."""
     matrix = pack.joint_mass_matrix(qpos)
     return matrix + pack.armature[:, None] * np.eye(pack.dof) if pack.armature.any() else matrix
+
+
+BLOCK = 64
+"""Sim steps of a block."""
+
+
+class NoiseBlocks:
+    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive steps."""
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._first = 0
+        self._block: tuple[Any, Any] = (None, None)
+
+    def __call__(self, k: Coefficients, state: ActuatorState, like: NDArray[np.float64]) -> tuple[Any, Any] | None:
+        """Return the noise of positions and velocities; None for sensors without noise.
+
+        A reset replaces the key. While the key is the same, all envs advance by the same number of steps.
+        """
+        if state.key is None:
+            return None
+        at = int(state.step[0]) - self._first
+        if state.key is not self._key or not 0 <= at < BLOCK:
+            steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
+            self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
+            self._key, self._first, at = state.key, int(state.step[0]), 0
+        position, velocity = self._block
+        return None if position is None else position[at], None if velocity is None else velocity[at]

@@ -84,12 +84,13 @@ class PIDLaw(NamedTuple):
         if viscous is not None:
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate = command
-        rates = (qvel if self.measures_rate else None, setpoint_rate, feedforward)
+        rates = (qvel if self.measures_rate else None, setpoint_rate)
         inputs = (setpoint, qpos, matrix, *rates) if self.whole else (setpoint, qpos, *rates)
+        advance: Any = advance_with_mass_matrix if self.whole else bp.advance
         if not observed:
-            new, effort = (advance_with_mass_matrix if self.whole else bp.advance)(k, state, *inputs)
-            return new, effort, None
-        new, terms = (advance_terms_with_mass_matrix if self.whole else bp.advance_terms)(k, state, *inputs)
+            return *advance(k, state, *inputs, feedforward=feedforward), None
+        advance = advance_terms_with_mass_matrix if self.whole else bp.advance_terms
+        new, terms = advance(k, state, *inputs, feedforward=feedforward)
         return new, terms.effort, terms.saturated
 
 

@@ -234,7 +234,7 @@ class Snapshot:
         if episodes is not None and (
             episodes.shape != (num_envs, 2) or episodes.dtype != np.int64 or (episodes < 0).any()
         ):
-            raise ValueError(f"its episodes are no counts (envs, 2) of {num_envs} envs")
+            raise ValueError(f"its episodes are not counts (envs, 2) of {num_envs} envs")
         groups = nest(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.elementwise import replace_envs
 from batchpid.law.computed_torque import convert_integral
 from batchpid.motors import ActuatorState
 from batchpid.motors import friction as friction_model
@@ -40,7 +41,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     fresh = friction_model.init(model, velocity, load, matrix, constants.timestep, *constants.drive)
     age = np.zeros(pack.size, np.int64)
     if state.age is not None:
-        fresh, age = friction_model.reset(state.friction, fresh, mask), np.where(mask, 0, state.age)
+        fresh, age = replace_envs(state.friction, fresh, mask), np.where(mask, 0, state.age)
     return state._replace(friction=fresh, age=age)
 
 
@@ -71,7 +72,7 @@ def reset_guard(constants: Constants, state: StepState, qpos: Float64, mask: Boo
     if constants.guard is None:
         return state
     fresh = guard_model.init(constants.guard, qpos)
-    return state._replace(guard=fresh if state.guard is None else guard_model.reset(state.guard, fresh, mask))
+    return state._replace(guard=fresh if state.guard is None else replace_envs(state.guard, fresh, mask))
 
 
 def init_motors(

@@ -11,23 +11,16 @@ import batchpid as bp
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.motors.actuator_fields import NEUTRAL, TABLE
+from batchpid.motors.actuator_fields import FIELDS, TABLE
 from batchpid.sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 
-_PAIRED = ("saturation_effort", "no_load_speed")
 _HUGE = 1e300
 
 
 def check_robot(randomization: Randomization, robot: Robot) -> None:
-    """Check that the names and ranges of ``randomization`` fit ``robot``.
-
-    Raises
-    ------
-    InvalidArgumentError
-        They do not.
-    """
+    """Check that the names and ranges of ``randomization`` fit ``robot``. Raises InvalidArgumentError if not."""
     for name, each in randomization.given.items():
         if name in PHYSICAL:
             _check_range(name, each, robot)
@@ -35,7 +28,9 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
             list(parts(name, each, robot.joint_names))
     if randomization.damping is not None and robot.dissipation != "urdf":
         remedy = "load the robot with dissipation='urdf'"
-        raise InvalidArgumentError("damping", "is the engine's under this dissipation", remedy=remedy)
+        raise InvalidArgumentError(
+            "damping", "cannot be drawn: with this dissipation the engine sets it", remedy=remedy
+        )
     if randomization.payload_link is not None:
         choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
 
@@ -43,10 +38,7 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
 def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:
     """Check that the params have the leaves that are drawn, and that no draw makes them invalid.
 
-    Raises
-    ------
-    InvalidArgumentError
-        A leaf is off, or a draw may be out of its range.
+    Raises InvalidArgumentError if a leaf is off, or a draw may be out of its range.
     """
     for leaf, each in randomization.params.items():
         name = f"params.{leaf}"
@@ -67,13 +59,8 @@ def prepared_actuators(
 ) -> bp.Actuators | None:
     """Return ``actuators`` with every field that is drawn on, also where it is neutral, and histories long enough.
 
-    So the state has the same arrays in all envs.
-
-    Raises
-    ------
-    InvalidArgumentError
-        A field is unknown, or has no effect under ``control``, or a draw may be out of its range, or changes a limit
-        that is off.
+    So the state has the same arrays in all envs. Raises InvalidArgumentError if a field is unknown, or has no effect
+    under ``control``, or a draw may be out of its range, or changes a limit that is off.
     """
     if not randomization.actuators:
         return actuators
@@ -84,20 +71,19 @@ def prepared_actuators(
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
     values: dict[str, NDArray[Any]] = {}
     for leaf, each in randomization.actuators.items():
-        neutral = {**NEUTRAL, TABLE: np.inf}[choice("actuators", leaf, [*NEUTRAL, TABLE])]
+        field = (FIELDS | TABLE)[choice("actuators", leaf, [*FIELDS, *TABLE])]
         nominal = getattr(known, leaf)
-        if nominal is None and np.isinf(neutral):
-            remedy = f"give the runner actuators with {'position_limit' if leaf == TABLE else leaf}"
+        if nominal is None and np.isinf(field.neutral):
+            remedy = f"give the runner actuators with {'position_limit' if leaf in TABLE else leaf}"
             raise InvalidArgumentError(f"actuators.{leaf}", "is off, and has no value to change", remedy=remedy)
-        values[leaf] = np.full((1, robot.dof), neutral) if nominal is None else np.asarray(nominal)
+        values[leaf] = np.full((1, robot.dof), field.neutral) if nominal is None else np.asarray(nominal)
         for _, chosen, distribution in parts(f"actuators.{leaf}", each, robot.joint_names):
             for end in np.clip(distribution.support, -_HUGE, _HUGE):
                 rows = np.array(values[leaf])
                 rows[:, chosen] = distribution.apply(rows[:, chosen], end)
-                options: dict[str, Any] = dict.fromkeys(_PAIRED, 1.0) if leaf in _PAIRED else {}
-                options |= {"position_limit": (known.limit_positions[0], rows[0])} if leaf == TABLE else {leaf: rows}
-                checked = bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
-                delay = max(delay, 0.0 if checked.max_delay is None else float(checked.max_delay[0, 0]))
+                each_joint = rows.reshape(len(rows), robot.dof, -1).min(2)
+                field.checked(leaf, each_joint, robot.joint_names, infinite=leaf in TABLE)
+                delay = max(delay, float(rows.max())) if leaf.endswith("delay") else delay
     like = bp.make_actuators(robot.dof, command_delay=1e-3, position_noise=1.0, max_delay=max(delay, 1e-3))
     noisy = known.seed is None and not values.keys().isdisjoint(("position_noise", "velocity_noise"))
     delayed = not values.keys().isdisjoint(("command_delay", "sensor_delay"))
@@ -111,12 +97,11 @@ def prepared_actuators(
 
 def _check_range(name: str, each: Field, robot: Robot) -> None:
     """Check the results of the least and the largest draws."""
-    columns, nominal = elements(name, robot), nominal_values(name, robot)
-    strict = name == "link_mass"
+    columns, nominal, (_, _, lowest, strict, _) = elements(name, robot), nominal_values(name, robot), PHYSICAL[name]
     for _, chosen, distribution in parts(name, each, columns):
         if name in ("payload", "center_of_mass") and distribution.operation == "scale":
             raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
-        if name == "center_of_mass":
+        if np.isinf(lowest):
             continue
         known = nominal[chosen]
         if strict and distribution.operation == "scale":

@@ -80,10 +80,11 @@ class Uniform(Distribution):
     low: float
     high: float
     kind = "uniform"
+    _lowest = -math.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._numbers("low", "high")
+        self._numbers("low", "high", low=self._lowest)
         self._ordered(self.low, self.high)
 
     @property
@@ -97,22 +98,11 @@ class Uniform(Distribution):
 
 
 @dataclass(frozen=True)
-class LogUniform(Distribution):
+class LogUniform(Uniform):
     """Distribution on [low, high], both > 0, whose logarithm is uniform."""
 
-    low: float
-    high: float
     kind = "log_uniform"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._numbers("low", "high", low=np.finfo(float).tiny)
-        self._ordered(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.low, self.high
+    _lowest = np.finfo(float).tiny
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -198,7 +188,7 @@ def read_distribution(name: str, value: Any) -> Distribution:
     kinds = [kind for kind in KINDS if isinstance(value, Mapping) and kind in value]
     if len(kinds) != 1:
         remedy = f"write e.g. {{uniform: [0, 1], operation: add}}; there are {', '.join(KINDS)}"
-        raise InvalidArgumentError(name, "is no distribution", value=value, remedy=remedy)
+        raise InvalidArgumentError(name, "is not a distribution", value=value, remedy=remedy)
     (kind,) = kinds
     options = {key: option for key, option in value.items() if key != kind}
     arguments = [value[kind]] if kind == Choice.kind else value[kind]
@@ -208,7 +198,7 @@ def read_distribution(name: str, value: Any) -> Distribution:
         return KINDS[kind](*arguments, **options)
     except TypeError as error:
         remedy = f"the options are {', '.join(each.name for each in fields(KINDS[kind]) if each.kw_only)}"
-        raise InvalidArgumentError(name, f"is no distribution: {error}", value=value, remedy=remedy) from None
+        raise InvalidArgumentError(name, f"is not a distribution: {error}", value=value, remedy=remedy) from None
     except InvalidArgumentError as error:
         problem = f"{error.argument} {error.problem}"
         raise InvalidArgumentError(name, problem, value=error.value, remedy=error.remedy) from None

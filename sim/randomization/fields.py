@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
@@ -17,9 +18,16 @@ Float64 = NDArray[np.float64]
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
 
-PHYSICAL = ("payload", "link_mass", "center_of_mass", "friction", "damping", "armature")
+PHYSICAL = {
+    "payload": Bounds("kg"),
+    "link_mass": Bounds("kg", above=True),
+    "center_of_mass": Bounds("m", low=-np.inf),
+    "friction": Bounds("N m or N"),
+    "damping": Bounds("N m s/rad or N s/m"),
+    "armature": Bounds("kg m^2 or kg"),
+}
 """Fields that change the simulated robot."""
-START = ("qpos", "qvel")
+START = {"qpos": Bounds("rad or m", low=-np.inf), "qvel": Bounds("rad/s or m/s", low=-np.inf)}
 """Fields that change the state at a reset."""
 GROUPS = ("params", "actuators")
 """Fields that are mappings, by name of a further field."""
@@ -60,7 +68,7 @@ def mapping(name: str, value: object) -> Mapping[str, Any]:
     """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
     if not isinstance(value, Mapping):
         remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
-        raise InvalidArgumentError(name, "is no mapping of fields to distributions", value=value, remedy=remedy)
+        raise InvalidArgumentError(name, "is not a mapping of fields to distributions", value=value, remedy=remedy)
     return value
 
 

@@ -90,7 +90,7 @@ class Randomization:
             given = list(each.values()) if isinstance(each, Mapping) and name != "payload" else [each]
             for part in given or [None]:
                 if not isinstance(part, Distribution):
-                    raise InvalidArgumentError(name, "is no distribution", value=part, remedy=remedy)
+                    raise InvalidArgumentError(name, "is not a distribution", value=part, remedy=remedy)
 
     @property
     def given(self) -> dict[str, Field]:

@@ -41,12 +41,8 @@ def read_hdf5(
     Without ``names`` the file is read as a log: "time", and the columns of :data:`LOG_QUANTITIES`.
 
     Every n-th row is read. A recording ends before the first row whose "checksum" (in older files: "time") is not
-    written yet; a log is read to its end.
-
-    Raises
-    ------
-    ValueError
-        The file is damaged, lies in several files, or holds more than ``max_bytes``.
+    written yet; a log is read to its end. Raises ValueError if the file is damaged, lies in several files, or holds
+    more than ``max_bytes``.
     """
     request = json.dumps([os.fspath(path), names if names is None else list(names), every, max_bytes])
     environment = os.environ | {"HDF5_PLUGIN_PRELOAD": "::", "OPENBLAS_NUM_THREADS": "1"}  # "::": no plugins
@@ -145,7 +141,7 @@ def _open_dataset(file: Any, name: str) -> Any:
         raise ValueError(f"its {name} is not a dataset")
     storage = dataset.id.get_create_plist()
     if storage.get_layout() == h5py.h5d.VIRTUAL or storage.get_external_count():  # before its shape is asked for
-        raise ValueError(f"its {name} lies in other files")
+        raise ValueError(f"its {name} is stored in other files")
     if dataset.dtype.kind not in "biuf" or not dataset.ndim:
         raise ValueError(f"its {name} is not an array of numbers")
     return dataset

@@ -70,13 +70,7 @@ class PartialFile(SingleOwner):
             raise RecordingError(f"{partial}: cannot be made: {_cause(error)}") from error
 
     def append(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Append rows, ticks first.
-
-        Raises
-        ------
-        RecordingError
-            They cannot be written; the file is closed.
-        """
+        """Append rows, ticks first. Raises RecordingError if they cannot be written; the file is closed."""
         try:
             self._reserve(self._file.id.get_filesize(), sum(array.nbytes for array in arrays.values()))
             files.append_rows(self._datasets, arrays)
@@ -94,10 +88,7 @@ class PartialFile(SingleOwner):
     def finish(self, complete: bool, faults: str, redraws: str) -> None:
         """Close the file and give it its name; one that is not ``complete`` keeps the partial name if that one exists.
 
-        Raises
-        ------
-        RecordingError
-            It cannot be completed, or another program has made a file of its name.
+        Raises RecordingError if it cannot be completed, or another program has made a file of its name.
         """
         size = self._file.id.get_filesize()
         with contextlib.suppress(Exception):

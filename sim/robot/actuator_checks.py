@@ -62,12 +62,8 @@ def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescript
 def fit_actuators(actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object) -> bp.Actuators:
     """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
 
-    Followers have no motor: their bias, friction and armature are left out.
-
-    Raises
-    ------
-    InvalidArgumentError
-        They do not fit.
+    Followers have no motor: their bias, friction and armature are left out. Raises InvalidArgumentError if they do not
+    fit.
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
     check_actuators(actuators, num_envs, robot.joint_names)

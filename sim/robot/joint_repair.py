@@ -80,7 +80,7 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
             continue
         text = limit.attrib.pop(key)
         if values is None:
-            problem = f"<limit {key}={text!r}> is no number: no {key} limit"
+            problem = f"<limit {key}={text!r}> is not a number: no {key} limit"
             yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
         elif values[0] < 0:
             limit.set(key, repr(-values[0]))
@@ -101,7 +101,7 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
     low, high = (readable(limit, key, "0", limit=True) for key in given)
     for key, values in zip(given, (low, high), strict=True):
         if values is None:
-            text = f"<limit {key}={given[key]!r}> is no number: no {key} limit"
+            text = f"<limit {key}={given[key]!r}> is not a number: no {key} limit"
             yield finding_of(joint, "warning", "limits", text, GIVE_RANGE)
     lower, upper = (-math.inf if low is None else low[0]), (math.inf if high is None else high[0])
     efforts = [limit.get(key) for key in ("effort", "velocity")]

@@ -36,12 +36,12 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
         return
     origin, mass, inertia = map(inertial.find, ("origin", "mass", "inertia"))
     if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
-        text = "the centre of mass is no position: the origin of the link is used"
+        text = "the centre of mass is not a position: the origin of the link is used"
         yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>", str(dict(origin.attrib)))
         inertial.remove(origin)
     value = readable(mass, "value", "0")
     if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-        text = f"<mass value={mass.get('value')!r}> is no mass that PhysX can hold: it counts as not given"
+        text = f"<mass value={mass.get('value')!r}> is a mass that PhysX cannot hold: it counts as not given"
         yield finding_of(link, "warning", "inertia", text, "give a mass > 0 [kg]")
         value = None
     if not value or not value[0]:
@@ -77,7 +77,7 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
         problem = f"it has none of {', '.join(SHAPES)}" if not shapes else None
         origin = collision.find("origin")
         if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
-            problem = f"<origin> {dict(origin.attrib)} is no position"
+            problem = f"<origin> {dict(origin.attrib)} is not a position"
         for shape in shapes:
             for key, default in SHAPES[shape.tag].items():
                 text = shape.get(key, default)

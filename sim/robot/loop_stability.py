@@ -68,7 +68,7 @@ def gains_at(
 ) -> Gains:
     """Return ``params`` and the robot at ``qpos`` (dof,); ``armature`` (dof,) is inertia of motors [kg m^2 or kg].
 
-    Implicit params become those of the explicit law at ``timestep`` [s].
+    Implicit params become params of the explicit law at ``timestep`` [s].
     """
     params = as_explicit(params, timestep)
     leaves = params.kp, params.ki, params.kd, params.derivative_filter_time

@@ -170,7 +170,7 @@ def _join(
 
 
 def _mirrored(link: etree._Element) -> list[bool]:
-    """Return for each collision shape of a link if it is a mirrored mesh; an element has one shape of each kind."""
+    """Return whether each collision shape of a link is a mirrored mesh; an element has one shape of each kind."""
     elements = [{shape.tag: shape for shape in each.iterfind("geometry/*")} for each in link.findall("collision")]
     shapes = [shape for element in elements for shape in element.values()]
     return [min(numbers(shape, "scale", "1 1 1", "scale")) < 0 for shape in shapes]

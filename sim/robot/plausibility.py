@@ -27,7 +27,7 @@ from batchpid.sim.robot.findings import Finding
 
 GRAVITY = 9.81
 LARGEST, SMALLEST = 20.0, 1 / 200
-"""Bounds of the size of shapes over the reach."""
+"""Bounds of the ratio of the shapes' size to the reach."""
 SPARSEST, DENSEST = 0.1, 30_000.0
 """Bounds of the mass of a link per cubic size [kg/m^3]."""
 GYRATION = 2.0

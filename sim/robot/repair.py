@@ -35,10 +35,7 @@ _VECTORS = ("xyz", "rpy", "size", "scale")
 def repair(root: etree._Element, path: Path) -> list[Finding]:
     """Repair the ``<robot>`` read from ``path`` in place and return the findings.
 
-    Raises
-    ------
-    RobotError
-        The file is a xacro that was not expanded.
+    Raises RobotError if the file is a xacro that was not expanded.
     """
     found = [*_elements(root), *_attributes(root)]
     _refuse_xacro(root, path)

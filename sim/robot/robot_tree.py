@@ -17,10 +17,7 @@ from batchpid.task_space.kinematic_tree import KinematicTree
 def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
     """Return the tree of ``robot`` with the masses of its URDF; ``options`` are the tree's armature and gravity.
 
-    Raises
-    ------
-    RobotError
-        The base is not fixed, or the mass of a link is known to the engine alone.
+    Raises RobotError if the base is not fixed, or the mass of a link is known to the engine alone.
     """
     if not robot.fixed_base:
         raise RobotError(f"{robot.path}: a kinematic tree has a fixed base; load the robot with fixed_base=True")

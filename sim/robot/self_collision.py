@@ -67,12 +67,8 @@ class SelfContact(NamedTuple):
 def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     """Return the pairs in the .srdf at ``path``, for any reason; a pair without reason gets "User".
 
-    Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
-
-    Raises
-    ------
-    RobotError
-        What :func:`batchpid.sim.robot.xml.parse_xml` refuses.
+    Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding. Raises RobotError for
+    what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
     """
     known, disabled, enabled, findings = set(links), list[DisabledPair](), set[frozenset[str]](), list[Finding]()
     for element in parse_xml(path).iterchildren("disable_collisions", "enable_collisions"):

@@ -58,10 +58,7 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
 def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 
-    Raises
-    ------
-    InvalidArgumentError
-        It does not fit the robot or the control.
+    Raises InvalidArgumentError if it does not fit the robot or the control.
     """
     if guard is False or guard is None:
         return None

@@ -24,12 +24,8 @@ LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared a
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
     """Return the root element of the file at ``path``, without comments and processing instructions.
 
-    A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``.
-
-    Raises
-    ------
-    RobotError
-        The file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or has a DTD.
+    A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``. Raises RobotError if
+    the file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or has a DTD.
     """
     try:
         with open(path, "rb") as file:

@@ -49,7 +49,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
             stiffness, damping = map(float, (name.partition(":")[2] or "20,5").split(","))
         except ValueError:
             raise InvalidArgumentError(
-                "gains", "is no drive", value=name, remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
+                "gains", "is not a drive", value=name, remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
             ) from None
         params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")

@@ -26,10 +26,7 @@ class HistoryFile:
     def read(self) -> Any:
         """Return the state in the file, None if there is no file.
 
-        Raises
-        ------
-        InvalidArgumentError
-            The file is damaged, or its settings differ; the message names these.
+        Raises InvalidArgumentError if the file is damaged, or its settings differ; the message names these.
         """
         if self._path is None or not self._path.exists():
             return None
@@ -56,7 +53,7 @@ class HistoryFile:
 
     def damaged(self, problem: str) -> InvalidArgumentError:
         """Return the error for a state that is impossible under these settings."""
-        return self._error(f"is no history of a {self._kind}: {problem}")
+        return self._error(f"is not a history of a {self._kind}: {problem}")
 
     def _error(self, problem: str) -> InvalidArgumentError:
         remedy = "use the same inputs, remove it, or name another file"

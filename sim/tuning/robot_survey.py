@@ -82,10 +82,7 @@ class RobotReport:
 def find_urdfs(paths: Sequence[Path]) -> list[Path]:
     """Return the files among ``paths``, and the files ``*.urdf`` in the folders among them and below, each once.
 
-    Raises
-    ------
-    InvalidArgumentError
-        A path does not exist, or there is no URDF at all.
+    Raises InvalidArgumentError if a path does not exist, or there is no URDF at all.
     """
     found: dict[Path, None] = {}
     for path in paths:

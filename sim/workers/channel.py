@@ -29,13 +29,7 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: bytes) -> None:
-        """Send a message.
-
-        Raises
-        ------
-        OSError
-            The other side is closed.
-        """
+        """Send a message. Raises OSError if the other side is closed."""
         rest = memoryview(_HEAD.pack(len(message)) + message)
         while rest:
             try:

@@ -70,7 +70,9 @@ class Cluster:
         if not machines:
             least = self.options.cpus_per_node or 1
             raise InvalidArgumentError(
-                "cluster", f"has no machine of {least} CPUs", remedy="pass a smaller cpus_per_node, or start more of it"
+                "cluster",
+                f"has no machine of {least} CPUs",
+                remedy="pass a smaller cpus_per_node, or add larger machines",
             )
         packs = -(-options.num_envs // options.inseparable_envs)
         if self.options.placement == "PACK":
@@ -92,10 +94,7 @@ class Cluster:
     def place(self, index: int) -> tuple[Machine, int]:
         """Return the machine for the envs of a node, and the CPUs to reserve: none for a replacement.
 
-        Raises
-        ------
-        WorkerError
-            No machine is left.
+        Raises WorkerError if no machine is left.
         """
         if index not in self._has_started:
             self._has_started.add(index)
@@ -113,13 +112,7 @@ class Cluster:
         self._failures[machine.node_id] += 1
 
     def admit(self, info: NodeInfo, machine: Machine) -> None:
-        """Check that a new node rounds as the first one does.
-
-        Raises
-        ------
-        InvalidArgumentError
-            It does not.
-        """
+        """Check that a new node rounds as the first one does. Raises InvalidArgumentError if not."""
         if self._reference is None:
             self._reference = info
         first = self._reference

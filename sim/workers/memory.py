@@ -30,10 +30,7 @@ def estimate_memory(options: RunnerOptions, num_envs: int) -> int:
 def check_memory(options: RunnerOptions, num_envs: int, workers: int, is_local: bool) -> None:
     """Check that the memory of this machine, and the limits of this process, leave room for ``num_envs`` of the envs.
 
-    Raises
-    ------
-    InvalidArgumentError
-        They do not.
+    Raises InvalidArgumentError if not.
     """
     envs, count = estimate_memory(options, num_envs), 0 if is_local else workers
     needs = [(envs + count * WORKER_BYTES, available) for available in (_free_memory(), *_cgroup_memory())]

@@ -146,12 +146,7 @@ class WorkerPool(SingleOwner):
     def begin(self, request: Request) -> None:
         """Send every worker its part of ``request``; :meth:`run` completes it.
 
-        A loop in this process executes it at once.
-
-        Raises
-        ------
-        WorkerError
-            A worker was lost for good.
+        A loop in this process executes it at once. Raises WorkerError if a worker was lost for good.
         """
         self._serve(request, wait=False)
 

@@ -87,7 +87,7 @@ class Start(Request):
     params: bp.PIDParams
     """Of these envs."""
     first_env: int = 0
-    """Env of the runner that is the pool's first one: a node of a cluster has a pool for some of the envs."""
+    """Number of the pool's first env within the runner; each node of a cluster has a pool for some of the envs."""
 
     @property
     def numbers(self) -> slice:

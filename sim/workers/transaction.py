@@ -124,12 +124,8 @@ class Transactions:
 
         An unfinished command is completed first; without ``request`` nothing else is done, and an error in it is
         dropped if it only reads. Without ``wait`` the request is sent, for a later call to complete. The arrays of
-        ``request`` must not change afterwards.
+        ``request`` must not change afterwards. Raises WorkerError if a worker was lost for good; the pool is closed.
 
-        Raises
-        ------
-        WorkerError
-            A worker was lost for good; the pool is closed.
         Exception
             A loop raised it; the pool is closed, unless the request only reads.
         InUseError

@@ -14,7 +14,7 @@ DT = 1 / 2000
     [
         ({"strength": -0.1}, "strength, joint 0: must be finite and >= 0"),
         ({"strength": [1, np.nan, 1]}, "strength, joint 1"),
-        ({"command_delay": 1.5}, "command_delay: out of range"),
+        ({"command_delay": 1.5}, "command_delay, joint .*: out of range"),
         ({"sensor_delay": -1e-3}, "sensor_delay"),
         ({"sensor_delay": 0.01, "max_delay": 0.005}, "sensor_delay: out of range"),
         ({"static": 0.1, "coulomb": [0.1, 0.2, 0.0]}, "static, joint 1: is less than coulomb"),

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.io.params_files import OFF
+from batchpid.law.params import FIELDS
 
 NAMES = ["shoulder", "elbow"]
 PARAMS = bp.make_params(
@@ -79,7 +79,7 @@ DOCUMENTS = st.fixed_dictionaries(
         | st.dictionaries(
             st.sampled_from(NAMES) | st.text(max_size=3),
             VALUES
-            | st.dictionaries(st.sampled_from(list(OFF)), VALUES, max_size=4).map(lambda some: {"kp": 1.0} | some),
+            | st.dictionaries(st.sampled_from(list(FIELDS)), VALUES, max_size=4).map(lambda some: {"kp": 1.0} | some),
             max_size=3,
         ),
     },

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from batchpid.arrays.elementwise import replace_envs
 from batchpid.motors import friction
 from batchpid.motors.friction import Friction
 
@@ -102,7 +103,7 @@ def test_envs_do_not_affect_each_other_and_are_reset_alone():
         np.testing.assert_array_equal(alone, together[:, part])
     fresh = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
     old = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
-    mixed = friction.reset(old, fresh, np.array([True, False, True]))
+    mixed = replace_envs(old, fresh, np.array([True, False, True]))
     for new, before, after in zip(fresh, old, mixed, strict=True):
         np.testing.assert_array_equal(after, np.stack([new[0], before[1], new[2]]))
 

@@ -85,7 +85,7 @@ BAD = {
     "unknown option": (JOINT % '"kp": 1.0, "kq": 2.0', "kq, joint 'elbow': unknown option.*use one of kp, ki"),
     "negative": (JOINT % '"kp": -1.0', "kp, joint 'elbow'.*-1.0"),
     "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
-    "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is no float"),
+    "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is not a float"),
     "bool": (JOINT % '"kp": true', "no float"),
     "huge": (JOINT % f'"kp": 1{"0" * 400}', "kp, joint 'elbow'.*no float"),
     "null": (JOINT % '"kp": null', "no float"),

@@ -5,11 +5,11 @@ Where they are not used, and with the environment variable ``BATCHPID_NATIVE=0``
 
 from __future__ import annotations
 
-from batchpid.sim.engine.native.loading import extension
 from batchpid.sim.engine.native.verdict import (
     SWITCH,
     NativeStatus,
     environment,
+    extension,
     python_calls,
     status,
     take_verdict,

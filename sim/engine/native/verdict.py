@@ -1,6 +1,6 @@
 """Verdict on the native extensions: used or not, and why not.
 
-They are used if all of them were built from the present tables and sources (:mod:`batchpid.sim.engine.native.loading`),
+They are used if all of them were built from the present tables and sources (:mod:`batchpid.native.extensions`),
 and if a self-test in a child process, where a crash does no harm, gives the results of Python. The verdict of the
 self-test is kept in the user's cache, under a hash of its inputs. A process passes its verdict on to its child
 processes, so that one warning is shown and one self-test is run for all of them.
@@ -26,9 +26,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.native.availability import SWITCH
-from batchpid.native.extensions import ROOT, StaleExtensionError
+from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
+from batchpid.native.operations import PROGRAM
+from batchpid.sim.engine.native.interface import EXTENSIONS
 from batchpid.sim.engine.native.library import functions, sapien_library
-from batchpid.sim.engine.native.loading import extensions
 
 _VERIFIED, _REFUSED = "BATCHPID_NATIVE_VERIFIED", "BATCHPID_NATIVE_REFUSED"
 """Environment variables of child processes: fingerprint of a verdict to use the extensions, or reason not to."""
@@ -157,3 +158,16 @@ def _run(program: str, fingerprint: str) -> str | None:
     if done.returncode:
         return (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
     return None
+
+
+def extension(name: str) -> Any:
+    """Return the extension ``name`` of :data:`interface.EXTENSIONS`; errors as :func:`batchpid.native.extensions.load`.
+
+    It does not depend on the verdict.
+    """
+    return load(EXTENSIONS[name])
+
+
+def extensions() -> list[Any]:
+    """Return all extensions, the one for programs included; errors as :func:`batchpid.native.extensions.load_all`."""
+    return load_all((*EXTENSIONS.values(), PROGRAM))

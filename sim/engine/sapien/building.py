@@ -37,10 +37,7 @@ with imported_lazily("trimesh"):  # for meshes that are not loaded here: two fif
 def parse(spec: SceneSpec) -> ArticulationBuilder:
     """Return a builder that makes any number of copies of the robot, the same object for equal specs.
 
-    Raises
-    ------
-    RobotError
-        SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
+    Raises RobotError if SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
     with _building:
         builder = _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
@@ -209,11 +206,8 @@ def new_system(spec: SceneSpec) -> Any:
 def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of ``spec``.
 
-    Raises
-    ------
-    RobotError
-        SAPIEN cannot build a collision shape, which it would silently leave out, or numbers the joints in another order
-        than ours.
+    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out, or numbers the joints
+    in another order than ours.
     """
     scene, builder = HeadlessScene(system), parse(spec)
     with engine_settings(spec):

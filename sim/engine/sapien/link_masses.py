@@ -19,10 +19,7 @@ _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 def link_masses(robot: RobotDescription) -> dict[str, LinkMass]:
     """Return the mass of every link of the URDF, whether links are merged or not.
 
-    Raises
-    ------
-    RobotError
-        SAPIEN cannot build the robot.
+    Raises RobotError if SAPIEN cannot build the robot.
     """
     _ = robot.self_contact  # which tries the shapes of a foreign robot in a child process
     repaired = {each.link for each in robot.repairs if each.code == "inertia"}

@@ -41,10 +41,7 @@ class LinkShape(NamedTuple):
 def link_shapes(spec: SceneSpec) -> dict[str, list[LinkShape]]:
     """Return the shapes that SAPIEN builds for each simulated link, as :func:`.building.build_scene` has them.
 
-    Raises
-    ------
-    RobotError
-        SAPIEN's loader refuses the description.
+    Raises RobotError if SAPIEN's loader refuses the description.
     """
     owners = shape_owners(spec)
     shapes: dict[str, list[LinkShape]] = {}

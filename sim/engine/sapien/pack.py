@@ -34,9 +34,8 @@ from batchpid.sim.engine.sapien.calls import EngineCalls
 from batchpid.sim.engine.sapien.contact_watch import ContactWatch
 from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.sapien.native_calls import engine_calls
-from batchpid.sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
 from batchpid.sim.engine.sapien.sim_step import NativeStep
-from batchpid.sim.engine.sapien.user_content import SceneContent, refuse_shapes
+from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 
@@ -290,7 +289,7 @@ class Pack(SingleOwner):
         self.isolate(np.flatnonzero(isolated).tolist())
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
-        """Apply zero effort and no gravity to the robots of ``mask`` (M,), and both again to the others."""
+        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the others."""
         if (mask == self._suspended).all():
             return
         for robot, suspended in zip(self.robots, mask, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.dynamics import Dynamics, loaded_dynamics, robot_dynamics, scene_dynamics
+from batchpid.sim.engine.sapien.dynamics import loaded_dynamics, robot_dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.link_masses import link_masses
 from batchpid.sim.engine.sapien.missed_contact import MissedContacts
 from batchpid.sim.engine.sapien.pack import Pack
@@ -14,9 +14,6 @@ from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
 from batchpid.sim.engine.sapien.self_contact import self_contact
 from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.parts import LinkMass
-from batchpid.sim.robot.self_collision import SelfContact
 
 
 class SapienEngine:
@@ -47,29 +44,12 @@ class SapienEngine:
             return Pack(spec, size, first_env, system_size)
         return VariedPack(spec, size, first_env, system_size, variation, carrier, links)
 
-    def scene_dynamics(self, spec: SceneSpec) -> Dynamics:
-        """Return the model that SAPIEN derives from the URDF of ``spec``."""
-        return scene_dynamics(spec)
-
-    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> Dynamics:
-        """Return the model of ``robot`` on a fixed base."""
-        return robot_dynamics(robot, ground)
-
-    def loaded_dynamics(self, robot: RobotDescription, payload: float) -> Dynamics:
-        """Return the model with a payload [kg] at the tool."""
-        return loaded_dynamics(robot, payload)
-
-    def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> MissedContacts:
-        """Return the record of contacts of robots without shapes."""
-        return MissedContacts(spec, size, ground)
-
-    def self_contact(self, robot: RobotDescription) -> SelfContact:
-        """Return the pairs of links that do not collide."""
-        return self_contact(robot)
-
-    def link_masses(self, robot: RobotDescription) -> Mapping[str, LinkMass]:
-        """Return the mass of every link of the URDF."""
-        return link_masses(robot)
+    scene_dynamics = staticmethod(scene_dynamics)
+    robot_dynamics = staticmethod(robot_dynamics)
+    loaded_dynamics = staticmethod(loaded_dynamics)
+    missed_contacts = staticmethod(MissedContacts)
+    self_contact = staticmethod(self_contact)
+    link_masses = staticmethod(link_masses)
 
 
 ENGINE: Engine = SapienEngine()

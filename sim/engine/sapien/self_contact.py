@@ -40,11 +40,7 @@ def self_contact(robot: RobotDescription) -> SelfContact:
     """Return the pairs of links of ``robot`` that do not collide under its option ``self_collision`` and its .srdf.
 
     Deterministic: the poses are seeded. Poses at which links of a foreign robot may touch are tried in a child process.
-
-    Raises
-    ------
-    RobotError
-        SAPIEN cannot build the robot, or crashes at one of the poses.
+    Raises RobotError if SAPIEN cannot build the robot, or crashes at one of the poses.
     """
     spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, PHYSICS["fast"], ground=False, merge_fixed=robot.merge_fixed)
     solid = [link.name for link in robot.links if link.collisions]

@@ -14,7 +14,6 @@ from sapien.wrapper.actor_builder import ActorBuilder
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.sapien.mirrored_meshes import MirroringBuilder
-from batchpid.sim.engine.sapien.root_state import ROOT_SIZE, read_root, write_root
 from batchpid.sim.engine.scene_spec import Build
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
@@ -163,3 +162,20 @@ def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapie
                 remedy="return the entities and links whose poses are wanted, or None",
             )
     return watched
+
+
+ROOT_SIZE = 13
+
+
+def read_root(articulation: Any) -> NDArray[np.float32]:
+    """Return the state of the root link of a SAPIEN articulation (13,)."""
+    pose = articulation.get_root_pose()
+    velocity = articulation.get_root_linear_velocity(), articulation.get_root_angular_velocity()
+    return np.concatenate([pose.p, pose.q, *velocity], dtype=np.float32)
+
+
+def write_root(articulation: Any, state: NDArray[np.float32]) -> None:
+    """Set the state of the root link of a SAPIEN articulation (13,)."""
+    articulation.set_root_pose(sapien.Pose(state[:3], state[3:7]))
+    articulation.set_root_linear_velocity(state[7:10])
+    articulation.set_root_angular_velocity(state[10:])

@@ -40,12 +40,8 @@ class Mjcf(NamedTuple):
 def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
-    For the other arguments see :meth:`batchpid.sim.Robot.load`.
-
-    Raises
-    ------
-    RobotError
-        MuJoCo refuses the file, it has a ball joint or several robots, or, if refused, a missing mesh.
+    For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses the file, it has a
+    ball joint or several robots, or, if refused, a missing mesh.
     """
     findings: list[Finding] = []
     model = _compile(path, missing_meshes, findings)

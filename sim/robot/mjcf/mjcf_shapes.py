@@ -121,7 +121,7 @@ class ShapeWriter:
             self._found("note", None, "the plane of the file is left out", "scenes have a ground at height 0")
         else:
             name = "a plane" if kind == PLANE else "a height field"
-            self._found("warning", body, f"{name} is no shape of a robot: left out", "add it with build= of Runner")
+            self._found("warning", body, f"{name} is not a shape of a robot: left out", "add it with build= of Runner")
         return None
 
     def _found(self, severity: str, body: int | None, text: str, remedy: str) -> None:

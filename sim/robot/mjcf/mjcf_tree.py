@@ -48,13 +48,7 @@ class Tree:
         self.solid: dict[int, str] = {}
 
     def write(self, fixed_base: bool, motors: Motors, couplings: Couplings) -> None:
-        """Write the robot.
-
-        Raises
-        ------
-        RobotError
-            There is a ball joint, or more than one robot.
-        """
+        """Write the robot. Raises RobotError if there is a ball joint, or more than one robot."""
         base, left_out = self._find_base(fixed_base)
         name = self._names.bodies[base]
         parent = None

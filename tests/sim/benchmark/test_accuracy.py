@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 from robots import load_bundled
+from scripts import load_script
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.benchmark.accuracy import EquationOfMotion, contact_moves, limit_moves, measure_errors
 from batchpid.sim.engine.sapien.physics import PHYSICS
+
+accuracy = load_script("accuracy")
 
 
 def falling(robot, qpos, timestep, seconds):
     """Return the robot without effort, after ``seconds``."""
-    plant = EquationOfMotion(robot.dynamics(), np.zeros(robot.dof), qpos, timestep)
+    plant = accuracy.EquationOfMotion(robot.dynamics(), np.zeros(robot.dof), qpos, timestep)
     for _ in range(round(seconds / timestep)):
         plant.step()
     return plant
@@ -28,7 +30,7 @@ def test_equation_of_motion_keeps_the_energy(panda):
     """Kinetic energy is the work of gravity: the integral of -g(q) q'."""
     qpos, timestep = panda.sample(1, seed=3), 1 / 4000
     dynamics, still = panda.dynamics(), np.zeros((1, panda.dof))
-    plant = EquationOfMotion(dynamics, np.zeros(panda.dof), qpos, timestep)
+    plant = accuracy.EquationOfMotion(dynamics, np.zeros(panda.dof), qpos, timestep)
     powers = []
     for _ in range(401):
         gravity = dynamics.inverse_dynamics(plant.read_qpos(), still, still)
@@ -46,7 +48,7 @@ def test_equation_of_motion_keeps_the_energy(panda):
 
 def test_passive_force_holds_still(panda):
     qpos = panda.sample(3, seed=1)
-    plant = EquationOfMotion(panda.dynamics(), panda.damping, qpos, 1 / 2000)
+    plant = accuracy.EquationOfMotion(panda.dynamics(), panda.damping, qpos, 1 / 2000)
     for _ in range(100):
         plant.write_qf(plant.passive_force(True, True))
         plant.step()
@@ -54,20 +56,20 @@ def test_passive_force_holds_still(panda):
 
 
 def test_contact_moves_begin_free_and_end_in_contact(panda):
-    moves, dynamics = contact_moves(panda, 4, seed=1), panda.dynamics()
+    moves, dynamics = accuracy.contact_moves(panda, 4, seed=1), panda.dynamics()
     assert not dynamics.in_contact(moves.start).any()
     assert dynamics.in_contact(moves.target).all()
 
 
 def test_limit_moves_leave_the_limits_of_one_joint(panda):
-    moves = limit_moves(panda, 4, seed=1)
+    moves = accuracy.limit_moves(panda, 4, seed=1)
     assert not panda.limit_violations(moves.start)
     assert [env for env, _, _ in panda.limit_violations(moves.target)] == [0, 1, 2, 3]
     assert not panda.dynamics().in_contact(moves.target).any()
 
 
 def test_free_motion_hardly_depends_on_the_solver(panda):
-    errors = measure_errors(panda, "free", count=2, seconds=0.2)
+    errors = accuracy.measure_errors(panda, "free", count=2, seconds=0.2)
     accurate, *others = (errors[name, "equation of motion"] for name in PHYSICS)
     for other in others:
         assert 0 < other.rms <= other.largest == other.over_time.max()
@@ -76,7 +78,7 @@ def test_free_motion_hardly_depends_on_the_solver(panda):
 
 def test_unknown_motion_is_refused(panda):
     with pytest.raises(InvalidArgumentError, match="motion"):
-        measure_errors(panda, "dance")
+        accuracy.measure_errors(panda, "dance")
 
 
 @pytest.mark.slow
@@ -90,9 +92,9 @@ def test_errors_are_of_the_documented_order_of_magnitude(name):
         "limit": (2e-2, 1e-3),
     }
     for motion, (largest, rms) in bounds.items():
-        for case, error in measure_errors(robot, motion).items():
+        for case, error in accuracy.measure_errors(robot, motion).items():
             assert 1e-6 < error.rms < rms, (motion, case)
             assert error.largest < largest, (motion, case)
-    free = measure_errors(robot, "free")
+    free = accuracy.measure_errors(robot, "free")
     fast, accurate = (free[physics, "equation of motion"].rms for physics in ("fast", "accurate"))
     assert fast == pytest.approx(accurate, rel=0.1)

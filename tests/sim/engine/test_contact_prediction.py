@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from robots import load_bundled
+from scripts import load_script
 
 from batchpid.sim import Runner
-from batchpid.sim.benchmark.accuracy import contact_moves
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.contact_prediction import (
     LISTED_DISTANCE,
@@ -305,7 +305,7 @@ def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
 
 def test_isolation_before_contact_does_not_change_the_path(panda, packs, monkeypatch):
     """A robot that is rebuilt in contact would lose the engine's contact cache."""
-    moves, runs = contact_moves(panda, 2), []
+    moves, runs = load_script("accuracy").contact_moves(panda, 2), []
     for isolated in (2, 0):
         with Runner(panda, 2, workers=0, params=panda.tuned(), physics="fast", pack_size=2) as runner:
             runner.reset(moves.start)

@@ -38,7 +38,8 @@ DT, N = 1e-3, 3
 
 
 def parameters(function):
-    return list(inspect.signature(function).parameters) if inspect.isfunction(function) else None
+    """Return the names of a method's arguments; None for another attribute."""
+    return [name for name in inspect.signature(function).parameters if name != "self"] if callable(function) else None
 
 
 @pytest.mark.parametrize(

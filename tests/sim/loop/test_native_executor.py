@@ -12,7 +12,7 @@ from robots import load_bundled
 import batchpid as bp
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native_mass_matrix import NativeMassMatrix
+from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop import native_executor

@@ -259,10 +259,10 @@ STRANGE = {
         "qpos is a link",
     ),
     "soft link": (lambda h5py, file, elsewhere: file.__setitem__("qpos", h5py.SoftLink("/qvel")), "qpos is a link"),
-    "virtual dataset": (virtual, "qpos lies in other files"),
+    "virtual dataset": (virtual, "qpos is stored in other files"),
     "external storage": (
         lambda h5py, file, elsewhere: file.create_dataset("qpos", (6, 3, 9), "f4", external=[(elsewhere, 0, 648)]),
-        "qpos lies in other files",
+        "qpos is stored in other files",
     ),
     "huge shape": (
         lambda h5py, file, elsewhere: file.create_dataset("qpos", (10**12, 3, 9), "f4", chunks=(1, 3, 9)),

@@ -112,7 +112,7 @@ def damaged(columns: dict, change: str) -> str:
         ("no setpoint", r"column setpoint:panda_joint2.*is missing"),
         ("unknown joint", r"'qpos:elbow'.*unknown.*panda_joint1"),
         ("text", r"line 5 has 6 cells, the header 5"),
-        ("word", r"line 5, column 'qpos:panda_joint2' is no number \(got 'off'\)"),
+        ("word", r"line 5, column 'qpos:panda_joint2' is not a number \(got 'off'\)"),
         ("nan", r"line 5, column 'qpos:panda_joint2' is empty or not finite"),
         ("backwards", r"line 5: time does not increase"),
         ("degrees", r"line 2, column 'qpos:panda_joint2' is far beyond.*positions are in rad"),

@@ -1,0 +1,71 @@
+"""Tables of the numbers that params, actuators, guards and randomizations hold: unit, bounds, and the value for off.
+
+Each named tuple has one such table, from which come the checks of its options and leaves, the keys of its files, the
+values that are off, the bounds of a randomization, and the tables of the guides (docs/tables.py).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from batchpid.checks.validate import at_least, entries, is_traced
+from batchpid.errors import InvalidArgumentError
+
+
+class Field(NamedTuple):
+    """Option of a joint: a number, or of the type of ``neutral``."""
+
+    unit: str = ""
+    neutral: Any = 0.0
+    """Value that is off; an infinite one allows infinite values."""
+    low: float = 0.0
+    """Smallest value."""
+    above: bool = False
+    """Whether values must be greater than ``low``."""
+    high: float = math.inf
+    """Largest value."""
+
+    def checked(self, name: str, values: Any, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
+        """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
+
+        Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``
+        allows it.
+        """
+        if not is_traced(values):
+            infinite = infinite or math.isinf(self.neutral)
+            at_least(name, values, self.low, joint_names, above=self.above, infinite=infinite)
+            remedy = f"use a number from {self.low:g} to {self.high:g} ({self.unit})"
+            entries(name, values, values <= self.high, "out of range", joint_names, remedy=remedy)
+        return values
+
+
+FREE = Field(low=-math.inf)
+"""A leaf that may hold any number."""
+
+
+def check_leaves(
+    owner: str, leaves: Any, fields: Mapping[str, Field], num_envs: int, joint_names: Sequence[str] | None
+) -> None:
+    """Check the leaves of a named tuple that may have been edited by hand.
+
+    Raises InvalidArgumentError if a leaf has neither one row nor ``num_envs``, not one column per joint, or values out
+    of the bounds of ``fields``; a leaf without a field may hold any numbers.
+    """
+    for name, leaf in leaves._asdict().items():
+        if leaf is None or isinstance(leaf, tuple) or name in WHOLE:
+            continue
+        joints = leaves.num_joints if joint_names is None else len(joint_names)
+        if leaf.shape[:2] not in ((1, joints), (num_envs, joints)):
+            remedy = "give one row, or one row per env" + (f", of {', '.join(joint_names)}" if joint_names else "")
+            problem = f"has shape {leaf.shape}, not {(1, joints)} or {(num_envs, joints)}"
+            raise InvalidArgumentError(f"{owner}.{name}", problem, remedy=remedy)
+        field = fields.get(name, FREE)
+        field.checked(f"{owner}.{name}", leaf if is_traced(leaf) else np.asarray(leaf), joint_names, infinite=True)
+
+
+WHOLE = ("max_delay", "seed")
+"""Leaves for all joints together."""

@@ -1,0 +1,105 @@
+"""Write the tables of fields in the guides: ``python docs/tables.py``.
+
+Names, units, bounds and the values for off come from the tables in the code, meanings from the docstrings there.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import math
+import re
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import batchpid as bp
+from batchpid.arrays.choices import CHOICES
+from batchpid.arrays.field_tables import Field
+from batchpid.law.params import FIELDS as PARAMS
+from batchpid.motors.actuator_fields import FIELDS as ACTUATORS
+from batchpid.sim.randomization.fields import PHYSICAL, START
+from batchpid.sim.randomization.randomization import Randomization
+
+DOCS = Path(__file__).parent
+
+
+def numpydoc(function: Any) -> Iterator[tuple[list[str], str]]:
+    """Yield the names and the description of each entry under Parameters of a function's docstring."""
+    parameters = re.split(r"\n\w+\n-+\n", inspect.getdoc(function) or "")[1]
+    for names, text in re.findall(r"^(\S.*)\n((?:    .*\n?)+)", parameters, re.M):
+        yield names.split(", "), text
+
+
+def attributes(owner: type) -> Iterator[tuple[list[str], str]]:
+    """Yield the name and the docstring of each attribute of a class."""
+    body = ast.parse(inspect.getsource(owner)).body[0].body  # type: ignore[attr-defined]
+    for field, text in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            yield [field.target.id], text.value.value  # type: ignore[attr-defined, union-attr]
+
+
+def cells(names: list[str], text: str, fields: Mapping[str, Field]) -> tuple[str, ...]:
+    """Return names, units, bounds, the values for off, and the first sentence of a description."""
+    some = [fields[name] for name in names if name in fields]
+    numbers = [field for field in some if isinstance(field.neutral, float)]
+    units = dict.fromkeys(field.unit for field in some if field.unit)
+    bounds = dict.fromkeys(bound(field) for field in numbers)
+    off = dict.fromkeys(shown(field.neutral) for field in some)
+    off |= {f"`{next(iter(CHOICES[name]))}`": None for name in names if name in CHOICES}
+    meaning = re.sub(r" \[[^]`]*\]|,? >=? 0(?=[ ,.]|$)|:\w+:|\*", "", " ".join(text.split())).replace("``", "`")
+    meaning = re.match(r".*?(?<!e\.g)(?=\. |\.?$)", meaning)[0].replace("|", "\\|")  # type: ignore[index]
+    columns = [f"`{name}`" for name in names], units, bounds, off
+    return *(", ".join(column) for column in columns), meaning
+
+
+def bound(field: Field) -> str:
+    """Return the bounds of a field."""
+    if math.isfinite(field.high):
+        return f"{field.low:g} to {field.high:g}"
+    return "any" if math.isinf(field.low) else f"{'>' if field.above else '>='} {field.low:g}"
+
+
+def shown(neutral: Any) -> str:
+    """Return a value that is off."""
+    return f"{neutral:g}" if isinstance(neutral, float) else f"`{neutral}`"
+
+
+def table(
+    entries: Iterator[tuple[list[str], str]], fields: Mapping[str, Field], without: tuple[str, ...], off: bool = True
+) -> str:
+    """Return a table in Markdown, with a column for the values that are ``off``."""
+    given = [cells(names, text, fields) for names, text in entries if names[0] not in without]
+    rows = [("option", "unit", "range", "off", "meaning"), ("---",) * 5, *given]
+    rows = rows if off else [row[:3] + row[4:] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def tables() -> dict[tuple[str, str], str]:
+    """Return the tables by page and name."""
+    without = "joints", "joint_names", "dtype"
+    return {
+        ("law.md", "params"): table(numpydoc(bp.make_params), PARAMS, without),
+        ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATORS, without),
+        ("randomization.md", "randomization"): table(
+            attributes(Randomization), PHYSICAL | START, ("seed", "each"), off=False
+        ),
+    }
+
+
+def pages() -> dict[Path, str]:
+    """Return the text of each page with its tables."""
+    texts: dict[Path, str] = {}
+    for (page, name), rows in tables().items():
+        path = DOCS / page
+        marked = re.compile(rf"(<!-- {name}: made by docs/tables.py -->\n).*?(<!-- end -->)", re.S)
+        text, count = marked.subn(lambda match, rows=rows: f"{match[1]}{rows}\n{match[2]}", path.read_text())
+        assert count == 1, (page, name)
+        texts[path] = text
+    return texts
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text)
