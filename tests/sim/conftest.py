@@ -2,10 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from robots import load_bundled
 
-from batchpid.sim import Robot
+from batchpid.sim import Robot, RunnerOptions
+
+
+@pytest.fixture(params=["sapien", "mujoco"])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Engine of the runners that this test makes without naming one, which have no ``pack_size`` in MuJoCo."""
+    name: str = request.param
+    if name == "mujoco":
+        pytest.importorskip("mujoco.batch")
+    original = RunnerOptions.__init__
+
+    def init(options: RunnerOptions, *args: Any, **given: Any) -> None:
+        if name == "mujoco":
+            given.pop("pack_size", None)
+        original(options, *args, **{"engine": name, **given})
+
+    monkeypatch.setattr(RunnerOptions, "__init__", init)
+    return name
 
 
 @pytest.fixture(scope="session")

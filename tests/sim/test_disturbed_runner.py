@@ -8,17 +8,26 @@ import random
 import signal
 import tempfile
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 from twin import ROBOT, CtrlC, N, Twin, nothing_left, undisturbed, warnings_raised
 
 EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "20"))
 CTRL_C = CtrlC()
+ENGINES = ["sapien", "mujoco"] if find_spec("mujoco") else ["sapien"]
 
 
 class DisturbedRunner(RuleBasedStateMachine):
@@ -31,8 +40,11 @@ class DisturbedRunner(RuleBasedStateMachine):
         super().__init__()
         self._stack = contextlib.ExitStack()
         self._stack.enter_context(nothing_left())
-        folder = self._stack.enter_context(tempfile.TemporaryDirectory())
-        self.twin = Twin(Path(folder), workers=2)
+        self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+
+    @initialize(engine=st.sampled_from(ENGINES))
+    def begin(self, engine):
+        self.twin = Twin(self._folder, workers=2, engine=engine)
 
     def disturbance(self, kind, seed):
         """Return the disturbance of this kind."""

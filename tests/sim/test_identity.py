@@ -1,4 +1,4 @@
-"""Results are bit-identical for any number of workers, packing and number of envs, and in every rerun."""
+"""Results are bit-identical for any number of workers, packing and number of envs, in every rerun, in each engine."""
 
 import functools
 
@@ -35,22 +35,27 @@ def run(name="panda", num_envs=20, ticks=TICKS, control="pid", **options):
 
 
 @functools.cache
-def reference(name="panda", control="pid", ticks=TICKS):
-    """20 envs in this process."""
-    return run(name, ticks=ticks, control=control, workers=0)
+def in_this_process(engine, name="panda", control="pid", ticks=TICKS):
+    return run(name, ticks=ticks, control=control, workers=0, engine=engine)
+
+
+@pytest.fixture
+def reference(engine):
+    """Function that runs 20 envs in this process."""
+    return functools.partial(in_this_process, engine)
 
 
 @pytest.mark.parametrize("workers", [0, 2, 3])
-def test_any_number_of_workers(workers):
+def test_any_number_of_workers(workers, reference):
     assert_identical(run(workers=workers), reference())
 
 
 @pytest.mark.parametrize("pack_size", [1, 8, 16])
 def test_any_pack_size(pack_size):
-    assert_identical(run(workers=0, pack_size=pack_size), reference())
+    assert_identical(run(workers=0, pack_size=pack_size), in_this_process("sapien"))
 
 
-def test_any_number_of_envs():
+def test_any_number_of_envs(reference):
     many = run(num_envs=40, ticks=20, workers=0)
     assert_identical(run(num_envs=1, ticks=20, workers=0), many, slice(0, 1))
     assert_identical(many, reference(ticks=20), slice(0, 20))
@@ -58,23 +63,24 @@ def test_any_number_of_envs():
 
 @pytest.mark.parametrize("control", ["drive", "effort"])
 def test_other_controls(control):
-    expected = reference(control=control, ticks=20)
+    expected = in_this_process("sapien", control=control, ticks=20)
     assert_identical(run(ticks=20, workers=2, pack_size=8, control=control), expected)
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_another_robot():
-    assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), reference("jaco2", ticks=20))
+    assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), in_this_process("sapien", "jaco2", ticks=20))
 
 
 @pytest.mark.parametrize("control", ["pid", "drive"])
-def test_a_robot_with_friction_and_damping(control):
+def test_a_robot_with_friction_and_damping(control, reference):
     expected = reference(RUBBING, control=control, ticks=20)
     assert_identical(run(RUBBING, ticks=20, workers=1, pack_size=3, control=control), expected)
     alone = run(RUBBING, num_envs=1, ticks=20, workers=0, control=control)
     assert_identical(alone, expected, slice(0, 1))
 
 
+@pytest.mark.usefixtures("engine")
 def test_an_episode_with_friction_does_not_depend_on_when_it_begins():
     robot = load_bundled(RUBBING)
     setpoints = np.broadcast_to(robot.settings.target, (160, robot.dof))
@@ -91,6 +97,7 @@ def test_an_episode_with_friction_does_not_depend_on_when_it_begins():
 
 
 def test_a_rollout_and_its_ticks_one_by_one(panda):
+    reference = functools.partial(in_this_process, "sapien")
     with Runner(panda, 20, params=panda.params(), workers=1) as runner:
         runner.reset(start_poses(panda, 20))
         rollout = runner.rollout(np.broadcast_to(panda.settings.target, (TICKS, panda.dof)))
@@ -98,6 +105,7 @@ def test_a_rollout_and_its_ticks_one_by_one(panda):
     assert rollout.time[-1] == pytest.approx(TICKS * 20 / 2000)
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_rollout_with_checkpoints_faults_rates_and_feedforwards(panda, workers):
     ticks, envs = 57, 8  # all ticks of the rollout fit into one request, but for the checkpoints
@@ -121,9 +129,9 @@ def test_a_rollout_with_checkpoints_faults_rates_and_feedforwards(panda, workers
     assert_identical(rollout.observation, type(steps[0])._make(map(np.stack, zip(*steps, strict=True))))
 
 
-def test_a_masked_reset_does_not_affect_the_other_envs(panda):
+def test_a_masked_reset_does_not_affect_the_other_envs(panda, reference):
     mask = np.arange(20) % 3 == 0
-    with Runner(panda, 20, params=panda.params(), workers=1) as runner:
+    with Runner(panda, 20, params=panda.params(), workers=0) as runner:
         runner.reset(start_poses(panda, 20))
         for tick in range(TICKS):
             if tick == 15:

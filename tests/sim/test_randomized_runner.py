@@ -67,6 +67,7 @@ def episodes(runner, num_envs=N):
     return first, runner.rollout(command)
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
     robot, runs = load_bundled(name), []
@@ -145,6 +146,7 @@ def test_new_params_are_randomized_and_an_env_keeps_its_draws():
         runner.params = PANDA.params(kd=None)
 
 
+@pytest.mark.usefixtures("engine")
 def test_a_snapshot_holds_the_draws(tmp_path):
     command = setpoints()
     with make(actuators=bp.make_actuators(PANDA.dof, lag=0.002)) as runner:

@@ -27,7 +27,8 @@ def exchange(runner, setpoint, **arguments):
     return runner.recv()
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize("workers", [0, 1])
 def test_send_and_recv_are_bit_identical_to_step(workers):
     arguments = {"setpoint_rate": 0.1, "feedforward": 0.2, "substeps": 3}
     with make(workers, checkpoint_steps=10) as runner, make(0, checkpoint_steps=10) as model:

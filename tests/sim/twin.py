@@ -125,14 +125,16 @@ class Twin:
     it. It raises AssertionError where they differ.
     """
 
-    def __init__(self, folder: Path, workers: int) -> None:
+    def __init__(self, folder: Path, workers: int, engine: str = "sapien") -> None:
         self._folder, self._workers, self._files, self._others = folder, workers, 0, children()
+        self._engine: Any = engine
         self.runner, self._model = self._make(workers), self._make(0)
         self._recorders: tuple[Recorder, Recorder] | None = None
         self.snapshots: list[Snapshot] = []
 
     def _make(self, workers: int) -> Runner:
-        return Runner(ROBOT, N, params=ROBOT.params(), workers=workers, substeps=SUBSTEPS, checkpoint_steps=40)
+        options: Any = {"substeps": SUBSTEPS, "checkpoint_steps": 40, "engine": self._engine}
+        return Runner(ROBOT, N, params=ROBOT.params(), workers=workers, **options)
 
     def step(self, setpoint: Any, disturb: Disturbance = undisturbed) -> None:
         disturb(lambda: self.runner.step(setpoint))

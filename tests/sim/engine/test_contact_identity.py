@@ -1,4 +1,4 @@
-"""Results in contact, at many places at once, are bit-identical for any packing of the envs."""
+"""Results in contact, at many places at once, are bit-identical for any packing of the envs, in each engine."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from batchpid.sim import RecoveryWarning, Robot, Runner
 from batchpid.sim.engine.sapien.contact_prediction import ContactPredictor
 from batchpid.sim.tuning.randomization_presets import usual_variation
 
+# In MuJoCo, which does not limit the speed of joints, light fingers fail under these efforts.
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 N, TICKS = 16, 20
 OPEN_LOOP = {"kp": 0.0, "ki": 0.0, "kd": 0.0}
 
@@ -38,9 +40,9 @@ def thrash(name="jaco2", *, num_envs=N, before=lambda runner: None, after=lambda
 
 
 @functools.cache
-def reference(name="jaco2", physics="accurate"):
+def reference(name="jaco2", physics="accurate", engine="sapien"):
     """Return the rollout with every env alone in a system from the start."""
-    return thrash(name, physics=physics, pack_size=1)
+    return thrash(name, physics=physics, engine=engine, **({"pack_size": 1} if engine == "sapien" else {}))
 
 
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
@@ -76,6 +78,7 @@ def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name
     assert_identical(fall(8), first)
 
 
+@pytest.mark.usefixtures("engine")
 def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     robot = Robot.load("panda", fixed_base=False)
     options = {"control": "effort", "params": robot.params(**OPEN_LOOP)}
@@ -86,13 +89,14 @@ def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     assert_identical(*runs)
 
 
-def test_an_env_alone_is_bit_identical_to_the_same_env_among_others(jaco2):
+def test_an_env_alone_is_bit_identical_to_the_same_env_among_others(jaco2, engine):
     with Runner(jaco2, 1, workers=0, control="effort", params=jaco2.params(**OPEN_LOOP)) as runner:
         alone = runner.rollout(random_efforts(jaco2)[:, :1])
-    np.testing.assert_array_equal(alone.qpos, reference().qpos[:, :1])
+    np.testing.assert_array_equal(alone.qpos, reference(engine=engine).qpos[:, :1])
+    assert np.abs(alone.qpos - jaco2.start).max() > 0.5
 
 
-def test_neighbours_of_an_env_that_fails_are_bit_identical(jaco2):
+def test_neighbours_of_an_env_that_fails_are_bit_identical(jaco2, engine):
     effort = random_efforts(jaco2)
     effort[7, 5, 3] = np.nan
     options = {"control": "effort", "params": jaco2.params(**OPEN_LOOP), "workers": 0, "pack_size": 8}
@@ -100,7 +104,7 @@ def test_neighbours_of_an_env_that_fails_are_bit_identical(jaco2):
         warnings.simplefilter("ignore")
         rollout = runner.rollout(effort)
     assert not rollout.ok[7:, 5].any()
-    assert_identical(rollout, reference(), np.arange(N) != 5)
+    assert_identical(rollout, reference(engine=engine), np.arange(N) != 5)
 
 
 def closed_hand(robot):

@@ -1,8 +1,6 @@
 """MuJoCo as an engine: the model that is built, the same motion as in SAPIEN, and the promises of a runner."""
 
 import dataclasses
-import os
-import signal
 import sys
 
 import numpy as np
@@ -11,8 +9,6 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
-from identical import assert_identical  # noqa: E402
-from processes import children  # noqa: E402
 from robots import RUBBING, load_bundled  # noqa: E402
 from tiny_urdf import INERTIAL, joint, link, one_joint, random_tree, robot, write  # noqa: E402
 
@@ -23,14 +19,14 @@ from batchpid.sim import (  # noqa: E402
     MujocoSolver,
     Physics,
     Randomization,
-    RecoveryWarning,
     Robot,
     Runner,
     Uniform,
 )
 from batchpid.sim.engine import engines  # noqa: E402
 from batchpid.sim.engine.engines import load_engine  # noqa: E402
-from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
 
@@ -224,19 +220,6 @@ def test_the_ground_holds_a_robot_that_falls_on_it(tmp_path):
 # -- promises ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("workers", [1, 2, 3])
-def test_any_number_of_workers(workers):
-    assert_identical(run(workers=workers), run(workers=0))
-
-
-@pytest.mark.parametrize("control", ["pid", "drive"])
-def test_an_env_alone(control):
-    among = run(workers=0, control=control)
-    for env in range(6):
-        alone = run(num_envs=1, rows=slice(env, env + 1), workers=0, control=control)
-        assert_same_env(alone, among, env)
-
-
 def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
     """Motors change the joints of the models, after which envs with equal models share one."""
 
@@ -254,35 +237,6 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
         assert_same_env(run_drives(stiffness), both, env)
 
 
-def test_contact_does_not_depend_on_the_company(panda):
-    """The grippers close with full effort, and the arms push against themselves or the ground."""
-    setpoints = panda.sample(6, seed=3)
-
-    def push(rows):
-        with Runner(panda, len(setpoints[rows]), engine="mujoco", workers=0) as runner:
-            runner.reset()
-            for _ in range(60):
-                obs = runner.step(setpoints[rows])
-            return obs
-
-    among = push(slice(None))
-    assert (np.abs(among.qpos - setpoints).max(1) > 0.05).any()  # something is in the way
-    for env in (0, 3, 5):
-        assert_same_env(push(slice(env, env + 1)), among, env)
-
-
-def test_a_snapshot_continues_elsewhere(panda):
-    setpoints = panda.sample(4, seed=3)
-    options = {"engine": "mujoco", "randomization": Randomization(payload=Uniform(0.0, 1.0))}
-    with Runner(panda, 4, workers=0, **options) as one, Runner(panda, 4, workers=2, **options) as other:
-        one.reset()
-        one.rollout(np.broadcast_to(setpoints, (20, 4, panda.dof)))
-        other.restore(one.snapshot())
-        for _ in range(20):
-            first, second = one.step(setpoints), other.step(setpoints)
-    assert_identical(second, first)
-
-
 def test_a_snapshot_of_the_other_engine_is_refused(panda):
     with Runner(panda, 1, workers=0) as one:
         snapshot = one.snapshot()
@@ -290,43 +244,19 @@ def test_a_snapshot_of_the_other_engine_is_refused(panda):
         other.restore(snapshot)
 
 
-def test_a_killed_worker_changes_nothing(panda):
-    setpoints = panda.sample(4, seed=3)
+@pytest.mark.parametrize("switch", ["1", "0"], ids=["native", "Python"])
+def test_an_error_of_mujoco_closes_the_runner(panda, monkeypatch, switch):
+    def add_little_memory(scene, spec):
+        _set_options(scene, spec)
+        scene.memory = 10_000
 
-    def obs(kill):
-        with Runner(panda, 4, workers=2, engine="mujoco") as runner:
-            runner.reset()
-            for tick in range(12):
-                if kill and tick == 6:
-                    os.kill(runner.pids[0], signal.SIGKILL)
-                last = runner.step(setpoints)
-            return last
-
-    with pytest.warns(RecoveryWarning):
-        assert_identical(obs(True), obs(False))
-    assert not children()
-
-
-@pytest.mark.parametrize("on_fault", ["hold", "reset"])
-def test_an_env_that_fails_stays_alone(panda, on_fault):
-    setpoints = panda.sample(4, seed=3)
-
-    def last(bad):
-        options = {"on_fault": on_fault, "on_invalid_input": "contain"}
-        with Runner(panda, 4, workers=0, engine="mujoco", **options) as runner:
-            runner.reset()
-            for tick in range(12):
-                rows = setpoints.copy()
-                rows[1] = np.where(bad and tick == 5, np.nan, rows[1])
-                obs = runner.step(rows)
-            return obs
-
-    with pytest.warns(FaultWarning):
-        with_fault = last(True)
-    expected = last(False)
-    for env in (0, 2, 3):
-        np.testing.assert_array_equal(with_fault.qpos[env], expected.qpos[env])
-    assert np.isfinite(with_fault.qpos).all()
+    monkeypatch.setenv("BATCHPID_NATIVE", switch)
+    monkeypatch.setattr(model_builder, "_set_options", add_little_memory)
+    with Runner(panda, 2, engine="mujoco", workers=0, control="effort", timestep=4.9e-4) as runner:
+        with pytest.raises(Exception, match="out of memory"):
+            runner.rollout(np.full((100, 2, panda.dof), 3.0))
+        assert runner.closed
+    robot_model.cache_clear()
 
 
 def test_a_state_that_is_not_finite_is_contained(panda, tmp_path, monkeypatch):

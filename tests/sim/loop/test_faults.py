@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import warnings
 
@@ -40,9 +41,14 @@ COMMANDS = ("setpoint", "setpoint_rate", "feedforward")
 BAD = [(name, bad, 0) for name in COMMANDS for bad in (np.nan, -np.inf)] + [("setpoint", np.inf, 2)]
 
 
-@pytest.fixture(scope="module")
-def undisturbed():
-    with make() as runner:
+@pytest.fixture
+def undisturbed(engine):
+    return undisturbed_in(engine)
+
+
+@functools.cache
+def undisturbed_in(engine):
+    with make(engine=engine) as runner:
         return runner.rollout(setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9)))
 
 
@@ -64,6 +70,7 @@ def test_a_command_that_is_not_finite_suspends_its_env_alone(name, bad, workers,
     assert not broken.effort[5:, 3].any()
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("control", ["pid", "drive", "effort"])
 def test_a_state_that_is_not_finite_is_detected_at_its_step(control):
     table = setpoints(8) if control != "effort" else np.zeros((8, N, 9))
@@ -82,6 +89,7 @@ def test_a_state_that_is_not_finite_is_detected_at_its_step(control):
     assert not broken.ok[3:, 2].any()
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_an_env_with_unstable_gains_is_suspended():
     gains = PANDA.params().kd.repeat(N, 0)
@@ -96,6 +104,7 @@ def test_an_env_with_unstable_gains_is_suspended():
     assert np.isfinite(rollout.qpos).all()
 
 
+@pytest.mark.usefixtures("engine")
 def test_a_joint_above_the_speed_limit_fails_at_that_step():
     limit = np.full(9, np.inf)
     limit[3] = 1.0
@@ -115,6 +124,7 @@ def test_a_joint_above_the_speed_limit_fails_at_that_step():
     assert not rollout.ok[first:, 0].any()
 
 
+@pytest.mark.usefixtures("engine")
 def test_a_suspended_env_stands_still_until_it_is_reset():
     table = setpoints(40)
     table[2, 1] = np.nan
@@ -131,6 +141,7 @@ def test_a_suspended_env_stands_still_until_it_is_reset():
         assert np.abs(after.qpos[-1, 1] - PANDA.start).max() > 1e-3
 
 
+@pytest.mark.usefixtures("engine")
 def test_an_env_that_is_reset_after_a_fault_is_bit_identical_to_one_without():
     table = setpoints(20)
     with make() as runner:
@@ -145,6 +156,7 @@ def test_an_env_that_is_reset_after_a_fault_is_bit_identical_to_one_without():
     assert_identical(clean, again)
 
 
+@pytest.mark.usefixtures("engine")
 def test_on_fault_reset_restarts_the_env_and_flags_one_tick():
     table = setpoints(10)
     table[4, 2, 0] = np.nan
@@ -158,6 +170,7 @@ def test_on_fault_reset_restarts_the_env_and_flags_one_tick():
     assert np.abs(rollout.qpos[9, 2] - home).max() > 0.02
 
 
+@pytest.mark.usefixtures("engine")
 def test_a_start_pose_that_is_not_finite_is_replaced_by_the_last_start():
     qpos = np.tile(PANDA.start, (N, 1))
     qpos[3, 2] = np.nan
@@ -170,6 +183,7 @@ def test_a_start_pose_that_is_not_finite_is_replaced_by_the_last_start():
         runner.reset(qpos=qpos)
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_by_default_a_command_that_is_not_finite_raises_and_changes_nothing(name):
     table = setpoints(2)
@@ -207,11 +221,13 @@ def check_random_fault(case):
     assert np.isfinite(broken.effort).all()
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("case", [*range(6), 86])  # 86: the state stays finite, at 1e28 rad
 def test_the_other_63_of_64_envs_are_bit_identical(case):
     check_random_fault(case)
 
 
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("control", ["pid", "effort"])
 def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(control, monkeypatch):
     found = []

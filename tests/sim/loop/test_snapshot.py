@@ -38,6 +38,8 @@ KINDS = [(name, control, 0) for name in ("panda", "jaco2") for control in ("pid"
 KINDS += [(RUBBING, "pid", 0), (RUBBING, "drive", 0)]
 
 
+@pytest.mark.usefixtures("engine")
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")  # light fingers under efforts, in MuJoCo
 @pytest.mark.parametrize(("name", "control", "workers"), [*KINDS, ("jaco2", "pid", 2)])
 def test_it_restores_in_place_and_in_another_runner(name, control, workers, tmp_path):
     robot = load_bundled(name)

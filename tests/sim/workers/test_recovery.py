@@ -189,6 +189,7 @@ def test_workers_killed_between_ticks_and_during_their_replay_are_replaced(undis
     assert_identical(undisturbed, rollout)
 
 
+@pytest.mark.usefixtures("engine")
 def test_resets_params_and_snapshots_are_replayed():
     def program(runner, kill):
         runner.rollout(setpoints(8))
