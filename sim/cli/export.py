@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ FILES = {
 }
 """End of the default file name of each target."""
 USED = {
-    "c": ("gains", "timestep", "limits", "prefix"),
+    "c": ("gains", "timestep", "limits", "prefix", "dynamics", "project"),
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
     "isaac_lab": ("gains", "timestep", "limits", "actuators"),
     "maniskill": ("gains", "timestep", "limits", "actuators"),
@@ -35,6 +35,8 @@ USED = {
 }
 """Flags that have an effect for each target, of those that only some have."""
 UNLIMITED = "guard: setpoints are not limited in the target"
+PROJECT = ("CMakeLists.txt", "example.c")
+"""Files of ``--project``, besides the header."""
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
@@ -62,6 +64,10 @@ class ExportCommand:
     """Limit setpoints to the robot's joint limits and speeds before they reach the law."""
     prefix: str = "batchpid"
     """Beginning of every name in the file; in ros2_control the name of the controller."""
+    dynamics: flags.Switch = False
+    """In C, add the robot's mass matrix, gravity and bias as functions."""
+    project: flags.Switch = False
+    """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
     missing_meshes: flags.MissingMeshes = "skip"
@@ -74,6 +80,7 @@ class ExportCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.errors import InvalidArgumentError
+        from batchpid.export import to_c_project
         from batchpid.io.files import write_atomically
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
@@ -85,7 +92,9 @@ class ExportCommand:
                 raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        out = Outputs(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
+        outputs = Outputs(force=self.force)
+        out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
+        others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"
@@ -101,6 +110,10 @@ class ExportCommand:
         if self.strict and differences:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
+        if self.project:
+            files = to_c_project(chosen.params, self.timestep, header=out.name, **self._c_options(robot))
+            for name, path in others.items():
+                write_atomically(path, files[name])
         write_atomically(out, exported.text)
         for each in differences:
             print(f"differs: {each}")
@@ -117,8 +130,7 @@ class ExportCommand:
         place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
         notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
         if self.to == "c":
-            guard = robot.guard() if self.limits else None
-            exported = to_c(params, dt, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+            exported = to_c(params, dt, **self._c_options(robot))
             return exported._replace(differences=(*exported.differences, *notes))
         notes += [UNLIMITED] if self.limits else []
         params, inertia = params.for_joints(own), _inertia(robot)[:, own]
@@ -129,6 +141,15 @@ class ExportCommand:
             to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
             exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
+
+    def _c_options(self, robot: Robot) -> dict[str, Any]:
+        """Return the options of the C header."""
+        return {
+            "joint_names": robot.joint_names,
+            "guard": robot.guard() if self.limits else None,
+            "prefix": self.prefix,
+            "tree": robot.kinematic_tree() if self.dynamics else None,
+        }
 
 
 def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Exported:
