@@ -5,6 +5,7 @@ from batchpid.export.c_project import to_c_project
 from batchpid.export.exported import Exported
 from batchpid.export.isaac_lab import to_isaac_lab
 from batchpid.export.maniskill import to_maniskill
+from batchpid.export.newton import to_newton
 from batchpid.export.ros2_control import to_ros2_control
 from batchpid.export.ros2_control_reader import Imported, from_ros2_control
 
@@ -16,5 +17,6 @@ __all__ = [
     "to_c_project",
     "to_isaac_lab",
     "to_maniskill",
+    "to_newton",
     "to_ros2_control",
 ]

@@ -21,6 +21,7 @@ FILES = {
     "ros2_control": "-controllers.yaml",
     "isaac_lab": "-actuators.py",
     "maniskill": "-controller.py",
+    "newton": "-actuators.py",
     "mjcf": "-pid.xml",
     "urdf": "-repaired.urdf",
 }
@@ -30,7 +31,8 @@ USED = {
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
     "isaac_lab": ("gains", "timestep", "limits", "actuators"),
     "maniskill": ("gains", "timestep", "limits", "actuators"),
-    "mjcf": ("gains", "timestep", "limits", "actuators"),
+    "newton": ("gains", "timestep", "limits", "actuators"),
+    "mjcf": ("gains", "timestep", "limits", "actuators", "motors"),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
@@ -46,14 +48,14 @@ class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "mjcf" is the robot with the
+    is the YAML of a controller, "isaac_lab", "maniskill" and "newton" are gains in Python. "mjcf" is the robot with the
     law in MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and batchpid's law or
     the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "mjcf", "urdf"] = "c"
+    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "newton", "mjcf", "urdf"] = "c"
     """Target."""
     actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
@@ -66,6 +68,8 @@ class ExportCommand:
     """Beginning of every name in the file; in ros2_control the name of the controller."""
     dynamics: flags.Switch = False
     """In C, add the robot's mass matrix, gravity and bias as functions."""
+    motors: flags.Switch = False
+    """In MJCF, write the motors without the law: their inputs are the efforts asked for."""
     project: flags.Switch = False
     """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
@@ -98,6 +102,12 @@ class ExportCommand:
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"
+        elif self.motors:
+            if self.gains is not None or self.limits:
+                raise InvalidArgumentError(
+                    "motors", "are written without a law", remedy="leave out --gains and --limits"
+                )
+            exported, content = _mjcf(robot, None, self.timestep, False), f"motors of {robot.dof} joints"
         else:
             chosen = gain_set(robot, self.gains)
             if chosen.control != "pid":
@@ -121,7 +131,7 @@ class ExportCommand:
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
         """Return the file of a target for gains."""
-        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_ros2_control
+        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
 
         if self.to == "mjcf":
             return _mjcf(robot, params, self.timestep, self.limits)
@@ -138,7 +148,7 @@ class ExportCommand:
             names = {"controller": self.controller, "name": self.prefix}
             exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
         else:
-            to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
+            to = {"isaac_lab": to_isaac_lab, "maniskill": to_maniskill, "newton": to_newton}[self.to]
             exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
 
@@ -152,7 +162,7 @@ class ExportCommand:
         }
 
 
-def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Exported:
+def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:
     """Return the MJCF of the robot with its motors."""
     from batchpid.sim.engine.engines import load_engine
 

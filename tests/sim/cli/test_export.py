@@ -114,6 +114,9 @@ def test_pd_targets_have_the_motors_and_the_friction_of_the_robot(batchpid, tmp_
     status, said, _ = batchpid("export", path, "--to", "maniskill", "--out", out, *words)
     assert (status, "differs: coulomb: friction of PhysX" in said) == (0, True)
     assert "force_limit=[10.0]" in out.read_text()
+    status, said, _ = batchpid("export", path, "--to", "newton", "--out", out, *words)
+    assert (status, "differs: command_delay: of the setpoint" in said) == (0, True)
+    assert all(each in out.read_text() for each in ("DrivePID", "'delay_steps': 2", "'joint_friction': {'a': 0.75}"))
     assert batchpid("export", path, "--out", tmp_path / "a.h", *words)[0] == 2
 
 
@@ -125,3 +128,9 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     assert (status, "differs: guard" in said) == (0, True)
     model = mujoco.MjModel.from_xml_path(str(out))
     assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
+    status, said, _ = batchpid("export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out)
+    assert (status, said.splitlines()[-1]) == (0, f"written: {out}: motors of 9 joints")
+    assert mujoco.MjModel.from_xml_path(str(out)).nu == 9
+    assert (
+        batchpid("export", "panda", "--to", "mjcf", "--motors", "--gains", "designed", "--out", out, "--force")[0] == 2
+    )
