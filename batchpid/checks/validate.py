@@ -103,6 +103,13 @@ def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path
     return path
 
 
+def identifier(argument: str, value: Any) -> str:
+    """Return a name that is an identifier of Python."""
+    if not isinstance(value, str) or not value.isidentifier():
+        raise InvalidArgumentError(argument, "is no name in Python", value=value, remedy="use letters, digits and _")
+    return value
+
+
 def is_traced(value: Any) -> bool:
     """Return whether ``value`` is an array inside jax.jit, jax.grad or jax.vmap, whose entries cannot be checked."""
     jax = sys.modules.get("jax")

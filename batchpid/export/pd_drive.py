@@ -3,38 +3,46 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.choices import MeasuredRate
+from batchpid.arrays.choices import IntegrateFirst, MeasuredRate
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import Differences
+from batchpid.export.differences import Differences, strategies
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import Actuators
 
 Float64 = NDArray[np.float64]
-LACKING = {
-    "sensor_delay": "s",
-    "lag": "s",
-    "strength": "",
-    "bias": "N m or N",
-    "backlash": "rad or m",
-    "position_resolution": "rad or m",
-    "velocity_resolution": "rad/s or m/s",
-    "position_noise": "rad or m",
-    "velocity_noise": "rad/s or m/s",
+EFFECTS = {
+    "sensor_delay": ("none in the target", "s"),
+    "lag": ("none in the target", "s"),
+    "strength": ("none in the target", ""),
+    "bias": ("none in the target", "N m or N"),
+    "backlash": ("none in the target", "rad or m"),
+    "position_resolution": ("none in the target", "rad or m"),
+    "velocity_resolution": ("none in the target", "rad/s or m/s"),
+    "position_noise": ("none in the target", "rad or m"),
+    "velocity_noise": ("none in the target", "rad/s or m/s"),
+    "saturation_effort": ("no torque-speed line", "N m or N"),
+    "command_delay": ("none in the target", "s"),
+    "armature": ("none in the target", "kg m^2 or kg"),
+    "viscous": ("none in the target", "N m s/rad or N s/m"),
+    "coulomb": ("none in the target", "N m or N"),
+    "static": ("friction at rest is that of motion", "N m or N"),
 }
-"""Effects of actuators that no PD target has, with their units."""
+"""Effects of actuators: the sentence where a target lacks one, and the unit."""
+JOINT_SIDE = ("armature", "viscous", "coulomb", "static")
+_OFF = {"strength": 1.0, "saturation_effort": math.inf}
 
 
 class Drive(Differences):
     """Gains of a drive with their differences.
 
-    ``implicit``: the simulator integrates the drive implicitly. ``whole``: it has an integral and two limits of the
-    total effort, which the caller compares.
+    ``implicit``: the simulator integrates the drive implicitly. ``integrates``: it has an integral. ``two_sided``: its
+    effort limits may differ by direction.
     """
 
     def __init__(
@@ -44,8 +52,10 @@ class Drive(Differences):
         dt: float,
         inertia: ArrayLike | None,
         actuators: Actuators | None,
-        implicit: bool,
-        whole: bool = False,
+        *,
+        implicit: bool = False,
+        integrates: bool = False,
+        two_sided: bool = False,
     ) -> None:
         super().__init__(params, joint_names, dt, inertia, implicit)
         self._damps_more = implicit and params.discretization is None
@@ -58,7 +68,7 @@ class Drive(Differences):
             problem = f"are of {self.actuators.num_envs} envs and {self.actuators.num_joints} joints"
             remedy = f"give those of one env and {len(self.joints)} joints"
             raise InvalidArgumentError("actuators", problem, remedy=remedy)
-        self._compare(implicit, whole)
+        self._compare(implicit, integrates, two_sided)
 
     def motor(self, effect: str, off: float = 0.0) -> Float64:
         """Return an effect of the actuators (joints,), ``off`` where it is off."""
@@ -71,20 +81,67 @@ class Drive(Differences):
         low, high = self.value("effort_min", -math.inf), self.value("effort_max", math.inf)
         return np.minimum(np.maximum(np.minimum(-low, high), 0.0), self.motor("effort_limit", math.inf))
 
-    def lack_motor(self, effect: str, problem: str, unit: str = "", off: float = 0.0) -> None:
-        """Add an effect of the actuators that the target lacks, where it is on."""
-        values = self.motor(effect, off)
-        if (on := values != off).any():
-            self.append(f"{effect}: {problem}; here {self.listed(values, on)} {unit}".rstrip())
+    def lack_motors(self, has: Collection[str], **problems: str) -> None:
+        """Add the effects of the actuators that are on and not in ``has``; ``problems`` are other sentences."""
+        for effect, (problem, unit) in EFFECTS.items():
+            values = self.motor(effect, off := _OFF.get(effect, 0.0))
+            if effect not in has and (on := values != off).any():
+                said = problems.get(effect, problem)
+                self.append(f"{effect}: {said}; here {self.listed(values, on)} {unit}".rstrip())
+        if self.actuators.limit_positions is not None and "position_limit" not in has:
+            self.append("position_limit: no limit by position")
 
-    def _compare(self, implicit: bool, whole: bool) -> None:
+    def delays_setpoint(self) -> None:
+        """Add the difference of a target whose delay is that of the setpoint."""
+        if (delay := self.motor("command_delay")).any():
+            lag = self.degrees(delay)
+            self.append(f"command_delay: of the setpoint, not of the effort: the law is not late{lag}")
+
+    def delay_steps(self) -> list[int]:
+        """Return the delay of the setpoint of each joint in whole steps, and add its differences."""
+        delay = self.motor("command_delay")
+        steps = np.rint(delay / self.dt).astype(int)
+        if (odd := np.abs(delay - steps * self.dt) > 1e-9).any():
+            whole, here = self.listed(steps, odd), self.listed(delay, odd)
+            self.append(f"command_delay: a whole number of steps of {self.dt:g} s: {whole}; here {here} s")
+        self.delays_setpoint()
+        return [int(each) for each in steps]
+
+    @property
+    def integral_limit(self) -> Float64:
+        """Symmetric limit of the integral (joints,) [N m or N]; infinite without a limit."""
+        low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
+        return np.maximum(np.minimum(-low, high), 0.0)
+
+    def compare_integral(self, first: bool) -> None:
+        """Add the differences of a target that limits its integral alone, symmetrically.
+
+        ``first``: it integrates before the output, else after, and then beyond its limit by one step.
+        """
+        ki, used = self.value("ki"), np.array(strategies(self.params))
+        limited = np.isfinite(self.value("effort_min", -math.inf)) | np.isfinite(self.value("effort_max", math.inf))
+        if (winds := (ki > 0) & limited & (used != "none")).any():
+            limit = self.listed(self.integral_limit, winds)
+            self.append(f"anti_windup: the integral goes on while the effort is at its limit, up to {limit} N m or N")
+        low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
+        uneven, ends = -low != high, np.isfinite(low) | np.isfinite(high)
+        if ((ki > 0) & (uneven if first else ends)).any():
+            limits = self.listed(self.integral_limit, ki > 0)
+            how = "the same in both directions" if first else "passed by up to one step, ki dt |e|"
+            self.append(f"integral_limit: {limits} N m or N, {how}")
+        if isinstance(self.params.integration, IntegrateFirst) != first and ki.any():
+            phase = self.phase(self.params._replace(integration=IntegrateFirst() if first else None))
+            how = "before the output, a step earlier" if first else "after the output, a step later"
+            self.append(f"integration: the present error enters the integral {how}{phase}")
+
+    def _compare(self, implicit: bool, integrates: bool, two_sided: bool) -> None:
         params, kp, ki = self.params, self.value("kp"), self.value("ki")
-        if ki.any() and not whole:
+        if ki.any() and not integrates:
             soft = np.divide(1.0, kp, out=np.full(len(kp), math.inf), where=kp > 0)
             left = self.listed(soft, ki > 0)
             self.append(f"ki: no integral: a load of 1 N m or N leaves an error of {left} rad or m")
         low, high = self.value("effort_min", -math.inf), self.value("effort_max", math.inf)
-        if not whole and (uneven := -low != high).any():
+        if not two_sided and (uneven := -low != high).any():
             limit = self.listed(self.effort_limit, uneven)
             self.append(f"effort_limit: one number for both directions: {limit} N m or N")
         elif implicit and np.isfinite(high).any():
@@ -113,7 +170,3 @@ class Drive(Differences):
             self.append("non_finite: inputs are not checked")
         if self._damps_more:
             self.append("law: stiffness and damping act at the end of a step, implicitly, which damps more")
-        for effect, unit in LACKING.items():
-            self.lack_motor(effect, "none in the target", unit, float(effect == "strength"))
-        if self.actuators.limit_positions is not None:
-            self.append("position_limit: no limit by position")

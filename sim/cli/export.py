@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -21,20 +21,24 @@ FILES = {
     "ros2_control": "-controllers.yaml",
     "isaac_lab": "-actuators.py",
     "maniskill": "-controller.py",
+    "newton": "-actuators.py",
     "mjcf": "-pid.xml",
     "urdf": "-repaired.urdf",
 }
 """End of the default file name of each target."""
 USED = {
-    "c": ("gains", "timestep", "limits", "prefix"),
+    "c": ("gains", "timestep", "limits", "prefix", "dynamics", "project"),
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
     "isaac_lab": ("gains", "timestep", "limits", "actuators"),
     "maniskill": ("gains", "timestep", "limits", "actuators"),
-    "mjcf": ("gains", "timestep", "limits", "actuators"),
+    "newton": ("gains", "timestep", "limits", "actuators"),
+    "mjcf": ("gains", "timestep", "limits", "actuators", "motors"),
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
 UNLIMITED = "guard: setpoints are not limited in the target"
+PROJECT = ("CMakeLists.txt", "example.c")
+"""Files of ``--project``, besides the header."""
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
@@ -44,14 +48,14 @@ class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller, "isaac_lab" and "maniskill" are the PD gains in Python. "mjcf" is the robot with the
+    is the YAML of a controller, "isaac_lab", "maniskill" and "newton" are gains in Python. "mjcf" is the robot with the
     law in MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and batchpid's law or
     the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "mjcf", "urdf"] = "c"
+    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "newton", "mjcf", "urdf"] = "c"
     """Target."""
     actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
@@ -62,6 +66,12 @@ class ExportCommand:
     """Limit setpoints to the robot's joint limits and speeds before they reach the law."""
     prefix: str = "batchpid"
     """Beginning of every name in the file; in ros2_control the name of the controller."""
+    dynamics: flags.Switch = False
+    """In C, add the robot's mass matrix, gravity and bias as functions."""
+    motors: flags.Switch = False
+    """In MJCF, write the motors without the law: their inputs are the efforts asked for."""
+    project: flags.Switch = False
+    """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
     missing_meshes: flags.MissingMeshes = "skip"
@@ -74,6 +84,7 @@ class ExportCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.errors import InvalidArgumentError
+        from batchpid.export import to_c_project
         from batchpid.io.files import write_atomically
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
@@ -85,10 +96,18 @@ class ExportCommand:
                 raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        out = Outputs(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
+        outputs = Outputs(force=self.force)
+        out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
+        others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"
+        elif self.motors:
+            if self.gains is not None or self.limits:
+                raise InvalidArgumentError(
+                    "motors", "are written without a law", remedy="leave out --gains and --limits"
+                )
+            exported, content = _mjcf(robot, None, self.timestep, False), f"motors of {robot.dof} joints"
         else:
             chosen = gain_set(robot, self.gains)
             if chosen.control != "pid":
@@ -101,6 +120,10 @@ class ExportCommand:
         if self.strict and differences:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
+        if self.project:
+            files = to_c_project(chosen.params, self.timestep, header=out.name, **self._c_options(robot))
+            for name, path in others.items():
+                write_atomically(path, files[name])
         write_atomically(out, exported.text)
         for each in differences:
             print(f"differs: {each}")
@@ -108,7 +131,7 @@ class ExportCommand:
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
         """Return the file of a target for gains."""
-        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_ros2_control
+        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
 
         if self.to == "mjcf":
             return _mjcf(robot, params, self.timestep, self.limits)
@@ -117,8 +140,7 @@ class ExportCommand:
         place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
         notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
         if self.to == "c":
-            guard = robot.guard() if self.limits else None
-            exported = to_c(params, dt, joint_names=robot.joint_names, guard=guard, prefix=self.prefix)
+            exported = to_c(params, dt, **self._c_options(robot))
             return exported._replace(differences=(*exported.differences, *notes))
         notes += [UNLIMITED] if self.limits else []
         params, inertia = params.for_joints(own), _inertia(robot)[:, own]
@@ -126,12 +148,21 @@ class ExportCommand:
             names = {"controller": self.controller, "name": self.prefix}
             exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
         else:
-            to = to_isaac_lab if self.to == "isaac_lab" else to_maniskill
+            to = {"isaac_lab": to_isaac_lab, "maniskill": to_maniskill, "newton": to_newton}[self.to]
             exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
 
+    def _c_options(self, robot: Robot) -> dict[str, Any]:
+        """Return the options of the C header."""
+        return {
+            "joint_names": robot.joint_names,
+            "guard": robot.guard() if self.limits else None,
+            "prefix": self.prefix,
+            "tree": robot.kinematic_tree() if self.dynamics else None,
+        }
 
-def _mjcf(robot: Robot, params: bp.PIDParams, dt: float, limits: bool) -> Exported:
+
+def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:
     """Return the MJCF of the robot with its motors."""
     from batchpid.sim.engine.engines import load_engine
 

@@ -1,4 +1,4 @@
-"""MJCF of the simulated robot, with the law in MuJoCo's own PID actuators.
+"""MJCF of the simulated robot, with the law in MuJoCo's own PID actuators, or with its motors alone.
 
 MuJoCo's ``pid`` actuator (3.15 and later), with the error e, inputs r, r' and ff, and the integral A::
 
@@ -6,7 +6,9 @@ MuJoCo's ``pid`` actuator (3.15 and later), with the error e, inputs r, r' and f
     A     <- A + dt e        while |A| < imax, or towards 0
 
 That is this package's law with the measured velocity, output first, without anti-windup. Its output after a step was
-compared with MuJoCo 4.0's.
+compared with MuJoCo 4.0's. A motor alone is a ``general`` actuator, whose input u is the effort asked for::
+
+    effort = min(max(s x + b, low), high)        x = u(t - d), or its first-order lag
 """
 
 from __future__ import annotations
@@ -18,14 +20,13 @@ from typing import Any
 import mujoco
 import numpy as np
 from lxml import etree
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.export.differences import strategies
 from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
-from batchpid.law.params import PIDParams
+from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
@@ -35,33 +36,36 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.inertia import nearest_physical
 
+LINEAR = 1
+"""Interpolation between the samples of a delay."""
 INPUTS = 7
 """Inputs of each actuator, in its order in ``ctrl``: position, velocity, feedforward (bits of ``mjtCtrlInput``)."""
 
 
 def to_mjcf(
     robot: RobotDescription,
-    params: PIDParams,
+    params: PIDParams | None,
     dt: float,
     *,
     actuators: Actuators | None = None,
     inertia: ArrayLike | None = None,
     physics: str = "accurate",
 ) -> Exported:
-    """Return the MJCF of ``robot``, one ``pid`` actuator for each independent joint, and its differences.
+    """Return the MJCF of ``robot``, one actuator for each independent joint, and its differences.
 
     Bodies are the rigid bodies that are simulated here, with repaired inertias, convex shapes, pairs that do not
     collide, joint limits, damping, Coulomb friction and armature; followers are tied to their leaders by constraints.
-    Each actuator has three inputs in ``ctrl``: position, velocity and feedforward.
+    Each ``pid`` actuator has three inputs in ``ctrl``: position, velocity and feedforward.
 
     Parameters
     ----------
     params
-        Of one env: (1, joints), all joints.
+        Of one env: (1, joints), all joints. None: the motors alone; the input in ``ctrl`` is the effort asked for.
     dt
         Time step of the simulation, and so of the control [s].
     actuators
-        Motors of one env: armature, friction and effort limit are written.
+        Motors of one env. Written are armature, friction, effort limit and command delay, with ``pid`` as a delay of
+        the inputs; of motors alone also strength, bias and lag.
     inertia
         As in :func:`batchpid.export.to_ros2_control`, of all joints.
     physics
@@ -74,7 +78,8 @@ def to_mjcf(
     RobotError
         MuJoCo cannot build the robot.
     """
-    found = Drive(params, robot.joint_names, dt, inertia, actuators, implicit=False, whole=True)
+    law = make_params(robot.dof, 0.0, measurement_rate="measured") if params is None else params
+    found = Drive(law, robot.joint_names, dt, inertia, actuators, integrates=True, two_sided=True)
     spec = SceneSpec(
         robot.urdf,
         robot.ignored_pairs,
@@ -94,12 +99,12 @@ def to_mjcf(
         found += _set_inertia(scene.body(name), inertias[link], link)
     friction = added_friction(own_friction(spec), found.actuators)
     _set_joints(scene, robot, found, friction)
-    _set_actuators(scene, robot, found)
+    _set_actuators(scene, robot, found, params is not None)
     try:
         scene.compile()
     except ValueError as error:
         raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
-    _compare(found, robot, friction)
+    _compare(found, robot, friction, params is not None)
     head = "".join(f"<!-- differs: {' '.join(each.split()).replace('--', '- -')} -->\n" for each in found)
     return Exported(f"{head}{_exact(scene)}", tuple(found))
 
@@ -137,23 +142,28 @@ def _set_joints(scene: Any, robot: RobotDescription, found: Drive, friction: Any
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
 
 
-def _integral_limit(found: Drive) -> NDArray[np.float64]:
-    """Return the symmetric limit of the integral (joints,) [N m or N]."""
-    low, high = found.value("integral_min", -math.inf), found.value("integral_max", math.inf)
-    return np.maximum(np.minimum(-low, high), 0.0)
-
-
-def _set_actuators(scene: Any, robot: RobotDescription, found: Drive) -> None:
-    kp, ki, kd, limit = found.value("kp"), found.value("ki"), found.value("kd"), _integral_limit(found)
+def _set_actuators(scene: Any, robot: RobotDescription, found: Drive, controls: bool) -> None:
+    kp, ki, kd, limit = found.value("kp"), found.value("ki"), found.value("kd"), found.integral_limit
     low, high = found.value("effort_min", -math.inf), found.value("effort_max", math.inf)
-    motor = found.motor("effort_limit", math.inf)
+    motor, delay = found.motor("effort_limit", math.inf), found.motor("command_delay")
+    strength, bias, lag = found.motor("strength", 1.0), found.motor("bias"), found.motor("lag")
     low, high = np.maximum(low, -motor), np.minimum(high, motor)
     for at in np.flatnonzero(robot.independent):
         name = robot.joint_names[at]
         actuator = scene.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        integrates = ki[at] > 0 and limit[at] > 0
-        imax = limit[at] / ki[at] if integrates and math.isfinite(limit[at]) else -1.0
-        actuator.set_to_pid(kp=kp[at], kv=kd[at], ki=ki[at] if integrates else 0.0, imax=imax, ctrlspec=INPUTS)
+        if controls:
+            integrates = ki[at] > 0 and limit[at] > 0
+            imax = limit[at] / ki[at] if integrates and math.isfinite(limit[at]) else -1.0
+            actuator.set_to_pid(kp=kp[at], kv=kd[at], ki=ki[at] if integrates else 0.0, imax=imax, ctrlspec=INPUTS)
+        else:
+            actuator.gainprm[0], actuator.biasprm[0] = strength[at], bias[at]
+            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            if lag[at]:
+                actuator.dyntype, actuator.dynprm[0] = mujoco.mjtDyn.mjDYN_FILTEREXACT, lag[at]
+                actuator.actearly = True
+        if delay[at]:
+            actuator.delay, actuator.interp = delay[at], LINEAR
+            actuator.nsample = math.ceil(delay[at] / found.dt) + 2
         if math.isfinite(low[at]) or math.isfinite(high[at]):
             if low[at] >= high[at]:
                 problem = "must be below effort_max for MuJoCo"
@@ -162,25 +172,17 @@ def _set_actuators(scene: Any, robot: RobotDescription, found: Drive) -> None:
             actuator.forcerange = np.clip([low[at], high[at]], -1e10, 1e10)
 
 
-def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
+def _compare(found: Drive, robot: RobotDescription, friction: Any, controls: bool) -> None:
     """Add the differences of MuJoCo's PID, friction and constraints."""
-    ki, used = found.value("ki"), np.array(strategies(found.params))
-    limited = np.isfinite(found.value("effort_min", -math.inf)) | np.isfinite(found.value("effort_max", math.inf))
-    if (winds := (ki > 0) & limited & np.isin(used, ("conditional", "back_calculation"))).any():
-        limit = found.listed(_integral_limit(found), winds)
-        found.append(f"anti_windup: the integral goes on while the effort is at its limit, up to {limit} N m or N")
-    low, high = found.value("integral_min", -math.inf), found.value("integral_max", math.inf)
-    if (ki > 0).any() and (np.isfinite(low) | np.isfinite(high)).any():
-        limits = found.listed(_integral_limit(found), ki > 0)
-        found.append(f"integral_limit: {limits} N m or N, passed by up to one step, ki dt |e|")
-    if found.params.integration is not None and ki.any():
-        phase = found.phase(found.params._replace(integration=None))
-        found.append(f"integration: the present error enters the integral after the output, a step later{phase}")
-    found.lack_motor("saturation_effort", "no torque-speed line", "N m or N", math.inf)
-    found.lack_motor("command_delay", "none in the target", "s")
+    if controls:
+        found.compare_integral(first=False)
+        found.delays_setpoint()
+    has = {"armature", "viscous", "coulomb", "command_delay", *(() if controls else ("strength", "bias", "lag"))}
+    found.lack_motors(has)
+    if not controls and (both := (found.motor("lag") > 0) & np.isfinite(found.motor("effort_limit", math.inf))).any():
+        found.append(f"lag: before effort_limit, not after it: {found.listed(found.motor('lag'), both)} s")
     if friction.coulomb is not None and np.any(friction.coulomb):
         found.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
-    found.lack_motor("static", "friction at rest is that of motion", "N m or N")
     if robot.coupling is not None:
         names = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
         found.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
@@ -203,7 +205,10 @@ def _exact(scene: Any) -> str:
         _write(element, {field: getattr(joint, field) for field in fields})
     for element in root.iterfind("actuator/*"):
         actuator = scene.actuator(element.get("name"))
-        _write(element, {field: getattr(actuator, field) for field in ("gainprm", "biasprm", "dynprm", "forcerange")})
+        _write(
+            element,
+            {field: getattr(actuator, field) for field in ("gainprm", "biasprm", "dynprm", "forcerange", "delay")},
+        )
     for element, given in zip(root.findall("equality/joint"), scene.equalities, strict=True):
         _write(element, {"polycoef": given.data})
     for element in root.iterfind("asset/mesh"):

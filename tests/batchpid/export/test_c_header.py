@@ -1,7 +1,8 @@
-"""The exported C header computes the same efforts as the law in NumPy, bit by bit."""
+"""The exported C header computes the same efforts as the law in NumPy, bit by bit, and the robot's dynamics."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -12,17 +13,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from law_cases import OPTIONS
+from trees import planar, states, tree_of
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.export import to_c
+from batchpid.export import to_c, to_c_project
 from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
 from batchpid.motors import guard as guards
+from batchpid.task_space import bias, gravity, mass_matrix
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SINGLE = {name: case for name, case in OPTIONS.items() if not name.endswith("per env")}
+SANITIZED = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 DT = 0.003
 
 
@@ -129,10 +133,24 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
             options[name] = np.array(draw(row)) * (0.001 if name in ("derivative_filter_time", "deadband") else 1)
     if draw(st.booleans()):
         options["effort_limit"] = np.array(draw(row)) + 0.1
-        options["anti_windup"] = draw(st.sampled_from(["none", "clamp", "conditional"]))
+        options["anti_windup"] = draw(st.sampled_from(["none", "clamp", "conditional", "back_calculation"]))
+        if options["anti_windup"] == "back_calculation":
+            options["tracking_time"] = 0.1
+    for name, unit in (("effort_rate_limit", 100.0), ("integral_limit", 0.1)):
+        if draw(st.booleans()):
+            options[name] = (np.array(draw(row)) + 0.1) * unit
+    if "setpoint_weight_derivative" in options:
+        options["first_derivative"] = draw(st.sampled_from(["zero", "kick"]))
+    options["weight_origin"] = draw(st.sampled_from(["zero", "start"]))
+    options["non_finite"] = draw(st.sampled_from(["propagate", "zero", "hold"]))
     options["integration"] = draw(st.sampled_from(["output_first", "integrate_first"]))
     options["continuous"] = draw(st.lists(st.booleans(), min_size=joints, max_size=joints))
     units = draw(st.sampled_from(["effort", "effort", "inertia", "mass_matrix"]))
+    if units == "mass_matrix":  # its law lacks these
+        for name in ("effort_rate_limit", "non_finite", "tracking_time"):
+            options.pop(name, None)
+        if options.get("anti_windup") == "back_calculation":
+            options["anti_windup"] = "conditional"
     if units == "mass_matrix" and draw(st.booleans()):
         options["discretization"] = "implicit"
         options.pop("derivative_filter_time", None)
@@ -147,15 +165,30 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     return params, {"guard": guard, "inputs": inputs, "prefix": "arm"}, [*inputs, *extra]
 
 
+def check_random_settings(folder, data, compiler, steps, *flags):
+    """Compare a law of random settings in C and in NumPy on ``steps`` random steps."""
+    params, options, names = settings_of_a_law(data.draw)
+    columns = motion(data.draw(st.integers(0, 99)), params.num_joints, params.dtype, names, steps)
+    if params.non_finite is not None:
+        columns["measurement"][steps // 3, 0] = np.nan
+        columns["setpoint"][steps // 2, -1] = np.inf
+    expected = efforts_in_numpy(params, columns, options["guard"])
+    np.testing.assert_array_equal(efforts_in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
+
+
 @pytest.mark.parametrize("compiler", COMPILERS)
 @given(data=st.data())
 @settings(max_examples=15)
 def test_random_settings_are_bit_identical(tmp_path_factory, compiler, data):
-    params, options, names = settings_of_a_law(data.draw)
-    columns = motion(data.draw(st.integers(0, 99)), params.num_joints, params.dtype, names)
-    expected = efforts_in_numpy(params, columns, options["guard"])
-    folder = tmp_path_factory.mktemp("c")
-    np.testing.assert_array_equal(efforts_in_c(folder, params, options, columns, compiler=compiler), expected)
+    check_random_settings(tmp_path_factory.mktemp("c"), data, compiler, 100)
+
+
+@pytest.mark.slow
+@given(data=st.data())
+@settings(max_examples=200)
+def test_long_runs_of_random_settings_are_bit_identical_under_sanitizers(tmp_path_factory, data):
+    compiler = data.draw(st.sampled_from(COMPILERS))
+    check_random_settings(tmp_path_factory.mktemp("c"), data, compiler, 10_000, *SANITIZED)
 
 
 def test_sanitizers_find_nothing(tmp_path):
@@ -165,9 +198,8 @@ def test_sanitizers_find_nothing(tmp_path):
         | {"kp": 1.0, "ki": 2.0, "kd": 0.1, "effort_limit": 3.0, "anti_windup": "conditional", "continuous": True},
     )
     columns = motion(2, 8, np.float64, ("feedforward",))
-    flags = ("-std=c99", "-O1", "-g", "-fsanitize=undefined", "-fno-sanitize-recover=all")
     try:
-        found = efforts_in_c(tmp_path, params, {}, columns, *flags)
+        found = efforts_in_c(tmp_path, params, {}, columns, *SANITIZED)
     except subprocess.CalledProcessError as error:
         if "law.c" in str(error.cmd) and error.stderr is None:
             pytest.skip("this compiler has no sanitizer")
@@ -178,13 +210,74 @@ def test_sanitizers_find_nothing(tmp_path):
 @pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
 def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_path):
     params = bp.make_params(2, **{**SINGLE["pid"], "kp": 1.0, "ki": 1.0, "kd": 0.1})
+    tree = planar((1.0, 1.0))
+    (tmp_path / "law.h").write_text(to_c(params, DT, joint_names=tree.joint_names, tree=tree).text)
     (tmp_path / "law.cpp").write_text(
-        to_c(params, DT).text + "void use(batchpid_state *s, double *x) {\n"
-        "  batchpid_init(s, x); batchpid_step(s, x, x, x, x); }\n"
+        '#include "law.h"\n'
+        "void use(double *x) {\n"
+        "  batchpid_controller arm(x); arm.step(x, x, x, x); arm.reset(x);\n"
+        "  batchpid_mass_matrix(x, x + 2); batchpid_bias(x, x, x); }\n"
     )
     subprocess.run(["g++", *STRICT, "-O2", "-c", "law.cpp"], cwd=tmp_path, check=True)
     listed = subprocess.run(["nm", "law.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    assert not re.search(r" [UBbDd] (?!_GLOBAL)", listed), listed  # nothing undefined, such as malloc, and no data
+    # Nothing undefined but trigonometry (malloc would be), and no data that can change.
+    assert not re.search(r" U (?!sincos|sin|cos|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), listed
+
+
+TABLE = """#include <stdio.h>
+#include "arm.h"
+int main(void) {{
+  {t} state[2 * {n}], found[{n} * {n} + 2 * {n}];
+  while (fread(state, sizeof state, 1, stdin) == 1) {{
+    arm_mass_matrix(state, found);
+    arm_bias(state, state + {n}, found + {n} * {n});
+    arm_gravity(state, found + {n} * {n} + {n});
+    fwrite(found, sizeof found, 1, stdout);
+  }}
+  return 0;
+}}
+"""
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("panda", np.float64), (0, np.float64), ("planar", np.float32)])
+def test_the_dynamics_of_the_robot(name, dtype, tmp_path):
+    tree = planar(gravity=(0.0, -9.81, 0.0)) if name == "planar" else tree_of(name)
+    tree = dataclasses.replace(tree, armature=np.linspace(0, 0.2, tree.dof))
+    params, n = bp.make_params(tree.dof, 1.0, dtype=dtype), tree.dof
+    (tmp_path / "arm.h").write_text(to_c(params, DT, joint_names=tree.joint_names, prefix="arm", tree=tree).text)
+    q, v = (each.astype(dtype) for each in states(tree, 20))
+    flags = SANITIZED if name == "panda" else ("-std=c99", "-O2")
+    binary = compiled(tmp_path, TABLE.format(n=n, t="double" if dtype == np.float64 else "float"), *flags)
+    ran = subprocess.run([binary], input=np.hstack([q, v]).tobytes(), capture_output=True, check=True)
+    found = np.frombuffer(ran.stdout, dtype).reshape(20, -1)
+    wide = [each.astype(np.float64) for each in (q, v)]
+    parts = mass_matrix(tree, wide[0]).reshape(20, -1), bias(tree, *wide), gravity(tree, wide[0])
+    for at, expected in zip(np.split(found, [n * n, n * n + n], axis=1), parts, strict=True):
+        size = max(np.abs(expected).max(), 1.0)
+        np.testing.assert_allclose(at, expected, rtol=0, atol=(1e-12 if dtype == np.float64 else 1e-5) * size)
+
+
+def test_the_project_is_a_program_with_the_laws_efforts(tmp_path):
+    tree = planar(gravity=(0.0, -9.81, 0.0))
+    params = bp.make_params(2, [40.0, 20.0], 5.0, 2.0, measurement_rate="measured", gain_units="mass_matrix")
+    options = {"joint_names": tree.joint_names, "tree": tree}
+    files = to_c_project(params, DT, header="two-joints.h", **options)
+    assert files["two-joints.h"] == to_c(params, DT, **options).text
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    q, v, r = np.random.default_rng(0).normal(size=(3, 20, 1, 2))
+    if shutil.which("cmake"):
+        for words in (("-B", "build"), ("--build", "build")):
+            subprocess.run(["cmake", *words], cwd=tmp_path, check=True, capture_output=True)
+        binary = tmp_path / "build/example"
+    else:
+        binary = compiled(tmp_path, files["example.c"], "-std=c99")
+    words = "\n".join(" ".join(map(repr, row)) for row in np.concatenate([r, q, v], axis=2)[:, 0].tolist())
+    ran = subprocess.run([binary], input=words, capture_output=True, text=True, check=True)
+    found = np.array([line.split() for line in ran.stdout.splitlines()], float)
+    columns = {"setpoint": r, "measurement": q, "measurement_rate": v, "feedforward": bias(tree, q, v)}
+    columns = {name: column[:, 0] for name, column in columns.items()} | {"mass_matrix": mass_matrix(tree, q)[:, 0]}
+    np.testing.assert_allclose(found, efforts_in_numpy(params, columns), rtol=1e-12, atol=1e-12)
 
 
 def test_what_cannot_be_exported_is_an_error():
@@ -195,6 +288,8 @@ def test_what_cannot_be_exported_is_an_error():
         r"inputs.* lack measurement_rate": lambda: to_c(params.replace(measurement_rate="measured"), DT, inputs=()),
         r"dt": lambda: to_c(params, 0.0),
         r"inputs": lambda: to_c(params, DT, inputs=("velocity",)),
+        r"tree: has the joints": lambda: to_c(params, DT, tree=planar()),
+        r"header: unknown file format": lambda: to_c_project(params, DT, header="pid.c"),
     }
     for message, call in cases.items():
         with pytest.raises(InvalidArgumentError, match=message):

@@ -7,7 +7,7 @@ import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 import batchpid as bp
-from batchpid.export import to_c
+from batchpid.export import to_c, to_c_project
 from batchpid.sim import Robot
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -22,6 +22,19 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     exported = to_c(panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm")
     assert (status, out.read_text()) == (0, exported.text)
     assert said == f"written: {out}: tuned gains of 9 joints at 1000 Hz\n"
+
+
+def test_a_project_is_written_beside_the_header(batchpid, tmp_path):
+    out = tmp_path / "arm.h"
+    words = ("export", "panda", "--gains", "tuned", "--dynamics", "--project", "--out", out)
+    assert batchpid(*words)[0] == 0
+    panda = Robot.load("panda")
+    options = {"joint_names": panda.joint_names, "tree": panda.kinematic_tree()}
+    files = to_c_project(panda.tuned(), 0.001, header="arm.h", **options)
+    assert {each.name: each.read_text() for each in tmp_path.iterdir()} == files
+    out.unlink()
+    status, _, complaint = batchpid(*words)
+    assert (status, "CMakeLists.txt" in complaint, out.exists()) == (2, True, False)
 
 
 def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
@@ -101,6 +114,9 @@ def test_pd_targets_have_the_motors_and_the_friction_of_the_robot(batchpid, tmp_
     status, said, _ = batchpid("export", path, "--to", "maniskill", "--out", out, *words)
     assert (status, "differs: coulomb: friction of PhysX" in said) == (0, True)
     assert "force_limit=[10.0]" in out.read_text()
+    status, said, _ = batchpid("export", path, "--to", "newton", "--out", out, *words)
+    assert (status, "differs: command_delay: of the setpoint" in said) == (0, True)
+    assert all(each in out.read_text() for each in ("DrivePID", "'delay_steps': 2", "'joint_friction': {'a': 0.75}"))
     assert batchpid("export", path, "--out", tmp_path / "a.h", *words)[0] == 2
 
 
@@ -112,3 +128,9 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     assert (status, "differs: guard" in said) == (0, True)
     model = mujoco.MjModel.from_xml_path(str(out))
     assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
+    status, said, _ = batchpid("export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out)
+    assert (status, said.splitlines()[-1]) == (0, f"written: {out}: motors of 9 joints")
+    assert mujoco.MjModel.from_xml_path(str(out)).nu == 9
+    assert (
+        batchpid("export", "panda", "--to", "mjcf", "--motors", "--gains", "designed", "--out", out, "--force")[0] == 2
+    )

@@ -10,8 +10,10 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.tuning.moves import random_moves
 
 mujoco = pytest.importorskip("mujoco", "3.17")
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
@@ -118,7 +120,7 @@ def test_motors_friction_and_followers_are_written(tmp_path):
     motors = bp.make_actuators(2, armature=0.02, coulomb=0.5, viscous=0.1, effort_limit=6.0, lag=0.001)
     exported = to_mjcf(loaded, plain(loaded, effort_limit=10.0, anti_windup="conditional"), DT, actuators=motors)
     listed = [each.partition(":")[0] for each in exported.differences]
-    assert listed == ["lag", "anti_windup", "friction", "followers"]
+    assert listed == ["anti_windup", "lag", "friction", "followers"]
     model = model_of(exported)
     held = model.joint("a")
     assert (held.armature[0], held.frictionloss[0], held.damping[0]) == (0.02, 0.75, 0.6)
@@ -151,3 +153,60 @@ def test_bad_requests_are_refused():
             to_mjcf(loaded, params, DT)
     with pytest.raises(InvalidArgumentError, match="physics"):
         to_mjcf(dataclasses.replace(loaded), plain(loaded), DT, physics="exact")
+
+
+def test_the_motors_alone_deliver_what_the_actuators_do():
+    loaded = Robot.load("panda")
+    effects = {"strength": np.linspace(0.8, 1.1, 9), "bias": np.linspace(-0.5, 0.5, 9), "armature": 0.05}
+    motors = bp.make_actuators(9, **effects, command_delay=np.linspace(0, 0.0041, 9), coulomb=0.1)
+    for own in (motors.replace(effort_limit=3.0), motors.replace(lag=0.003)):
+        exported = to_mjcf(loaded, None, DT, actuators=own)
+        assert [each.partition(":")[0] for each in exported.differences] == ["friction"]
+        model = model_of(exported)
+        assert (model.nu, model.na) == (9, 9 if own.lag is not None else 0)
+        data, state, limited = mujoco.MjData(model), motor_model.init(own, np.zeros((1, 9)), DT), 0
+        for step in range(240):
+            asked = 4 * np.sin(0.05 * step + np.arange(9))
+            state, effort = motor_model.deliver(own, state, asked[None], data.qpos[None], data.qvel[None], DT)
+            data.ctrl[:] = asked
+            mujoco.mj_step(model, data)
+            if step > 150:  # before, delays and lags remember other efforts
+                np.testing.assert_allclose(data.actuator_force, effort[0], rtol=0, atol=1e-9)
+            limited += np.isin(effort, (-3.0, 3.0)).sum()
+        assert bool(limited) == (own.lag is None)
+    both = to_mjcf(loaded, None, DT, actuators=own.replace(effort_limit=3.0)).differences
+    assert [each.partition(":")[0] for each in both] == ["lag", "friction"]
+
+
+def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
+    """Under what the target has of the tuned gains: efforts at one inertia, no filter, weight or anti-windup."""
+    loaded = Robot.load("panda")
+    inertia = np.diagonal(loaded.mass_matrix(loaded.start)[0])
+    exported = to_mjcf(loaded, loaded.tuned(), DT, inertia=inertia)
+    lost = {each.partition(":")[0] for each in exported.differences}
+    assert lost == {"gain_units", "setpoint_weight", "derivative_filter_time", "anti_windup"}
+    tuned = loaded.tuned()
+    gains = {name: getattr(tuned, name) * inertia for name in ("kp", "ki", "kd")}
+    limits = {"effort_min": tuned.effort_min, "effort_max": tuned.effort_max}
+    params = bp.make_params(9, **gains, **limits, measurement_rate="measured")
+    model = model_of(exported)
+    np.testing.assert_allclose(-model.actuator_biasprm[:, 1:3], np.stack([gains["kp"][0], gains["kd"][0]], 1), 1e-12)
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], gains["ki"][0], rtol=1e-12)
+    np.testing.assert_allclose(model.actuator_forcerange, np.stack([each[0] for each in limits.values()], 1), 1e-12)
+    moves, ticks = random_moves(loaded, 8), 750
+    options = {"workers": 0, "timestep": DT, "substeps": 2, "engine": "mujoco", "compensate": "gravity+coriolis"}
+    with Runner(loaded, 8, params=params, **options) as runner:
+        runner.reset(moves.start)
+        ours = runner.rollout(np.broadcast_to(moves.target, (ticks, 8, 9))).qpos
+    for move in range(8):
+        data = mujoco.MjData(model)
+        data.qpos[:] = moves.start[move]
+        reached = []
+        for _ in range(2 * ticks):
+            mujoco.mj_forward(model, data)
+            data.ctrl[:] = np.stack([moves.target[move], np.zeros(9), data.qfrc_bias], axis=1).ravel()
+            mujoco.mj_step(model, data)
+            reached.append(data.qpos.copy())
+        apart = np.abs(np.array(reached[1::2]) - ours[:, move]).max()
+        assert apart < 2e-3, (move, apart)
+    assert np.abs(ours[-1] - moves.start).max() > 0.5

@@ -67,6 +67,33 @@ def runs(arm, mujoco_log):
     return truth, as_log(arm, table, "setpoint"), as_log(arm, table, "effort")
 
 
+def error_of_the_export(found, log: Log, params: bp.PIDParams, dt: float) -> float:
+    """Return the error on the held-out rows of the identified motors as MJCF, in MuJoCo under the law [rad]."""
+    import mujoco
+
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    robot, moving = found.robot, list(log.joints)
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot, None, dt, actuators=found.actuators()).text)
+    data, pid = mujoco.MjData(model), bp.BatchPID(params, 1, dt=dt)
+    order = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
+    time = np.arange(round(log.time[-1] / dt) + 1) * dt
+    wanted = np.zeros((len(time), robot.dof))  # the other joints are locked at 0 in the log
+    wanted[:, moving] = log.commands_at(time)
+    data.qpos[order] = wanted[0]
+    moved = []
+    for setpoint in wanted:
+        mujoco.mj_forward(model, data)
+        moved.append(data.qpos[order][moving])
+        data.ctrl[:] = pid(setpoint[None], data.qpos[order][None])[0]
+        data.qfrc_applied[:] = data.qfrc_bias
+        mujoco.mj_step(model, data)
+    held_out = np.concatenate([fit.time[~fit.fitted] for fit in found.fits])
+    steps, held_out = (np.rint(each / dt).astype(int) for each in (log.time, held_out))
+    errors = np.array(moved)[steps] - log.qpos
+    return float(np.sqrt(np.mean(errors[np.isin(steps, held_out)] ** 2)))
+
+
 def row(value) -> np.ndarray:
     return np.atleast_2d(np.asarray(value, float))
 
@@ -178,6 +205,8 @@ def test_known_motors_are_found(arm, runs, kind):
     actuators = found.actuators()
     assert actuators.command_delay[0, 0] == pytest.approx(document["delay"][0])
     assert actuators.coulomb[0, 0] == pytest.approx(document["joints"]["shoulder"]["friction"][0])
+    if by_law:
+        assert error_of_the_export(found, setpoints, arm.designed("effort"), DT) < 2 * after
 
 
 def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
@@ -376,6 +405,10 @@ def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
             inside.append(interval[1] < wanted < interval[2])
             errors[unknown] = max(errors[unknown], abs(interval[0] / wanted - 1))
     before, after = found.held_out_error
+    if name == "panda" and kind == "setpoint":
+        exported = error_of_the_export(found, log, params, 1 / 2000)
+        print(f"exported to MJCF, held out: {exported:.3g} rad; the fit's own: {after:.3g} rad")
+        assert exported < 2 * after
     print(
         name, kind, seed, errors, found.interval("delay"), f"{before / after:.0f} times, {np.mean(inside):.2f} inside"
     )

@@ -1,0 +1,165 @@
+"""Rigid-body functions of a robot in C: mass matrix, bias and gravity, with the robot's constants as tables.
+
+The algorithms are those of :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies and recursive
+Newton-Euler, in the axes of the world and about its origin (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
+2008, sections 5.3 and 6.2). The sums of a joint run over its ancestors alone, so the last bits differ from NumPy's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from batchpid.export.c_step import Dialect
+from batchpid.task_space.kinematic_tree import KinematicTree
+
+
+def rigid_body(c: Dialect, tree: KinematicTree) -> str:
+    """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a tree."""
+    bodies, p, t, n, f = tree.bodies, c.prefix, c.type, c.size, c.suffix
+    rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
+    poses = "".join(c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items())
+    poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
+    poses += c.table("k_axis", bodies.axis) + c.table("k_center", bodies.center)
+    poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(c, "slides", bodies.slides[:, 0])
+    above, masses = _integers(c, "above", tree.body_parents), c.table("k_mass", bodies.mass[:, 0])
+    fall = ", ".join(map(c.number, bodies.gravity.tolist()))
+    return f"""/* Bodies at a pose, in the axes of the world. */
+typedef struct {{
+  {t} turn[{n}][9], place[{n}][3];      /* axes (rows of a matrix) and origin */
+  {t} linear[{n}][3], angular[{n}][3];  /* velocity at the world's origin per rate of the joint */
+  {t} center[{n}][3], tensor[{n}][9];   /* center of mass, and inertia tensor about it */
+}} {p}_bodies;
+
+static inline {t} {p}_dot(const {t} *a, const {t} *b) {{ return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }}
+
+/* out += a x b */
+static inline void {p}_add_cross(const {t} *a, const {t} *b, {t} *out) {{
+  out[0] += a[1] * b[2] - a[2] * b[1];
+  out[1] += a[2] * b[0] - a[0] * b[2];
+  out[2] += a[0] * b[1] - a[1] * b[0];
+}}
+
+static inline void {p}_rotate(const {t} *turn, const {t} *a, {t} *out) {{
+  for (int i = 0; i < 3; ++i) out[i] = {p}_dot(turn + 3 * i, a);
+}}
+
+static inline void {p}_place(const {t} *qpos, {p}_bodies *b) {{
+{above}{poses}  for (int j = 0; j < {n}; ++j) {{
+    const {t} sine = sin{f}(qpos[j]), rest = {c.number(1.0)} - cos{f}(qpos[j]);
+    const int up = above[j];
+    {t} turn[9], place[3], mixed[9];
+    for (int i = 0; i < 9; ++i) turn[i] = k_turn[j][i] + sine * k_sine[j][i] + rest * k_cosine[j][i];
+    for (int i = 0; i < 3; ++i) place[i] = k_place[j][i] + qpos[j] * k_slide[j][i];
+    for (int i = 0; i < 3; ++i) {{
+      for (int k = 0; k < 3; ++k) {{
+        const {t} column[3] = {{turn[k], turn[3 + k], turn[6 + k]}};
+        b->turn[j][3 * i + k] = up < 0 ? turn[3 * i + k] : {p}_dot(b->turn[up] + 3 * i, column);
+      }}
+      b->place[j][i] = up < 0 ? place[i] : {p}_dot(b->turn[up] + 3 * i, place) + b->place[up][i];
+      b->linear[j][i] = b->angular[j][i] = {c.number(0.0)};
+    }}
+    {p}_rotate(b->turn[j], k_axis[j], slides[j] ? b->linear[j] : b->angular[j]);
+    if (!slides[j]) {p}_add_cross(b->place[j], b->angular[j], b->linear[j]);
+    {p}_rotate(b->turn[j], k_center[j], b->center[j]);
+    for (int i = 0; i < 3; ++i) b->center[j][i] += b->place[j][i];
+    for (int i = 0; i < 3; ++i) {p}_rotate(b->turn[j], k_tensor[j] + 3 * i, mixed + 3 * i);
+    for (int i = 0; i < 3; ++i) {{
+      for (int k = 0; k < 3; ++k) {{
+        const {t} column[3] = {{mixed[i], mixed[3 + i], mixed[6 + i]}};
+        b->tensor[j][3 * i + k] = {p}_dot(column, b->turn[j] + 3 * k);
+      }}
+    }}
+  }}
+}}
+
+/* Mass matrix [kg m^2 or kg] at qpos [rad or m], by rows, with the armature of the motors. */
+static inline void {p}_mass_matrix(const {t} qpos[{n}], {t} matrix[{n} * {n}]) {{
+{above}{masses}{c.table("k_armature", np.asarray(tree.armature))}  {p}_bodies b;
+  {t} mass[{n}], moment[{n}][3], tensor[{n}][9]; /* of all that a joint moves, about the world's origin */
+  {p}_place(qpos, &b);
+  for (int j = 0; j < {n}; ++j) {{
+    const {t} *center = b.center[j];
+    mass[j] = k_mass[j];
+    for (int i = 0; i < 3; ++i) {{
+      moment[j][i] = k_mass[j] * center[i];
+      for (int k = 0; k < 3; ++k) {{
+        const {t} square = i == k ? {p}_dot(center, center) : {c.number(0.0)};
+        tensor[j][3 * i + k] = b.tensor[j][3 * i + k] + k_mass[j] * (square - center[i] * center[k]);
+      }}
+    }}
+  }}
+  for (int i = 0; i < {n} * {n}; ++i) matrix[i] = {c.number(0.0)};
+  for (int j = {n} - 1; j >= 0; --j) {{
+    {t} linear[3], angular[3], change[3] = {{{c.number(0.0)}, {c.number(0.0)}, {c.number(0.0)}}};
+    if (above[j] >= 0) {{
+      mass[above[j]] += mass[j];
+      for (int i = 0; i < 3; ++i) moment[above[j]][i] += moment[j][i];
+      for (int i = 0; i < 9; ++i) tensor[above[j]][i] += tensor[j][i];
+    }}
+    {p}_add_cross(b.angular[j], moment[j], change);
+    for (int i = 0; i < 3; ++i) linear[i] = mass[j] * b.linear[j][i] + change[i];
+    {p}_rotate(tensor[j], b.angular[j], angular);
+    {p}_add_cross(moment[j], b.linear[j], angular);
+    for (int i = j; i >= 0; i = above[i]) {{
+      matrix[{n} * i + j] = matrix[{n} * j + i] = {p}_dot(b.linear[i], linear) + {p}_dot(b.angular[i], angular);
+    }}
+    matrix[{n} * j + j] += k_armature[j];
+  }}
+}}
+
+/* Efforts [N m or N] that cancel gravity and Coriolis and centrifugal forces, at qpos [rad or m] and qvel. */
+static inline void {p}_bias(const {t} qpos[{n}], const {t} qvel[{n}], {t} bias[{n}]) {{
+{above}{masses}  static const {t} gravity[3] = {{{fall}}};
+  {p}_bodies b;
+  {t} v[{n}][3], w[{n}][3], dv[{n}][3], dw[{n}][3]; /* velocity and acceleration at the world's origin */
+  {t} force[{n}][3], torque[{n}][3];
+  {p}_place(qpos, &b);
+  for (int j = 0; j < {n}; ++j) {{
+    const int up = above[j];
+    const {t} *center = b.center[j];
+    {t} linear[3], angular[3], spin[3], rate[3];
+    for (int i = 0; i < 3; ++i) {{
+      linear[i] = b.linear[j][i] * qvel[j];
+      angular[i] = b.angular[j][i] * qvel[j];
+      v[j][i] = (up < 0 ? {c.number(0.0)} : v[up][i]) + linear[i];
+      w[j][i] = (up < 0 ? {c.number(0.0)} : w[up][i]) + angular[i];
+      dv[j][i] = up < 0 ? {c.number(0.0)} : dv[up][i];
+      dw[j][i] = up < 0 ? {c.number(0.0)} : dw[up][i];
+    }}
+    {p}_add_cross(w[j], linear, dv[j]);
+    {p}_add_cross(v[j], angular, dv[j]);
+    {p}_add_cross(w[j], angular, dw[j]);
+    for (int i = 0; i < 3; ++i) {{
+      rate[i] = v[j][i];
+      force[j][i] = dv[j][i] - gravity[i];
+    }}
+    {p}_add_cross(w[j], center, rate);
+    {p}_add_cross(dw[j], center, force[j]);
+    {p}_add_cross(w[j], rate, force[j]);
+    for (int i = 0; i < 3; ++i) force[j][i] *= k_mass[j];
+    {p}_rotate(b.tensor[j], dw[j], torque[j]);
+    {p}_rotate(b.tensor[j], w[j], spin);
+    {p}_add_cross(w[j], spin, torque[j]);
+    {p}_add_cross(center, force[j], torque[j]);
+  }}
+  for (int j = {n} - 1; j >= 0; --j) {{
+    bias[j] = {p}_dot(b.linear[j], force[j]) + {p}_dot(b.angular[j], torque[j]);
+    for (int i = 0; i < 3 && above[j] >= 0; ++i) {{
+      force[above[j]][i] += force[j][i];
+      torque[above[j]][i] += torque[j][i];
+    }}
+  }}
+}}
+
+/* Efforts [N m or N] that hold the robot at qpos [rad or m]. */
+static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
+  const {t} still[{n}] = {{{c.number(0.0)}}};
+  {p}_bias(qpos, still, bias);
+}}
+
+"""
+
+
+def _integers(c: Dialect, name: str, values: object) -> str:
+    numbers = ", ".join(str(int(each)) for each in np.asarray(values))
+    return f"  static const int {name}[{c.size}] = {{{numbers}}};\n"
