@@ -99,7 +99,8 @@ class RunnerOptions:
     control: ControlMode | Controller = field(
         default="pid", metadata=_in(snapshot="control_name", recording="control_name")
     )
-    tool: str | None = None
+    tool: str | None = field(default=None, metadata=_in("recording"))
+    """Link that setpoints move; None where they are not poses."""
     backend: Backend = field(default="numpy", metadata=_in("snapshot"))
     dtype: Precision = field(default="float64", metadata=_in("snapshot"))
     compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
@@ -136,7 +137,6 @@ class RunnerOptions:
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "control": _control(self.control, robot, given["tool"]),
-            "tool": None,  # it is in the control
             "backend": choice("backend", self.backend, get_args(Backend)),
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
@@ -147,6 +147,8 @@ class RunnerOptions:
             "recover": flag("recover", self.recover),
             "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
         }
+        if isinstance(self.control, OperationalSpace):
+            own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
         own["pack_size"] = self._checked_pack_size(given["pack_size"])
         own["workers"], own["cluster"] = _places(given["workers"], given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
@@ -242,6 +244,11 @@ class RunnerOptions:
     def command(self) -> CommandSpec:
         """Names and units of the setpoint's entries."""
         return self.own_command or joint_command(self.robot.joint_names, self.robot.units, self.control)
+
+    @property
+    def tool_pose(self) -> Callable[[NDArray[Any]], NDArray[np.float32]] | None:
+        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
+        return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
 
     @property
     def scenes_per_system(self) -> int:
@@ -376,7 +383,7 @@ def keyword_parameters() -> list[Parameter]:
 
 def _control(value: object, robot: Robot, tool: Any) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
-    if tool is not None and value != "osc":
+    if tool is not None and value != "osc" and tool != getattr(value, "link", None):
         raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
     if value == "osc":
         kinematics = Kinematics(robot)

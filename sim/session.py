@@ -27,7 +27,7 @@ from batchpid.sim.loop.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
+from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.loop_stability import StabilityCheck
@@ -75,6 +75,7 @@ class Session:
         """Recorder of every tick."""
         self._arguments = Arguments(options)
         self._stability = StabilityCheck(robot, options.timestep) if options.control == "pid" else None
+        self._tool_pose = options.tool_pose
         self._has_warned = self._has_warned_of_contact = False
         entry_names = None if own is None else own.names
         faults = FaultLog(options.num_envs, robot.joint_names, options.timestep, options.on_fault, entry_names)
@@ -154,7 +155,7 @@ class Session:
         command = self._arguments.tick(setpoint, setpoint_rate, feedforward)
         self._transactions.run(*self._ticks(command, count))
         self._warn(stacklevel=4)
-        return Observation._make(map(_COPY, self.pool.present.observation))  # a tick has few calls (test_hops.py)
+        return self._observation()
 
     def send(
         self,
@@ -206,9 +207,11 @@ class Session:
                 rows_of_part = command.map(lambda rows, part=part: rows[part])
                 self._transactions.run(*self._ticks(rows_of_part, options.substeps))
                 self._warn(stacklevel=4)
-                for table, rows in zip(seen, self.pool.arrays.observation, strict=True):
-                    table[part] = rows[: done - tick]
+                for name in OBSERVED:
+                    getattr(seen, name)[part] = getattr(self.pool.arrays.observation, name)[: done - tick]
         next(shown, None)  # the end
+        if self._tool_pose is not None:
+            seen = seen._replace(tool_pose=self._tool_pose(seen.qpos))
         info = replace(info, faults=self.state.faults.faults)
         return Rollout(times, command.setpoint, seen, options.timestep * options.substeps, info)
 
@@ -343,7 +346,7 @@ class Session:
                     contacts = contacts.with_contacts(arrays)
                 if self.recorder is not None:
                     time = (state.steps + done * substeps) * timestep
-                    observation = Observation._make(map(_COPY, arrays.observation))
+                    observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
             steps = len(pool.completed) * substeps
             state = state._replace(
@@ -368,7 +371,12 @@ class Session:
 
     def _observation(self) -> Observation:
         """Return a copy of the present observation."""
-        return Observation._make(map(_COPY, self.pool.present.observation))
+        return self._seen(self.pool.present.observation)
+
+    def _seen(self, observation: Observation) -> Observation:
+        """Return a copy of the loop's ``observation``, with the pose of the tool."""
+        seen = observation.map(_COPY)
+        return seen if self._tool_pose is None else seen._replace(tool_pose=self._tool_pose(seen.qpos))
 
     def _record(self) -> None:
         """Pass on the ticks that are not recorded yet."""

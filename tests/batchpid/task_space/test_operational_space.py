@@ -19,6 +19,10 @@ START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
 HAND = "panda_hand"
 
 
+def advance(params, *inputs, dt=DT, **options):
+    return ts.advance(ts.discretise(params, dt), *inputs, **options)
+
+
 def accelerations(d, effort):
     """Return q'' = M^-1 (u - h), and the acceleration of the tool."""
     qacc = np.linalg.solve(d.mass_matrix, (effort - d.bias)[..., None])[..., 0]
@@ -49,7 +53,7 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, qvel, link)
     inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5), "terms": True}
-    _, effort, terms = ts.advance(params, state, d, goal, qpos, qvel, **inputs)
+    _, effort, terms = advance(params, state, goal, qpos, qvel, d, **inputs)
     qacc, tool = accelerations(d, effort - 0.5)
     error = frames.pose_error(goal, d.pose)
     for part, most in ((error[:, :3], 0.1), (error[:, 3:], 0.5)):
@@ -77,7 +81,7 @@ def test_the_posture_does_not_move_the_tool():
         for decoupling in ("full", "partial", "none"):
             chosen = params._replace(decoupling=ts.osc_params.TASK_CHOICES["decoupling"][decoupling])
             state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
-            terms = ts.advance(chosen, state, d, goal, qpos, qvel, terms=True)[2]
+            terms = advance(chosen, state, goal, qpos, qvel, d, terms=True)[2]
             moved = moved_by(d, tree.chain(HAND), terms.posture)
             moved = moved if axes is None else moved[:, axes]
             assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
@@ -91,7 +95,7 @@ def run(tree, link, params, qpos, goal, steps, change=lambda d, q: d, dt=DT):
     for n in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
         target = goal(n) if callable(goal) else goal
-        _, effort = ts.advance(params, state, change(d, q), target, q, v)
+        _, effort = advance(params, state, target, q, v, change(d, q), dt=dt)
         errors.append(frames.pose_error(target, d.pose))
         efforts.append(effort)
         v = v + dt * accelerations(d, effort)[0]
@@ -169,7 +173,7 @@ def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
     d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
     limit = np.abs(d.bias).max() * tight * rng.uniform(0.5, 2, (rows, tree.dof))
     params = ts.make_osc_params(tree, effort_limit=limit)
-    _, effort, terms = ts.advance(params, state, d, goal, qpos, 0.1 * qvel, terms=True)
+    _, effort, terms = advance(params, state, goal, qpos, 0.1 * qvel, d, terms=True)
     chain = tree.chain(HAND)
     base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
     task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, effort, limit))
@@ -198,7 +202,9 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
 
         def efforts(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
-            return ts.step(params, part, tree, HAND, goal[chosen], qpos[chosen], qvel[chosen], terms=True)[1:]
+            return ts.step(
+                params, part, goal[chosen], qpos[chosen], qvel[chosen], DT, tree=tree, link=HAND, terms=True
+            )[1:]
 
         effort, terms = efforts(slice(None))
         bad = [2, 3, 5]
@@ -222,8 +228,8 @@ def test_a_selected_force_is_that_of_the_wrench():
     wrench, chain = np.array([0.0, 0.0, -20.0, 0.0, 0.0, 0.0]), tree.chain(HAND)
     for frame in ("world", "tool"):
         params = ts.make_osc_params(tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame)
-        inputs = params, ts.OSCState(qpos + 0.3 * chain), d, d.pose, qpos, 0 * qpos
-        _, _, terms = ts.advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
+        inputs = params, ts.OSCState(qpos + 0.3 * chain), d.pose, qpos, 0 * qpos, d
+        _, _, terms = advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
         np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)
         tool = moved_by(d, chain, terms.posture)
         turn = frames.matrix_of(d.pose[:, 3:])
@@ -239,7 +245,7 @@ def test_without_decoupling_gains_are_forces():
     d = ts.task_dynamics(tree, qpos, qvel, HAND)
     goal = d.pose.copy()
     goal[:, 0] += 0.05
-    effort = ts.step(params, ts.init(params, qpos), tree, HAND, goal, qpos, 0 * qvel)[1]
+    effort = ts.step(params, ts.init(params, qpos), goal, qpos, 0 * qvel, DT, tree=tree, link=HAND)[1]
     chain = tree.chain(HAND)
     wanted = ts.gravity(tree, qpos)[:, chain] + 20.0 * d.jacobian[:, 0, chain]
     np.testing.assert_allclose(effort[:, chain], wanted, atol=1e-9)
@@ -263,7 +269,7 @@ def test_jax_computes_the_same(x64):
     inputs = params, ts.init(params, qpos), goal, qpos, qvel
 
     def step(params, state, *rest):
-        return ts.step(params, state, tree, link, *rest)[1]
+        return ts.step(params, state, *rest, DT, tree=tree, link=link)[1]
 
     with jax.numpy_rank_promotion("allow"):
         found = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
@@ -285,7 +291,7 @@ def test_inputs_of_a_step_are_checked():
     ):
         inputs = {"params": params, "state": state, "tree": tree, "link": "tip", "setpoint": goal} | change
         with pytest.raises(InvalidArgumentError, match=message):
-            ts.step(**inputs, qpos=qpos, qvel=qpos)
+            ts.step(**inputs, qpos=qpos, qvel=qpos, dt=DT)
 
 
 @pytest.mark.parametrize(
