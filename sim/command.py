@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 from batchpid.checks.validate import array, entries
 from batchpid.errors import InvalidArgumentError
 
+POSE_UNITS = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": ""}
+"""Names and units of the numbers in a pose: position and quaternion (w, x, y, z)."""
+
 
 @dataclass(frozen=True)
 class CommandSpec:

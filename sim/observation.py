@@ -1,9 +1,11 @@
-"""Observations, and rollouts with the info of their run. A new observed quantity is one line here, and no other."""
+"""Observations, and rollouts with the info of their run. A new quantity that the loop observes is one line here."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
+from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.display import html_table, span
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.command import CommandSpec, joint_command
+from batchpid.sim.command import POSE_UNITS, CommandSpec, joint_command
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -28,12 +30,16 @@ def register_plot(load: Callable[[], Callable[..., Any]]) -> None:
 
 
 class Quantity(NamedTuple):
-    """Observed quantity: its dtype, meaning, unit ("rad|m" is the joint's own), and whether there is one per joint."""
+    """Observed quantity: its dtype, meaning, unit ("rad|m" is the joint's own), and whether there is one per joint.
+
+    If not, ``columns`` are names and units of its columns, if it has any.
+    """
 
     dtype: Any
     meaning: str
     unit: str = "1"
     per_joint: bool = True
+    columns: Mapping[str, str] = MappingProxyType({})
 
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
@@ -46,7 +52,8 @@ class Observation(NamedTuple):
 
     ``effort``, ``saturated`` and ``guarded`` are from the last sim step; under control "drive" the effort is qf
     alone, since PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is
-    suspended since an earlier one: see :attr:`batchpid.sim.Runner.faults`.
+    suspended since an earlier one: see :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the
+    tool at ``qpos``, where setpoints are poses: position [m] and unit quaternion (w, x, y, z); else None.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
@@ -55,28 +62,40 @@ class Observation(NamedTuple):
     saturated: Annotated[Bool, Quantity(np.bool_, "effort at its limit")]
     ok: Annotated[Bool, Quantity(np.bool_, "state is finite", per_joint=False)]
     guarded: Annotated[Bool, Quantity(np.bool_, "setpoint changed by the guard")]
+    tool_pose: Annotated[Float32 | None, Quantity(np.float32, "pose of the tool", "m|1", False, POSE_UNITS)] = None
 
     def for_envs(self, envs: slice | Any) -> Observation:
         """Return the observation of some envs (a slice or an index array)."""
-        return Observation._make(array[envs] for array in self)
+        return self.map(itemgetter(envs))
+
+    def map(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Observation:
+        """Return an observation with ``function`` applied to each array that there is."""
+        return Observation._make([None if array is None else function(array) for array in self])
+
+    @staticmethod
+    def join(parts: Sequence[Observation]) -> Observation:
+        """Return the observations as one, along the first axis."""
+        columns = zip(*parts, strict=True)
+        return Observation._make([None if arrays[0] is None else np.concatenate(arrays) for arrays in columns])
 
     def __repr__(self) -> str:
         envs, dof = self.qpos.shape[-2:]
         return f"Observation({envs} envs, {dof} joints, {_failed_envs(self.ok)})"
 
 
-OBSERVED: dict[str, Quantity] = {
-    name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()
-}
-"""Quantity of each field of :class:`Observation`."""
-RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | OBSERVED
+_SEEN = {name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()}
+OPTIONAL = ("tool_pose",)
+"""Fields of :class:`Observation` that may be None."""
+OBSERVED: dict[str, Quantity] = {name: quantity for name, quantity in _SEEN.items() if name not in OPTIONAL}
+"""Quantity of each other field."""
+RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | _SEEN
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 
 
 def empty_observation(*shape: int) -> Observation:
     """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
     fields = OBSERVED.values()
-    return Observation(*(np.empty(shape if each.per_joint else shape[:-1], each.dtype) for each in fields))
+    return Observation(*[np.empty(shape if each.per_joint else shape[:-1], each.dtype) for each in fields])
 
 
 class Redraw(NamedTuple):
@@ -120,6 +139,8 @@ class RunInfo:
     """Sim steps of a tick."""
     control: str | None = None
     """One of "pid", "drive", "effort"; of the caller's own controller the name of its class."""
+    tool: str | None = None
+    """Link of the tool that setpoints move; None where they are not poses."""
     own_command: CommandSpec | None = None
     """Names and units of setpoints that are not one number for each joint."""
     compensate: str | None = None
@@ -168,16 +189,22 @@ class RunInfo:
         own = self.own_command
         return self.control != "effort" if own is None else (own.names, own.units) == (self.joint_names, self.units)
 
+    @property
+    def recorded(self) -> dict[str, Quantity]:
+        """Quantities of :data:`RECORDED` that this run has."""
+        return {name: each for name, each in RECORDED.items() if name not in OPTIONAL or self.tool is not None}
+
     def units_of(self, name: str) -> tuple[str, ...]:
         """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it has no columns."""
         quantity = RECORDED[name]
         if name == "setpoint":
             return self.command.units
-        return tuple(map(quantity.unit_for, self.units)) if quantity.per_joint else ()
+        return tuple(map(quantity.unit_for, self.units)) if quantity.per_joint else tuple(quantity.columns.values())
 
     def row_shape(self, name: str, num_envs: int) -> tuple[int, ...]:
         """Return the shape of the quantity ``name`` of :data:`RECORDED` after a tick: (envs, columns) or (envs,)."""
-        return (num_envs, len(self.units_of(name))) if RECORDED[name].per_joint else (num_envs,)
+        quantity = RECORDED[name]
+        return (num_envs, len(self.units_of(name))) if quantity.per_joint or quantity.columns else (num_envs,)
 
     def for_envs(self, envs: slice | Any) -> RunInfo:
         """Return the info of some envs (a slice or an index array)."""
@@ -218,8 +245,8 @@ class Rollout:
     """Robot, options and origin of the run."""
 
     def __getattr__(self, name: str) -> NDArray[Any]:
-        if name not in OBSERVED:
-            raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {', '.join(OBSERVED)}")
+        if name not in _SEEN:
+            raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {', '.join(_SEEN)}")
         array: NDArray[Any] = getattr(self.observation, name)
         return array
 
@@ -229,23 +256,24 @@ class Rollout:
         return int(self.qpos.shape[1])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return time, setpoint and every observed quantity, by name."""
-        return {"time": self.time, "setpoint": self.setpoint, **self.observation._asdict()}
+        """Return time, setpoint and every quantity that was observed, by name."""
+        seen = {name: array for name, array in self.observation._asdict().items() if array is not None}
+        return {"time": self.time, "setpoint": self.setpoint, **seen}
 
     def for_envs(self, envs: slice | Sequence[int] | Any) -> Rollout:
         """Return the rollout of some envs (a slice or an index array)."""
-        part = Observation._make(array[:, envs] for array in self.observation)
+        part = self.observation.map(lambda array: array[:, envs])
         return Rollout(self.time, self.setpoint[:, envs], part, self.tick, self.info.for_envs(envs))
 
     def for_ticks(self, ticks: slice) -> Rollout:
         """Return the rollout of some ticks."""
-        part = Observation._make(array[ticks] for array in self.observation)
+        part = self.observation.for_envs(ticks)
         return Rollout(self.time[ticks], self.setpoint[ticks], part, self.tick * (ticks.step or 1), self.info)
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
         """Return successive rollouts of the same envs as one, with the info of the first and the faults of the last."""
-        seen = Observation._make(map(np.concatenate, zip(*(part.observation for part in parts), strict=True)))
+        seen = Observation.join([part.observation for part in parts])
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
         info = replace(parts[0].info, faults=parts[-1].info.faults)
         return Rollout(time, setpoint, seen, parts[0].tick, info)

@@ -46,7 +46,9 @@ from batchpid.sim.runner_keywords import (
     PhysicsPreset,
     Precision,
     RunnerKeywords,
+    SetpointSpace,
 )
+from batchpid.sim.tool_setpoints import ToolSetpoints
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver
@@ -99,7 +101,9 @@ class RunnerOptions:
     control: ControlMode | Controller = field(
         default="pid", metadata=_in(snapshot="control_name", recording="control_name")
     )
-    tool: str | None = None
+    tool: str | None = field(default=None, metadata=_in("recording"))
+    """Link that setpoints move; None where they are not poses."""
+    setpoint_space: SetpointSpace = field(default="joints", metadata=_in("snapshot"))
     backend: Backend = field(default="numpy", metadata=_in("snapshot"))
     dtype: Precision = field(default="float64", metadata=_in("snapshot"))
     compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
@@ -135,8 +139,8 @@ class RunnerOptions:
         own |= {
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
-            "control": _control(self.control, robot, given["tool"]),
-            "tool": None,  # it is in the control
+            "setpoint_space": choice("setpoint_space", self.setpoint_space, get_args(SetpointSpace)),
+            "control": _control(self.control, robot, given["tool"], self.setpoint_space),
             "backend": choice("backend", self.backend, get_args(Backend)),
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
@@ -147,6 +151,10 @@ class RunnerOptions:
             "recover": flag("recover", self.recover),
             "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
         }
+        if isinstance(self.control, OperationalSpace):
+            own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
+        if self.tool_setpoints is not None:
+            own["tool"] = self.tool_setpoints.link
         own["pack_size"] = self._checked_pack_size(given["pack_size"])
         own["workers"], own["cluster"] = _places(given["workers"], given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
@@ -242,6 +250,18 @@ class RunnerOptions:
     def command(self) -> CommandSpec:
         """Names and units of the setpoint's entries."""
         return self.own_command or joint_command(self.robot.joint_names, self.robot.units, self.control)
+
+    @property
+    def tool_pose(self) -> Callable[[NDArray[Any]], NDArray[np.float32]] | None:
+        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
+        if self.tool_setpoints is not None:
+            return self.tool_setpoints.tool_pose
+        return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
+
+    @cached_property
+    def tool_setpoints(self) -> ToolSetpoints | None:
+        """Inverse kinematics of ``setpoint_space`` "tool"."""
+        return None if self.setpoint_space == "joints" else ToolSetpoints(self.robot, _tool(self.robot, self.tool))
 
     @property
     def scenes_per_system(self) -> int:
@@ -374,13 +394,22 @@ def keyword_parameters() -> list[Parameter]:
     return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
-def _control(value: object, robot: Robot, tool: Any) -> Any:
+def _tool(robot: Robot, tool: str | None) -> str:
+    """Return the link ``tool``, by default the last one of the longest chain."""
+    kinematics = Kinematics(robot)
+    return kinematics.links[kinematics.tool] if tool is None else tool
+
+
+def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
-    if tool is not None and value != "osc":
-        raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+    if space == "tool" and value not in ("pid", "drive"):
+        problem = "'tool' makes joint setpoints, which this control does not take"
+        raise InvalidArgumentError("setpoint_space", problem, remedy="use control 'pid' or 'drive', or leave it out")
+    if tool is not None and value != "osc" and space == "joints" and tool != getattr(value, "link", None):
+        problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
+        raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
     if value == "osc":
-        kinematics = Kinematics(robot)
-        return OperationalSpace(robot, kinematics.links[kinematics.tool] if tool is None else tool)
+        return OperationalSpace(robot, _tool(robot, tool))
     if callable(value) and callable(getattr(value, "init", None)):
         own_command(value)  # raises for an invalid command
         return value

@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from copy import copy
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import array, choice, instance, names
+from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.command import CommandSpec
+from batchpid.motors.friction import LOOKAHEAD, compensation
+from batchpid.sim.command import POSE_UNITS, CommandSpec
+from batchpid.sim.robot.actuator_checks import BAND, known_joints
+from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.robot import Robot
+from batchpid.task_space.frames import pose_error
+from batchpid.task_space.symmetric import gram, solve
 
-_POSE = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": ""}
-_TWIST = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
+_OPTIONAL = {
+    "twist": ("vx vy vz wx wy wz", "m/s", "rad/s"),
+    "acceleration": ("ax ay az alphax alphay alphaz", "m/s^2", "rad/s^2"),
+    "wrench": ("fx fy fz mx my mz", "N", "N m"),
+}
+"""Names of further entries of a setpoint, and units of the linear and angular ones."""
+
+
+class Friction(NamedTuple):
+    """Known Coulomb friction of the joints, and the band of small errors in which it is reduced (1, dof)."""
+
+    coulomb: Any
+    band: Any
 
 
 class OperationalSpace:
@@ -25,10 +42,13 @@ class OperationalSpace:
 
     A setpoint is a pose of the tool in the world (7,): position [m] and quaternion (w, x, y, z). The quaternion is
     normalised: its length and sign have no effect; one of length 0 has no direction, and fails its env. Further entries
-    are the tool's twist (6,), with ``twist=True``, and the positions of ``joints``.
+    are the tool's twist, acceleration and wrench (6,), where these are True, and the positions of ``joints``.
 
-    The bias is the runner's passive force, as ``compensate`` selects; Jacobian and mass matrix are those of ``tree``.
-    The state is the posture of each env, which a reset restores. An env that has failed holds the pose of the posture.
+    The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the joints' known damping and
+    friction. Friction is that of the motion to the setpoint: its direction is dq = J^T (J J^T + 1e-4)^-1 e, with the
+    error e of the pose. Jacobian and mass matrix are those of ``tree``.
+    The state is the posture of each env, which a reset restores, and the integral. An env that has failed holds the
+    pose of the posture. A runner sets time step and ``compensate``; elsewhere they are 1/2000 s and "none".
 
     Parameters
     ----------
@@ -38,9 +58,11 @@ class OperationalSpace:
         Link that carries the tool.
     point
         Tool in the link's frame (3,) [m]; default its origin.
-    twist
-        Whether setpoints give the velocity of the tool, too (m/s and rad/s, in the world): a tool that moves follows
-        its setpoint without the delay kd/kp.
+    twist, acceleration
+        Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in the world: a tool that
+        moves follows its setpoint without the delay kd/kp, and on a circle without the error r w^2/kp.
+    wrench
+        Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes of the params' frame.
     joints
         Joints outside the chain to the link, such as fingers, whose positions are part of the setpoint; others hold
         their posture.
@@ -48,6 +70,8 @@ class OperationalSpace:
         Joint positions (dof,) that the null space is drawn to; default ``robot.start``.
     tree
         Kinematic tree; default ``robot.kinematic_tree()``.
+    params
+        Params of one row, such as those of :mod:`batchpid.task_space.osc_presets`, in place of ``options``.
     options
         Options of :func:`batchpid.task_space.make_osc_params`, one row for all envs; ``effort_limit`` is by default
         the robot's.
@@ -67,23 +91,46 @@ class OperationalSpace:
         *,
         point: ArrayLike | None = None,
         twist: bool = False,
+        acceleration: bool = False,
+        wrench: bool = False,
         joints: Sequence[str] = (),
         posture: ArrayLike | None = None,
         tree: ts.KinematicTree | None = None,
+        params: ts.OSCParams | None = None,
         **options: Any,
     ) -> None:
         robot = instance("robot", robot, Robot, "pass Robot.load(...)")
         tree = robot.kinematic_tree() if tree is None else tree
         self._tree = instance("tree", tree, ts.KinematicTree, "pass robot.kinematic_tree()")
-        self._link, self._twist = link, bool(twist)
+        self.link = link
+        """Link that carries the tool."""
         self._point = None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
         self._posture = array("posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names)
-        if not {"effort_limit", "effort_min", "effort_max"} & set(options):
-            options["effort_limit"] = robot.effort_limit
-        self._params = _of_one_row(ts.make_osc_params(tree, **options))
+        if params is None:
+            if not {"effort_limit", "effort_min", "effort_max"} & set(options):
+                options["effort_limit"] = robot.effort_limit
+            params = ts.make_osc_params(tree, **options)
+        elif options:
+            problem, remedy = "are given together with params", "give them to the function that makes the params"
+            raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
+        self._params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
+        self._friction: Friction | None = None
+        modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
+        damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
+        self._damping = damping[None] if damping.any() else None
+        coulomb = known.coulomb + robot.friction * modelled
+        band = np.array([BAND[unit] for unit in robot.units])
+        self._known_friction = Friction(coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
-        size = len(_POSE) + self._twist * len(_TWIST)
+        entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
+        for name, wanted in {"twist": twist, "acceleration": acceleration, "wrench": wrench}.items():
+            if flag(name, wanted):
+                (words, linear, angular), first = _OPTIONAL[name], len(entries)
+                entries |= zip(words.split(), [linear] * 3 + [angular] * 3, strict=True)
+                self._parts[name] = slice(first, first + 6)
+        size = len(entries)
         for column, name in enumerate(names("joints", list(joints)), size):
             joint = tree.joint_names.index(choice("joints", name, tree.joint_names))
             if chain[joint]:
@@ -91,17 +138,15 @@ class OperationalSpace:
                 raise InvalidArgumentError("joints", f"the pose of {link!r} controls it", joint=name, remedy=remedy)
             self._columns[joint] = column
         units = dict(zip(robot.joint_names, robot.units, strict=True)) if joints else {}
-        entries = _POSE | (_TWIST if self._twist else {}) | {name: units[name] for name in joints}
-        pose = ts.link_poses(tree, self._posture, [link])[0, 0]
-        if point is not None:
-            pose[:3] = ts.task_dynamics(tree, self._posture, 0 * self._posture, link, point=self._point).pose[0, :3]
+        entries |= {name: units[name] for name in joints}
+        pose = ts.link_poses(tree, self._posture, [link], point=self._point)[0, 0]
         others = [self._posture[0, tree.joint_names.index(name)] for name in joints]
-        neutral = np.concatenate([pose, np.zeros(size - len(_POSE)), others])
+        neutral = np.concatenate([pose, np.zeros(size - len(POSE_UNITS)), others])
         self.command = CommandSpec(tuple(entries), tuple(entries.values()), neutral=neutral)
         """Names and units of a setpoint; the neutral one is the pose of the posture."""
 
     def __repr__(self) -> str:
-        return summary(type(self).__name__, [self._link, "setpoints " + " ".join(self.command.names)])
+        return summary(type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)])
 
     def init(self, robot: Robot, num_envs: int) -> ts.OSCState:
         """Return the state of ``num_envs`` envs.
@@ -117,15 +162,49 @@ class OperationalSpace:
         return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any]:
-        """Return the state, which stays the same, and the efforts (envs, dof) [N m or N]."""
+        """Return the state and the efforts (envs, dof) [N m or N]."""
         xp = namespace(setpoint, qpos)
         aimed = state
         if self._columns.any():
-            aimed = ts.OSCState(xp.where(self._columns > 0, setpoint[:, self._columns], state.posture))
-        dynamics = ts.task_dynamics(self._tree, qpos, qvel, self._link, point=self._point, bias=passive)
-        twist = setpoint[:, 7:13] if self._twist else None
-        _, effort = ts.advance(self._params, aimed, dynamics, setpoint[:, :7], qpos, qvel, twist)
-        return state, effort
+            aimed = state._replace(posture=xp.where(self._columns > 0, setpoint[:, self._columns], state.posture))
+        dynamics = ts.task_dynamics(self._tree, qpos, qvel, self.link, point=self._point, bias=passive)
+        parts, feedforward = {name: setpoint[:, part] for name, part in self._parts.items()}, None
+        if self._damping is not None:
+            feedforward = self._damping * qvel
+            added = self._timestep * (self._damping[:, None] * xp.eye(qpos.shape[1]))
+            dynamics = dynamics._replace(mass_matrix=dynamics.mass_matrix + added.astype(qpos.dtype))
+        if self._friction is not None:
+            friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture - qpos, dynamics)
+            feedforward = friction if feedforward is None else feedforward + friction
+        inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
+        new, effort = ts.advance(self._k, *inputs, **parts, feedforward=feedforward)
+        return new._replace(posture=state.posture), effort
+
+    def _friction_to(self, setpoint: Any, twist: Any, others: Any, dynamics: ts.TaskDynamics) -> Any:
+        """Return the friction (envs, dof) on the way to the setpoint; ``others`` is the way of the other joints."""
+        assert self._friction is not None
+        error, j = pose_error(setpoint[:, :7], dynamics.pose), dynamics.jacobian
+        ahead = error if twist is None else error + LOOKAHEAD * twist
+        rows, eye = namespace(j).swapaxes(j, -1, -2), 1e-4 * namespace(j).eye(6)
+        moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
+        chain = dynamics.chain
+        return compensation(self._friction.coulomb, chain * moved + (1 - chain) * others, None, self._friction.band)
+
+    def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
+        """Return this controller for the time step [s] and the option ``compensate`` of a runner."""
+        other = copy(self)
+        other._k, other._timestep = ts.discretise(self._params, timestep), timestep
+        other._friction = self._known_friction if "friction" in compensate.split("+") else None
+        return other
+
+    def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
+        """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""
+        return tool_pose(self._tree, self.link, self._point, qpos)
+
+
+def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:
+    """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
+    return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
 
 
 def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:

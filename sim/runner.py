@@ -128,7 +128,8 @@ class Runner(SingleOwner):
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
             value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
             an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
-            (envs, size): :attr:`command`.
+            (envs, size): :attr:`command`. With ``setpoint_space="tool"`` it is a pose (7,) or (envs, 7), or
+            :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity. Not for
             a :class:`batchpid.sim.Controller`, which ignores it.
@@ -260,7 +261,8 @@ class Runner(SingleOwner):
     @property
     def command(self) -> CommandSpec:
         """Names and units of a setpoint's entries: the joints, or as a controller declares them."""
-        return self.options.command
+        tool = self.options.tool_setpoints
+        return self.options.command if tool is None else tool.command
 
     @property
     def recorder(self) -> TickRecorder | None:

@@ -53,6 +53,7 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
+SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
 Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
@@ -77,7 +78,13 @@ class RunnerKeywords(TypedDict, total=False):
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
     tool: str | None
-    """Link that control "osc" moves; default the last link of the robot's longest chain."""
+    """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
+    chain."""
+    setpoint_space: SetpointSpace
+    """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
+    ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
+    Inverse kinematics makes joint setpoints of them (:class:`batchpid.sim.tool_setpoints.ToolSetpoints`), which
+    rollouts and recordings hold."""
     backend: Backend
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
     of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,

@@ -27,7 +27,7 @@ from batchpid.sim.loop.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
+from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.loop_stability import StabilityCheck
@@ -75,6 +75,7 @@ class Session:
         """Recorder of every tick."""
         self._arguments = Arguments(options)
         self._stability = StabilityCheck(robot, options.timestep) if options.control == "pid" else None
+        self._tool_pose, self._tool_setpoints = options.tool_pose, options.tool_setpoints
         self._has_warned = self._has_warned_of_contact = False
         entry_names = None if own is None else own.names
         faults = FaultLog(options.num_envs, robot.joint_names, options.timestep, options.on_fault, entry_names)
@@ -135,8 +136,11 @@ class Session:
             position, velocity = coupling.positions(position), coupling.rates(velocity)
 
         def commit(state: RunnerState, _: list[Any]) -> tuple[RunnerState, Observation]:
-            faults = state.faults.without(chosen).with_faults(self.pool.present)
-            return state._replace(faults=faults, draws=draws), self._observation()
+            faults, targets = state.faults.without(chosen).with_faults(self.pool.present), None
+            if self._tool_setpoints is not None:
+                last = position if state.targets is None else state.targets
+                targets = np.where(chosen[:, None] & np.isfinite(position), position, last)
+            return state._replace(faults=faults, draws=draws, targets=targets), self._observation()
 
         observation: Observation = self._execute(Reset(chosen, position, velocity, draws), commit)
         return observation
@@ -151,10 +155,12 @@ class Session:
         """Run one tick."""
         self._transactions.ready("step")
         count = self.options.substeps if substeps is None else self._arguments.substeps(substeps)
+        if self._tool_setpoints is not None:
+            setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
         command = self._arguments.tick(setpoint, setpoint_rate, feedforward)
         self._transactions.run(*self._ticks(command, count))
         self._warn(stacklevel=4)
-        return Observation._make(map(_COPY, self.pool.present.observation))  # a tick has few calls (test_hops.py)
+        return self._observation()
 
     def send(
         self,
@@ -166,6 +172,8 @@ class Session:
         """Begin a tick."""
         self._transactions.ready("send")
         count = self._arguments.substeps(substeps)
+        if self._tool_setpoints is not None:
+            setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
         request, commit = self._ticks(self._arguments.tick(setpoint, setpoint_rate, feedforward), count)
 
         def commit_sent(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
@@ -192,6 +200,8 @@ class Session:
     ) -> Rollout:
         """Run one tick for each row of ``setpoints``."""
         steps, options = self._transactions.ready("rollout").steps, self.options
+        if self._tool_setpoints is not None:
+            setpoints = self._joints("setpoints", setpoints, setpoint_rates, len(np.atleast_1d(setpoints)))
         command = self._arguments.ticks(setpoints, setpoint_rates, feedforwards)
         ticks = len(command.setpoint)
         seen = empty_observation(ticks, options.num_envs, options.robot.dof)
@@ -206,9 +216,11 @@ class Session:
                 rows_of_part = command.map(lambda rows, part=part: rows[part])
                 self._transactions.run(*self._ticks(rows_of_part, options.substeps))
                 self._warn(stacklevel=4)
-                for table, rows in zip(seen, self.pool.arrays.observation, strict=True):
-                    table[part] = rows[: done - tick]
+                for name in OBSERVED:
+                    getattr(seen, name)[part] = getattr(self.pool.arrays.observation, name)[: done - tick]
         next(shown, None)  # the end
+        if self._tool_pose is not None:
+            seen = seen._replace(tool_pose=self._tool_pose(seen.qpos))
         info = replace(info, faults=self.state.faults.faults)
         return Rollout(times, command.setpoint, seen, options.timestep * options.substeps, info)
 
@@ -251,7 +263,7 @@ class Session:
         def commit(state: RunnerState, results: list[Any]) -> tuple[RunnerState, Snapshot]:
             episodes = None if self.options.randomization is None else state.draws.episodes
             about, states = self.options.describe(), EnvStates.join(results)
-            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes)
+            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes, state.targets)
             self.pool.start_replay_from(Restore(snapshot, state.draws))
             return state._replace(steps_since_checkpoint=0), snapshot
 
@@ -290,6 +302,7 @@ class Session:
                 params=params,
                 actuators=actuators,
                 steps=snapshot.steps,
+                targets=snapshot.targets,
                 steps_since_checkpoint=0,
                 faults=state.faults.restored(request.snapshot.states.containment["step"]),
             )
@@ -343,7 +356,7 @@ class Session:
                     contacts = contacts.with_contacts(arrays)
                 if self.recorder is not None:
                     time = (state.steps + done * substeps) * timestep
-                    observation = Observation._make(map(_COPY, arrays.observation))
+                    observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
             steps = len(pool.completed) * substeps
             state = state._replace(
@@ -351,12 +364,23 @@ class Session:
                 contacts=contacts,
                 unrecorded=unrecorded,
                 steps=state.steps + steps,
+                targets=_followed(state.targets, setpoint[: len(pool.completed)]),
                 steps_since_checkpoint=state.steps_since_checkpoint + steps,
                 work=state.work if pool.failure else (tuple(seconds), ticks),
             )
             return state, None
 
         return Run(ticks, substeps, rate is not None, feedforward is not None, command), commit
+
+    def _joints(self, name: str, setpoint: ArrayLike, rate: ArrayLike | None, ticks: int | None) -> NDArray[np.float64]:
+        """Return joint setpoints for poses of the tool."""
+        if rate is not None:
+            problem = "is the rate of joint setpoints, and setpoints are poses"
+            raise InvalidArgumentError("setpoint_rate", problem, remedy="leave it out")
+        last, finite = self._transactions.ready().targets, self.options.on_invalid_input == "raise"
+        assert self._tool_setpoints is not None
+        assert last is not None
+        return self._tool_setpoints.joints(name, setpoint, last, finite, ticks, stacklevel=4)
 
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
@@ -368,7 +392,12 @@ class Session:
 
     def _observation(self) -> Observation:
         """Return a copy of the present observation."""
-        return Observation._make(map(_COPY, self.pool.present.observation))
+        return self._seen(self.pool.present.observation)
+
+    def _seen(self, observation: Observation) -> Observation:
+        """Return a copy of the loop's ``observation``, with the pose of the tool."""
+        seen = observation.map(_COPY)
+        return seen if self._tool_pose is None else seen._replace(tool_pose=self._tool_pose(seen.qpos))
 
     def _record(self) -> None:
         """Pass on the ticks that are not recorded yet."""
@@ -399,3 +428,11 @@ class Session:
         if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
             self._has_warned_of_contact = True
             warnings.warn(contacts.message(), MissedContactWarning, stacklevel=stacklevel)
+
+
+def _followed(targets: NDArray[Any] | None, setpoints: NDArray[Any]) -> NDArray[Any] | None:
+    """Return the last finite joint setpoints (envs, dof) after ``setpoints`` (ticks, envs, dof)."""
+    if targets is not None:
+        for rows in setpoints:
+            targets = np.where(np.isfinite(rows).all(1, keepdims=True), rows, targets)
+    return targets

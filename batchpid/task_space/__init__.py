@@ -4,11 +4,14 @@ Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a po
 twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
 """
 
+from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.operational_space import advance, init, reset, step
+from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, task_dynamics
+from batchpid.task_space.osc_transfer import track
 from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
 from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
 
@@ -16,12 +19,14 @@ __all__ = [
     "IKResult",
     "InverseKinematicsWarning",
     "KinematicTree",
+    "OSCCoefficients",
     "OSCParams",
     "OSCState",
     "OSCTerms",
     "TaskDynamics",
     "advance",
     "bias",
+    "discretise",
     "forward_dynamics",
     "gravity",
     "init",
@@ -32,7 +37,9 @@ __all__ = [
     "link_poses",
     "make_osc_params",
     "mass_matrix",
+    "presets",
     "reset",
     "step",
     "task_dynamics",
+    "track",
 ]

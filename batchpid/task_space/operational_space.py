@@ -1,19 +1,24 @@
 r"""Operational-space control: the tool as decoupled unit masses on springs, pure functions on (envs, ...) arrays.
 
 With the tool's Jacobian J and pose, the mass matrix M and the bias h at present, the joints c of the chain to the tool
-and the other joints o, the setpoint's pose, twist V and acceleration V', and the gains kp, kd of the task and kp_n,
+and the other joints o, the setpoint's pose, twist V and acceleration V', and the gains kp, kd, ki of the task and kp_n,
 kd_n of the posture::
 
     e     = position and rotation vector from the pose to the setpoint, each shortened to its limit
-    a     = kp e + kd (V - J q') + V'                           acceleration of the task
+    a     = kp e + kd (V - J q') + V' + I                       acceleration of the task
     A     = J M_cc^-1 J^T
     L     = (S A S^T)^-1, bounded                               its inertia, in the selected axes S
     F     = L (a - J' q') + wrench                              decoupling "full"; F = a + wrench with "none"
-    a_n   = kp_n (posture - q) - kd_n q'                        acceleration of the posture
+    a_n   = kp_n (posture - q) - kd_n q' + limits(q, q')        acceleration of the posture
     task  = J^T F
     null  = M_cc a_n - J^T L_n J a_n                            = N^T M_cc a_n, with J M_cc^-1 N^T = 0
     u_c   = h + M_co a_o + s1 task + s2 null + feedforward      a_o = a_n of the other joints
     u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
+    I    <- I + ki dt e, within its limit, unless s1 < 1, u is clipped or L is bounded, and a e > 0
+
+These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the implicit one. limits(q, q')
+pushes joints of the chain away from their limits: with the depth x of q in the margin, kp_l x - 2 sqrt(kp_l) q' |x| /
+margin.
 
 The other joints, such as fingers, are controlled by computed torque: in the task they would move with the hand. L_n is
 the inertia over the axes of motion and force, with full decoupling. With "partial" the blocks of A between positions
@@ -32,7 +37,7 @@ IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +47,7 @@ from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.native_rows import elementwise
+from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
 from batchpid.task_space.projections import projections
@@ -49,26 +55,32 @@ from batchpid.task_space.symmetric import product, quiet
 
 
 def init(params: OSCParams, qpos: Any) -> OSCState:
-    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m]."""
+    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the integral 0."""
     xp = namespace(*params, qpos)
-    return OSCState(posture=xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos)
+    posture = xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos
+    integral = None if params.integral_gain is None else xp.zeros((len(posture), 6), posture.dtype)
+    return OSCState(posture, integral)
 
 
 def reset(params: OSCParams, state: OSCState, qpos: Any, mask: Any) -> OSCState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
-    xp = namespace(*state, qpos, mask)
-    return OSCState(posture=xp.where(xp.asarray(mask)[:, None], init(params, qpos).posture, state.posture))
+    xp, fresh = namespace(*state, qpos, mask), init(params, qpos)
+    chosen = xp.asarray(mask)[:, None]
+    return OSCState(
+        *[None if old is None else xp.where(chosen, new, old) for new, old in zip(fresh, state, strict=True)]
+    )
 
 
 def step(
     params: OSCParams,
     state: OSCState,
-    tree: KinematicTree,
-    link: str,
     setpoint: Any,
     qpos: Any,
     qvel: Any,
+    dt: Any,
     *,
+    tree: KinematicTree,
+    link: str,
     point: Any = None,
     twist: Any = None,
     acceleration: Any = None,
@@ -76,18 +88,19 @@ def step(
     feedforward: Any = None,
     terms: bool = False,
 ) -> Any:
-    """Compute the efforts (envs, dof) [N m or N]; return ``(state, effort)``, with ``terms`` also :class:`OSCTerms`.
+    """Advance the law by ``dt`` [s]; return ``(state, effort)``, with ``terms`` also :class:`OSCTerms`.
 
-    A row does not depend on the others, to the last bit under NumPy; NaN stays in its env.
+    Efforts are (envs, dof) [N m or N]. A row does not depend on the others, to the last bit under NumPy; NaN stays in
+    its env.
 
     Parameters
     ----------
-    link, point
-        Tool: a point (3,) [m] of a link, default its origin.
     setpoint
         Poses (envs, 7): position [m] and quaternion (w, x, y, z) of any length, in the world.
     qpos, qvel
         (envs, dof) [rad or m, rad/s or m/s].
+    tree, link, point
+        Robot, and its tool: a point (3,) [m] of a link, default its origin.
     twist, acceleration
         V and V' of the setpoint (envs, 6) [m/s, rad/s, ...], in the axes of the world; None: 0.
     wrench
@@ -98,7 +111,7 @@ def step(
     Raises
     ------
     InvalidArgumentError
-        The link is unknown, or an array has a wrong shape.
+        The link is unknown, an array has a wrong shape, or dt is not positive.
     """
     setpoints = {
         "setpoint": (setpoint, 7),
@@ -108,16 +121,17 @@ def step(
     }
     _check_shapes(params, setpoints | {"feedforward": (feedforward, tree.dof)}, qpos)
     dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
-    return advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms=terms)
+    optional = twist, acceleration, wrench, feedforward
+    return advance(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, *optional, terms=terms)
 
 
 def advance(
-    params: OSCParams,
+    k: OSCCoefficients,
     state: OSCState,
-    dynamics: TaskDynamics,
     setpoint: Any,
     qpos: Any,
     qvel: Any,
+    dynamics: TaskDynamics,
     twist: Any = None,
     acceleration: Any = None,
     wrench: Any = None,
@@ -125,9 +139,67 @@ def advance(
     *,
     terms: bool = False,
 ) -> Any:
-    """Compute the efforts with given dynamics, such as an engine's; otherwise as :func:`step`."""
+    """Advance the law with given coefficients and dynamics, such as an engine's; otherwise as :func:`step`."""
     with quiet():
-        return _advance(params, state, dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward, terms)
+        xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
+        task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
+        (a,) = elementwise(_accelerations, k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
+        a_n = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
+        p = projections(k, task.dynamics, a, a_n, wrench, feedforward)
+        parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
+        if not terms and state.integral is None:
+            return state, elementwise(_effort, *parts)[0]
+        effort, whole, s1, s2 = elementwise(_saturated, *parts)
+        if state.integral is not None:
+            held = p.near_singular | (effort != whole).any(-1)
+            state = state._replace(integral=_integrated(k, state.integral, task.motion, a, held[:, None], xp))
+    if not terms:
+        return state, effort
+    shares = s1[..., 0], s2[..., 0]
+    near = p.near_singular
+    return state, effort, OSCTerms(task.error, p.force, p.task, p.posture, whole, effort.copy(), *shares, near)
+
+
+class _Motion(NamedTuple):
+    """Vectors (envs, 6) in the axes of the params' frame."""
+
+    near: Any
+    """Error with limited norms."""
+    tool_twist: Any
+    """J q'."""
+    twist: Any
+    acceleration: Any
+
+
+class Task(NamedTuple):
+    """Error and motion of the tool, in the axes of the params' frame."""
+
+    dynamics: TaskDynamics
+    error: Any
+    """(envs, 6)"""
+    motion: _Motion
+
+
+def in_frame(
+    k: OSCCoefficients, d: TaskDynamics, setpoint: Any, v: Any, twist: Any, acceleration: Any, xp: Any
+) -> Task:
+    """Return the dynamics, error and motion in the axes of the params' frame."""
+    error, near, tool_twist = _errors(k, d, setpoint, v, xp)
+    vectors: tuple[Any, ...] = (error, near, tool_twist, twist, acceleration)
+    if k.frame is not None:
+        turn = matrix_of(d.pose[..., 3:])
+        vectors = tuple([None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors])
+        d = in_tool_axes(d)
+    return Task(d, vectors[0], _Motion(*vectors[1:]))
+
+
+def _integrated(k: OSCCoefficients, integral: Any, motion: _Motion, a: Any, held: Any, xp: Any) -> Any:
+    """Return the integral after the step; one that is ``held`` (envs, 1) does not grow."""
+    new = integral + k.ki_dt * motion.near
+    if k.ki_dt2 is not None and motion.twist is not None:
+        new = new - k.ki_dt2 * motion.twist
+    new = clip(new, -k.integral_limit, k.integral_limit, xp)
+    return xp.where(held & (a * motion.near > 0), integral, new)
 
 
 def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: Any) -> None:
@@ -146,43 +218,7 @@ def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: A
             raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")
 
 
-def _advance(
-    k: OSCParams,
-    state: OSCState,
-    d: TaskDynamics,
-    setpoint: Any,
-    q: Any,
-    v: Any,
-    twist: Any,
-    acceleration: Any,
-    wrench: Any,
-    feedforward: Any,
-    terms: bool,
-) -> Any:
-    xp = namespace(*k, *state, *d, setpoint, q, v, twist, acceleration, wrench, feedforward)
-    error, near, tool_twist = _errors(k, d, setpoint, v, xp)
-    rate = -tool_twist if twist is None else twist - tool_twist
-    if k.frame is not None:
-        turn = matrix_of(d.pose[..., 3:])
-        error, near, rate, acceleration = (
-            None if x is None else in_axes(turn, x[..., None])[..., 0] for x in (error, near, rate, acceleration)
-        )
-        d = in_tool_axes(d)
-    (a,) = elementwise(_accelerations, k.stiffness, k.damping, near, rate, acceleration)
-    (a_n,) = elementwise(_posture_accelerations, k.posture_stiffness, k.posture_damping, state.posture, q, v)
-    p = projections(k, d, a, a_n, wrench, feedforward)
-    parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
-    if not terms:
-        return state, elementwise(_effort, *parts)[0]
-    effort, whole, s1, s2 = elementwise(_saturated, *parts)
-    return (
-        state,
-        effort,
-        OSCTerms(error, p.force, p.task, p.posture, whole, effort.copy(), s1[..., 0], s2[..., 0], p.near_singular),
-    )
-
-
-def _errors(k: OSCParams, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
+def _errors(k: OSCCoefficients, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
     """Return the error (envs, 6), the same with limited norms, and the twist of the tool J q', in the world."""
     limits = k.position_error_limit, k.rotation_error_limit
     found = native_rows.errors(setpoint, d.pose, limits, d.jacobian, v)
@@ -200,15 +236,32 @@ def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def _accelerations(kp: Any, kd: Any, near: Any, rate: Any, acceleration: Any) -> list[Any]:
+def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: Any, given: Any, i: Any) -> list[Any]:
     """Return a (envs, 6)."""
-    a = kp * near + kd * rate
-    return [a if acceleration is None else a + acceleration]
+    a = kp * e - kd * v
+    a = a if twist is None else a + c * twist
+    a = a if given is None else a + share * given
+    return [a if i is None else a + i]
 
 
-def _posture_accelerations(kp: Any, kd: Any, posture: Any, q: Any, v: Any) -> list[Any]:
+def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> Any:
     """Return a_n (envs, dof)."""
-    return [kp * (posture - q) - kd * v]
+    gains, chain = (k.posture_kp, k.posture_kd), None
+    limits = k.limit_kp, k.limit_kd, k.limit_margin, k.limit_low, k.limit_high
+    if k.limit_kp is not None:
+        chain = d.chain[None]
+    return elementwise(_posture_accelerations, *gains, posture, q, v, chain, *limits)[0]
+
+
+def _posture_accelerations(
+    kp: Any, kd: Any, posture: Any, q: Any, v: Any, chain: Any, limit_kp: Any, limit_kd: Any, margin: Any, *ends: Any
+) -> list[Any]:
+    a = kp * (posture - q) - kd * v
+    if chain is None:
+        return [a]
+    xp, (low, high) = namespace(q, *ends), ends
+    depth = xp.maximum(low - q, 0.0) - xp.maximum(q - high, 0.0)
+    return [a + chain * (limit_kp * depth - limit_kd * v * xp.abs(depth) / margin)]
 
 
 def _effort(*parts: Any) -> list[Any]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.choices import Choice
+from batchpid.arrays.choices import CHOICES, Choice
 from batchpid.arrays.display import array_summary
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
@@ -35,6 +35,7 @@ class ToolFrame(Choice):
 TASK_CHOICES: dict[str, dict[str, Any]] = {
     "decoupling": {"full": None, "partial": PartialDecoupling(), "none": NoDecoupling()},
     "frame": {"world": None, "tool": ToolFrame()},
+    "discretization": CHOICES["discretization"],
 }
 """Options chosen by name, and the entries of the params; the first is the default."""
 
@@ -71,6 +72,19 @@ class OSCParams(NamedTuple):
     """None for "full", or a choice without fields."""
     frame: Any = None
     """None for "world", or a choice without fields."""
+    integral_gain: Any = None
+    """ki (1 | envs, 6) [1/s^3]; with decoupling "none" [N/(m s), N m/(rad s)]."""
+    integral_limit: Any = None
+    """(1 | envs, 6) [m/s^2, rad/s^2]; with decoupling "none" [N, N m]."""
+    limit_stiffness: Any = None
+    """(1 | envs, dof) [1/s^2]."""
+    limit_margin: Any = None
+    """(1 | envs, dof) [rad or m]."""
+    lower: Any = None
+    """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
+    upper: Any = None
+    discretization: Any = None
+    """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "axes")
@@ -83,10 +97,14 @@ def make_osc_params(
     stiffness: ArrayLike = 150.0,
     damping_ratio: ArrayLike = 1.0,
     damping: ArrayLike | None = None,
+    integral_gain: ArrayLike | None = None,
+    integral_limit: ArrayLike = math.inf,
     axes: ArrayLike | None = None,
     force_axes: ArrayLike | None = None,
     posture_stiffness: ArrayLike = 10.0,
     posture_damping_ratio: ArrayLike = 1.0,
+    limit_margin: ArrayLike | None = None,
+    limit_stiffness: ArrayLike = 400.0,
     position_error_limit: ArrayLike = 0.1,
     rotation_error_limit: ArrayLike = 0.5,
     smallest_eigenvalue: ArrayLike = 0.02,
@@ -95,6 +113,7 @@ def make_osc_params(
     effort_max: ArrayLike | None = None,
     decoupling: str = "full",
     frame: str = "world",
+    discretization: str = "explicit",
 ) -> OSCParams:
     """Build validated :class:`OSCParams` for a tool of ``tree``.
 
@@ -105,6 +124,9 @@ def make_osc_params(
     stiffness, damping_ratio, damping
         kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry, rz. With decoupling
         "none" they are forces and moments, and ``damping`` is required.
+    integral_gain, integral_limit
+        ki [1/s^3], which learns loads that the model does not know, and the largest size of the integral of each axis
+        [m/s^2, rad/s^2]. A loop with kp and kd is stable for ki < kp kd. None: no integral.
     axes
         Bools: the axes whose motion is controlled; the posture moves the others. None: all.
     force_axes
@@ -112,6 +134,9 @@ def make_osc_params(
     posture_stiffness, posture_damping_ratio
         Gains of the joints towards their posture: within the null space of the task for the joints of the chain to the
         tool, fully for others, such as fingers [1/s^2].
+    limit_margin, limit_stiffness
+        Joints of the chain that come nearer to a position limit than the margin [rad or m], or a quarter of their
+        range, are pushed away within the null space, by a critically damped spring [1/s^2]. None: no margin.
     position_error_limit, rotation_error_limit
         Largest norm of the error that enters the law [m, rad]; inf for none.
     smallest_eigenvalue
@@ -124,6 +149,9 @@ def make_osc_params(
         themselves only, as in robosuite by default; "none": gains are forces.
     frame
         "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
+    discretization
+        "explicit", or "implicit": stable at any time step (:mod:`batchpid.task_space.osc_coefficients`); not with
+        decoupling "none".
 
     Raises
     ------
@@ -136,6 +164,9 @@ def make_osc_params(
     if choice("decoupling", decoupling, TASK_CHOICES["decoupling"]) == "none" and damping is None:
         problem = "is missing: with decoupling 'none' no mass relates it to the stiffness"
         raise InvalidArgumentError("damping", problem, remedy="give forces per velocity [N s/m, N m s/rad]")
+    if choice("discretization", discretization, TASK_CHOICES["discretization"]) == "implicit" and decoupling == "none":
+        problem = "'implicit' needs gains of accelerations, which decoupling 'none' has not"
+        raise InvalidArgumentError("discretization", problem, remedy="use 'explicit', or decoupling 'full'")
     kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
     posture = _rows("posture_stiffness", posture_stiffness, joints)
     motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
@@ -156,6 +187,9 @@ def make_osc_params(
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
     above = {"above": True, "infinite": True}
+    limits = np.array([tree.lower, tree.upper])
+    margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
+    integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
     params = OSCParams(
         stiffness=kp,
         damping=kd if damping is None else _rows("damping", damping, AXES),
@@ -170,6 +204,13 @@ def make_osc_params(
         effort_max=high,
         decoupling=TASK_CHOICES["decoupling"][decoupling],
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
+        integral_gain=integral,
+        integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES, infinite=True),
+        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints),
+        limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
+        lower=None if margin is None else limits[:1],
+        upper=None if margin is None else limits[1:],
+        discretization=TASK_CHOICES["discretization"][discretization],
     )
     _check_rows(params)
     return params

@@ -39,10 +39,13 @@ class TaskDynamics(NamedTuple):
 
 
 class OSCState(NamedTuple):
-    """State of the law, arrays (envs, dof)."""
+    """State of the law."""
 
     posture: Any
-    """Positions that the joints are drawn to, by the posture gains [rad or m]."""
+    """Positions (envs, dof) that the joints are drawn to, by the posture gains [rad or m]."""
+    integral: Any = None
+    """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]; with decoupling "none" a wrench [N, N m]. None without
+    ``integral_gain``."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")

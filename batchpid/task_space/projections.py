@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.elementwise import namespace
 from batchpid.task_space import native_rows
-from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_coefficients import OSCCoefficients
+from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
@@ -34,7 +35,7 @@ class Projections(NamedTuple):
 
 
 def projections(
-    k: OSCParams, d: TaskDynamics, a: Any, a_n: Any, wrench: Any = None, feedforward: Any = None
+    k: OSCCoefficients, d: TaskDynamics, a: Any, a_n: Any, wrench: Any = None, feedforward: Any = None
 ) -> Projections:
     """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture."""
     kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
@@ -68,7 +69,7 @@ def projections(
     return Projections(f, task, null, base, of_others(task), of_others(null), singular)
 
 
-def _inertias(k: OSCParams, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
+def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
     """Return L, None with decoupling "none", and L_n of the mobility A (envs, 6, 6), and where either is bounded."""
     s0 = k.smallest_eigenvalue[..., 0]
     allowed = k.axes

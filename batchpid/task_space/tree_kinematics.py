@@ -54,8 +54,10 @@ class Velocities(NamedTuple):
     angular_rate: Any
 
 
-def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None) -> Any:
+def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None, *, point: Any = None) -> Any:
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
+
+    With a ``point`` (3,) of the links [m] the positions are those of the point.
 
     Raises
     ------
@@ -67,13 +69,14 @@ def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = Non
         raise InvalidArgumentError("links", "must be a list of names", value=links, remedy=f"pass [{links!r}]")
     indices = [tree.index(link) for link in chosen]
     (q,), bodies, xp = prepared(tree, qpos=qpos)
-    found = [native_rows.kinematics(tree, ("pose",), q, None, index) for index in indices]
+    at = read_point(q, point)
+    found = [native_rows.kinematics(tree, ("pose",), q, None, index, at) for index in indices]
     poses = [each[0] for each in found if each is not None]
     if len(poses) == len(indices):
         return np.stack(poses, axis=-2)
     frames = frames_of_bodies(tree, bodies, q, xp)
     with quiet():
-        return xp.stack([pose_of(frame_of_link(tree, bodies, frames, index)) for index in indices], axis=-2)
+        return xp.stack([pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2)
 
 
 def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:

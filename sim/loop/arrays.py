@@ -71,15 +71,14 @@ class Arrays(NamedTuple):
         """Return the arrays of ``fields``, named as in :meth:`layout`."""
 
         def group(kind: Any, prefix: str) -> Any:
-            return kind(*(fields[f"{prefix}.{name}"] for name in kind._fields))
+            return kind(*[fields.get(f"{prefix}.{name}") for name in kind._fields])
 
         return Arrays(group(Command, "command"), group(Observation, "observation"), group(FaultArrays, "fault"))
 
     def at(self, index: Any) -> Arrays:
         """Return views at an index of the leading axes, such as a tick or a slice of envs."""
         part = itemgetter(index)
-        command, observation, fault = (map(part, group) for group in self)
-        return Arrays(Command._make(command), Observation._make(observation), FaultArrays._make(fault))
+        return Arrays(self.command.map(part), self.observation.map(part), FaultArrays._make(map(part, self.fault)))
 
 
 class Ticks:

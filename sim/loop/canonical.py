@@ -11,6 +11,7 @@ import batchpid as bp
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
+from batchpid.sim.observation import OBSERVED
 from batchpid.sim.options import RunnerOptions
 
 _TICKS, _SUBSTEPS, _STEP = 5, 20, 0.1  # rad, m, N m or N: small enough for any robot
@@ -37,6 +38,6 @@ def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
     finally:
         loop.close()
     digest = hashlib.sha256(str(package_versions(("batchpid",)).get("batchpid")).encode())
-    for rows in arrays.observation:
-        digest.update(rows.tobytes())
+    for name in OBSERVED:
+        digest.update(getattr(arrays.observation, name).tobytes())
     return digest.hexdigest()

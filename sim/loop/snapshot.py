@@ -153,6 +153,8 @@ class Snapshot:
     actuators: bp.Actuators | None = None
     episodes: NDArray[np.int64] | None = None
     """Stream and episode of each env (envs, 2), from which everything is drawn again; None without randomization."""
+    targets: NDArray[np.float64] | None = None
+    """Last joint setpoints (envs, dof) of a runner whose setpoints are poses; else None."""
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Check that a runner with options ``about`` can restore it.
@@ -193,8 +195,9 @@ class Snapshot:
             "head": np.array(json.dumps(head)),
             **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
         }
-        if self.episodes is not None:
-            tables["episodes"] = self.episodes
+        for name in ("episodes", "targets"):
+            if (rows := getattr(self, name)) is not None:
+                tables[name] = rows
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
 
     @classmethod
@@ -235,6 +238,11 @@ class Snapshot:
             episodes.shape != (num_envs, 2) or episodes.dtype != np.int64 or (episodes < 0).any()
         ):
             raise ValueError(f"its episodes are not counts (envs, 2) of {num_envs} envs")
+        targets = tables.pop("targets", None)
+        if (targets is None) != (about.get("setpoint_space", "joints") == "joints"):
+            raise ValueError("its targets do not fit its setpoint_space")
+        if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
+            raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")
         groups = nest(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
@@ -257,7 +265,7 @@ class Snapshot:
             motors = states.actuators  # the runner that restores it checks them
         size = dof if about.get("command") is None else len(names("command", about["command"]))
         states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size)
-        return cls(about, steps, params, states, actuators, episodes)
+        return cls(about, steps, params, states, actuators, episodes, targets)
 
     def __repr__(self) -> str:
         about = self.about

@@ -15,12 +15,9 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import Constants, KnownFriction, Layout
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.actuator_checks import known_joints
+from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.mimics import coupling_of
-
-BAND = {"rad": 1e-4, "m": 2e-5}
-"""Half width, by the joint's unit, of the band in which the compensation is less than the friction."""
 
 
 def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actuators | None) -> Layout:

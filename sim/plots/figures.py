@@ -53,8 +53,9 @@ def step_responses(
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
 
-    Setpoints that are not one number for each joint have separate axes, one for each entry of the command. Not-finite
-    samples are gaps; so is everything of an env from where ``ok`` is False.
+    Setpoints that are not one number for each joint have separate axes, one for each entry of the command, with the
+    pose of the tool where there is one. Not-finite samples are gaps; so is everything of an env from where ``ok`` is
+    False.
 
     Parameters
     ----------
@@ -74,9 +75,12 @@ def step_responses(
     own = None if run.info.sets_positions else run.info.own_command
     figure, blocks = _figure(run, joints, rows=2, title=title, command=own)
     own_blocks = blocks[len(blocks) - own.size :] if own is not None else []
+    pose = None if run.tool_pose is None else _like_setpoints(run.tool_pose, rollout.setpoint[..., 3:7])
     for entry, (axes,) in own_blocks:
         values = rollout.setpoint[..., entry]
         drawing.draw_entry(axes, run.time, np.where(np.isfinite(values), values, np.nan))
+        if pose is not None and entry < pose.shape[-1]:
+            drawing.draw_fan(axes, run.time, pose[..., entry], mark)
     for joint, (above, below) in blocks[: len(blocks) - len(own_blocks)]:
         drawing.draw_limits(above, run.info.lower[joint], run.info.upper[joint])
         drawing.draw_setpoint(above, run, joint, band)
@@ -181,11 +185,21 @@ def _png(figure: Figure, dpi: int) -> bytes:
 def _blank_failed(rollout: Rollout) -> Rollout:
     """Return the rollout with NaN where an env has failed, and for setpoints that are not positions."""
     alive, seen = rollout.ok[..., None], rollout.observation
-    blank = seen._replace(qpos=np.where(alive, seen.qpos, np.nan), effort=np.where(alive, seen.effort, np.nan))
+    blank = seen._replace(
+        qpos=np.where(alive, seen.qpos, np.nan),
+        effort=np.where(alive, seen.effort, np.nan),
+        tool_pose=None if seen.tool_pose is None else np.where(alive, seen.tool_pose, np.nan),
+    )
     setpoint = np.full(seen.qpos.shape, np.nan)
     if rollout.info.sets_positions:
         setpoint = np.where(np.isfinite(rollout.setpoint), rollout.setpoint, np.nan)
     return replace(rollout, setpoint=setpoint, observation=blank)
+
+
+def _like_setpoints(pose: Any, wxyz: Any) -> Any:
+    """Return poses (..., 7) with the sign of the quaternion that is nearer to ``wxyz`` (..., 4)."""
+    sign = np.where((pose[..., 3:] * wxyz).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return np.concatenate([pose[..., :3], sign * pose[..., 3:]], axis=-1)
 
 
 def _joint_indices(run: Rollout, joints: Joints) -> list[int]:

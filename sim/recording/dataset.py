@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from batchpid.errors import MissingDependencyError
-from batchpid.sim.observation import RECORDED, Rollout
+from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import read_recording
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
         import xarray
     except ImportError:
         raise MissingDependencyError("xarray", "a labelled dataset", "data") from None
-    info, own = rollout.info, rollout.info.own_command
-    columns = {name: ("joint",) if quantity.per_joint else () for name, quantity in RECORDED.items()}
-    units = {name: quantity.unit for name, quantity in RECORDED.items()}
+    info, own, quantities = rollout.info, rollout.info.own_command, rollout.info.recorded
+    columns = {name: ("joint",) if quantity.per_joint else () for name, quantity in quantities.items()}
+    units = {name: quantity.unit for name, quantity in quantities.items()}
     entries: dict[str, Any] = {}
     if own is not None:
         columns["setpoint"], units["setpoint"] = ("entry",), "|".join(dict.fromkeys(own.units))
@@ -43,6 +43,8 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
         }
     elif info.control == "effort":
         units["setpoint"] = units["effort"]
+    if "tool_pose" in quantities:
+        columns["tool_pose"], entries["pose"] = ("pose",), list(quantities["tool_pose"].columns)
     return xarray.Dataset(
         {
             name: (
@@ -50,7 +52,7 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
                 getattr(rollout, name),
                 {"long_name": quantity.meaning, "units": units[name]},
             )
-            for name, quantity in RECORDED.items()
+            for name, quantity in quantities.items()
         },
         coords={
             **entries,

@@ -100,7 +100,8 @@ class Recorder(SingleOwner):
         seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
         info = replace(runner.info, seed=seed, complete=False)
         files.load_h5py()
-        self._row_bytes = sum(table.nbytes for table in runner.observe()) + 8 * runner.num_envs * runner.command.size
+        seen = [table.nbytes for table in runner.observe() if table is not None]
+        self._row_bytes = sum(seen) + 8 * runner.num_envs * runner.command.size
         self._rows: SimpleQueue[_Row | None] = SimpleQueue()  # None: the end
         self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
         self._oldest = math.inf  # when the oldest row was recorded that is being written
@@ -206,8 +207,8 @@ class Recorder(SingleOwner):
                         rows.append((row.time, row.setpoint, *row.observation))
                     last = row.observation
                 if rows:
-                    columns = map(np.array, zip(*rows, strict=True))
-                    file.append(dict(zip(("time", *RECORDED), columns, strict=True)))
+                    columns = zip(("time", *RECORDED), zip(*rows, strict=True), strict=True)
+                    file.append({name: np.array(column) for name, column in columns if column[0] is not None})
                 self._oldest = math.inf
         except RecordingError as error:
             self._error = error

@@ -135,10 +135,11 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: i
         present = DTYPES.keys() & arrays.keys()
         if "guarded" not in arrays and "qpos" in arrays:  # recorded before there were guards
             arrays["guarded"] = np.zeros(arrays["qpos"].shape, bool)
-        if lacking := DTYPES.keys() - arrays:
-            raise ValueError(f"it does not hold {', '.join(sorted(lacking))}")
-        arrays = {name: arrays[name].astype(dtype, casting="same_kind", copy=False) for name, dtype in DTYPES.items()}
         info = _info(attributes)
+        dtypes = {name: DTYPES[name] for name in ("time", *info.recorded)}
+        if lacking := dtypes.keys() - arrays:
+            raise ValueError(f"it does not hold {', '.join(sorted(lacking))}")
+        arrays = {name: arrays[name].astype(dtype, casting="same_kind", copy=False) for name, dtype in dtypes.items()}
         tick = float(attributes["tick"] if "tick" in attributes else attributes["timestep"] * attributes["substeps"])
         _check(arrays, tick, info)
         if checksums is not None and not np.array_equal(
@@ -179,17 +180,17 @@ def load_h5py() -> Any:
 
 
 def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) -> dict[str, h5py.Dataset]:
-    """Write ``info`` to a new .h5 file, and return empty datasets that can grow: time and all of :data:`RECORDED`."""
+    """Write ``info`` to a new .h5 file, and return empty datasets that can grow: time and :attr:`RunInfo.recorded`."""
     for name, value in _attributes(info, num_envs, tick).items():
         file.attrs[name] = value
     datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan)}
     datasets["time"].attrs["unit"] = ["s"]
-    for name, quantity in RECORDED.items():
+    for name, quantity in info.recorded.items():
         row = info.row_shape(name, num_envs)
         dtype = np.dtype(quantity.dtype)
         rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * dtype.itemsize))
         datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
-        if quantity.per_joint:
+        if info.units_of(name):
             datasets[name].attrs["unit"] = list(info.units_of(name))
     datasets["checksum"] = file.create_dataset(
         "checksum", (0,), "i8", maxshape=(None,), chunks=(1024,), fillvalue=NOT_WRITTEN
@@ -199,7 +200,7 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
 
 def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArray[Any]]) -> None:
     """Append ``arrays``, ticks first, to the datasets of their names; their checksums, which readers count, last."""
-    arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items()}
+    arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items() if name in datasets}
     for name, rows in (arrays | {"checksum": row_checksums(arrays)}).items():
         dataset = datasets[name]
         done = len(dataset)
@@ -262,7 +263,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
         raise ValueError("its attributes are damaged: the checksum differs")
     names = tuple(map(str, known["joint_names"]))
-    texts = ("robot", "urdf", "dissipation", "control", "compensate", "engine", "physics", "begun")
+    texts = ("robot", "urdf", "dissipation", "control", "tool", "compensate", "engine", "physics", "begun")
     decode: dict[str, Callable[[Any], Any]] = {
         **dict.fromkeys(texts, str),
         **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
@@ -301,7 +302,7 @@ def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> No
     """Check that shapes agree and times are numbers."""
     ticks, dof = len(arrays["time"]), len(info.joint_names)
     envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0
-    shapes = {name: (ticks, *info.row_shape(name, envs)) for name in RECORDED}
+    shapes = {name: (ticks, *info.row_shape(name, envs)) for name in info.recorded}
     for name, shape in ({"time": (ticks,)} | shapes).items():
         if arrays[name].shape != shape:
             raise ValueError(f"its {name} has shape {arrays[name].shape}, not {shape}")

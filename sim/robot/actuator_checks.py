@@ -14,6 +14,8 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE, check_actuators
 from batchpid.sim.robot.description import RobotDescription
 
+BAND = {"rad": 1e-4, "m": 2e-5}
+"""Half width, by the joint's unit, of the band in which the compensation of friction is less than the friction."""
 FRICTION_SHARE = 0.8
 """Share of the robot's own actuators' Coulomb friction that is compensated.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from batchpid.sim.observation import OBSERVED
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.spatial_inertia import SpatialInertia
 
 Float64 = NDArray[np.float64]
 
@@ -93,13 +94,14 @@ class LinkMass(NamedTuple):
 
     ``mass`` [kg]; ``source``: "inertial", "repaired", "shapes" (the collision shapes, at SAPIEN's density) or "none";
     ``gyration``: largest radius of gyration about the center of mass [m], sqrt(I/m); ``size``: diagonal [m] of the box
-    around its collision shapes, 0 without.
+    around its collision shapes, 0 without; ``inertia``: in the link's frame, None without mass.
     """
 
     mass: float
     source: str
     gyration: float
     size: float
+    inertia: SpatialInertia | None = None
 
 
 class Placement(NamedTuple):

@@ -205,7 +205,9 @@ class Robot(RobotDescription):
         return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)
 
     def kinematic_tree(self, **options: Any) -> KinematicTree:
-        """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`: float64, and without an engine.
+        """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
+
+        No engine is needed, unless a link has collision shapes and no ``<inertial>``: SAPIEN computes its inertia.
 
         It knows every link of the URDF by name, merged ones included. Its joints move independently: it ignores mimic
         couplings, friction and damping.
@@ -218,7 +220,7 @@ class Robot(RobotDescription):
         Raises
         ------
         RobotError
-            The base is not fixed, or the mass of a link follows from its collision shapes, which only the engine knows.
+            The base is not fixed, or SAPIEN cannot build a link whose mass comes from its collision shapes.
         InvalidArgumentError
             An option is not one of those above, or has a wrong shape or sign.
         """

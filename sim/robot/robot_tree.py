@@ -15,23 +15,24 @@ from batchpid.task_space.kinematic_tree import KinematicTree
 
 
 def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
-    """Return the tree of ``robot`` with the masses of its URDF; ``options`` are the tree's armature and gravity.
+    """Return the tree of ``robot``; ``options`` are its armature and gravity.
 
-    Raises RobotError if the base is not fixed, or the mass of a link is known to the engine alone.
+    Masses are those of the URDF; SAPIEN has those of links without ``<inertial>`` but with collision shapes.
+
+    Raises RobotError if the base is not fixed, or SAPIEN cannot build a link whose mass comes from its collision shapes.
     """
     if not robot.fixed_base:
-        raise RobotError(f"{robot.path}: a kinematic tree has a fixed base; load the robot with fixed_base=True")
+        problem = "operational space and inverse kinematics need a kinematic tree, which has a fixed base"
+        raise RobotError(f"{robot.path}: {problem}; load the robot with fixed_base=True, or control its joints")
 
-    def refuse(link: str) -> SpatialInertia:
-        remedy = "its mass would come from its collision shapes, which only the engine knows; give it an <inertial>"
-        raise RobotError(f"{robot.path}: link {link!r} has no <inertial>: {remedy}")
+    def of_shapes(link: str) -> SpatialInertia:
+        return robot.link_masses[link].inertia or empty
 
-    # Merging asks for the inertia of shapes only where a link that has shapes has no <inertial>.
-    inertias = merge_fixed_links(robot.urdf, refuse).inertias
+    empty = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
+    inertias = merge_fixed_links(robot.urdf, of_shapes).inertias
     children = {joint.child_link for joint in robot.all_joints}
     (root,) = (link.name for link in robot.links if link.name not in children)
     links = [root, *(joint.child_link for joint in robot.all_joints)]
-    empty = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
     of_links = [inertias.get(link, empty) for link in links]
     return KinematicTree(
         links=tuple(links),

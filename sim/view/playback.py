@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Observation, Rollout
+from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
 
 HISTORY_SECONDS = 8.0
@@ -79,8 +79,8 @@ class Playback:
         """Return the rows from a time [s] to the present one; numbers that are not finite become 0."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
         part = self._rollout.for_ticks(slice(first, last + 1))
-        finite = (np.nan_to_num(array, posinf=0.0, neginf=0.0) for array in part.observation)
-        return replace(part, observation=Observation._make(finite))
+        finite = part.observation.map(lambda array: np.nan_to_num(array, posinf=0.0, neginf=0.0))
+        return replace(part, observation=finite)
 
 
 def had_ground(rollout: Rollout, robot: Robot) -> bool:

@@ -180,14 +180,14 @@ class LiveSimulation(SingleOwner):
     def _observe(self, disturbance: Float64) -> None:
         """Append the present state to the frames; a robot that diverged keeps its last finite position."""
         parts = [runner.observe() for runner in self._runners]
-        observation = Observation._make(map(np.concatenate, zip(*parts, strict=True)))
+        observation = Observation.join(parts)
         ok = observation.ok[:, None]
         last = self._frames[-1].qpos[0] if self._frames else np.tile(self.start, (len(self.groups), 1))
         observation = observation._replace(
             qpos=np.where(ok, observation.qpos, last).astype(np.float32),
             effort=np.where(ok, observation.effort - disturbance, 0.0).astype(np.float32),
         )
-        row = Observation._make(array[None] for array in observation)
+        row = observation.map(lambda array: array[None])
         self._frames.append(Rollout(np.array([self.time]), self._setpoints(), row, self.period, self._info))
 
     def _setpoints(self) -> Float64:

@@ -89,8 +89,10 @@ class NodeWorker(Worker):
         if arrays is not None:
             tick = len(arrays.observation.ok)
             for ours, theirs in zip(self._arrays[1:], arrays[1:], strict=True):
-                for table, rows in zip(ours, theirs, strict=True):
-                    table[:tick, self._envs] = rows
+                tables: Any = zip(ours, theirs, strict=True)
+                for table, rows in tables:
+                    if table is not None:
+                        table[:tick, self._envs] = rows
         if failure is not None:
             return failure.of_worker(self._name)
         if self.info is None:

@@ -55,6 +55,8 @@ class RunnerState(NamedTuple):
     """None with collisions."""
     sent: Observation | None = None
     """Observation of the last tick that :meth:`Runner.send` began."""
+    targets: NDArray[Any] | None = None
+    """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
 
 
 Commit = Callable[[RunnerState, list[Any]], tuple[RunnerState, Any]]

@@ -101,7 +101,7 @@ def test_a_rollout_and_its_ticks_one_by_one(panda):
     with Runner(panda, 20, params=panda.params(), workers=1) as runner:
         runner.reset(start_poses(panda, 20))
         rollout = runner.rollout(np.broadcast_to(panda.settings.target, (TICKS, panda.dof)))
-    assert_identical(type(reference())._make(rows[-1] for rows in rollout.observation), reference())
+    assert_identical(rollout.observation.for_envs(-1), reference())
     assert rollout.time[-1] == pytest.approx(TICKS * 20 / 2000)
 
 
@@ -126,7 +126,7 @@ def test_a_rollout_with_checkpoints_faults_rates_and_feedforwards(panda, workers
         assert list(runner.faults) == list(other.faults)
         assert len(runner.faults) == 1
         assert_identical(runner.observe(), steps[-1])
-    assert_identical(rollout.observation, type(steps[0])._make(map(np.stack, zip(*steps, strict=True))))
+    assert_identical(rollout.observation, type(steps[0]).join([each.map(lambda rows: rows[None]) for each in steps]))
 
 
 def test_a_masked_reset_does_not_affect_the_other_envs(panda, reference):

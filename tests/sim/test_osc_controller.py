@@ -21,19 +21,28 @@ def panda():
     return load_bundled("panda")
 
 
-@pytest.fixture(scope="module")
-def six_joints(tmp_path_factory):
-    """Arm of six joints: yaw, pitch, pitch, roll, pitch, roll."""
+def six(folder, dynamics=""):
+    """Return an arm of six joints: yaw, pitch, pitch, roll, pitch, roll."""
     inertial = (
         '<inertial><origin xyz="0 0 0.15"/><mass value="2"/>'
         '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial>'
     )
-    limit = '<limit lower="-3" upper="3" effort="150" velocity="5"/>'
+    limit = f'<limit lower="-3" upper="3" effort="150" velocity="5"/>{dynamics}'
     parts, axes = [link("l0", inertial)], ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
     for number, axis in enumerate(axes, 1):
         one = joint(f"j{number}", f"l{number - 1}", f"l{number}", inner=limit, origin="0 0 0.3")
         parts += [link(f"l{number}", inertial), one.replace("0 1 0", axis)]
-    return Robot.load(write(tmp_path_factory.mktemp("arm"), robot(*parts)))
+    return Robot.load(write(folder, robot(*parts)))
+
+
+@pytest.fixture(scope="module")
+def six_joints(tmp_path_factory):
+    return six(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def with_friction(tmp_path_factory):
+    return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8" friction="2"/>')
 
 
 def pose_of(of, qpos, name):
@@ -41,23 +50,24 @@ def pose_of(of, qpos, name):
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-@pytest.mark.parametrize("name", ["panda", "six_joints"])
+@pytest.mark.parametrize("name", ["panda", "six_joints", "with_friction"])
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
-    """5 cm of radius, once in 2 s; the orientation is held. It is r w^2/kp = 0.5 mm too wide."""
+    """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are compensated."""
     if engine == "mujoco":
         pytest.importorskip("mujoco")
     of = request.getfixturevalue(name)
     tool, start = (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
-    control = OperationalSpace(of, tool, twist=True, stiffness=1000.0)
+    control = OperationalSpace(of, tool, twist=True, acceleration=True, stiffness=400.0)
     at, ticks, dt = pose_of(of, start, tool), 130, 1 / 100
     phase = np.pi * dt * np.arange(1, ticks + 1)
-    setpoints = np.tile(np.concatenate([at, np.zeros(6)]), (ticks, 1))
+    setpoints = np.tile(np.concatenate([at, np.zeros(12)]), (ticks, 1))
     ahead = 0.5 * np.pi * dt  # a setpoint is held for a tick: its middle is that of the motion
     setpoints[:, 0] += 0.05 * (np.cos(phase - ahead) - 1)
     setpoints[:, 1] += 0.05 * np.sin(phase - ahead)
     setpoints[:, 7], setpoints[:, 8] = -0.05 * np.pi * np.sin(phase - ahead), 0.05 * np.pi * np.cos(phase - ahead)
-    with Runner(of, 2, control=control, engine=engine, workers=0, timestep=1 / 1000, substeps=10) as runner:
-        assert runner.command.labels[7] == "vx [m/s]"
+    setpoints[:, 13:15] = -0.05 * np.pi**2 * np.stack([np.cos(phase - ahead), np.sin(phase - ahead)], axis=-1)
+    with Runner(of, 1, control=control, engine=engine, workers=0, timestep=1 / 1000, substeps=10) as runner:
+        assert runner.command.labels[7::6] == ("vx [m/s]", "ax [m/s^2]")
         runner.reset(start)
         rollout = runner.rollout(setpoints)
     assert rollout.ok.all()
@@ -166,6 +176,35 @@ def test_control_osc_moves_a_link(panda):
     np.testing.assert_array_equal(rollout.qpos, again.qpos)
     with Runner(panda, 1, control="osc", workers=0) as runner:  # the hand, and not a finger
         np.testing.assert_allclose(runner.command.neutral, pose_of(panda, panda.start, HAND))
+
+
+def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
+    pytest.importorskip("h5py")
+    from batchpid.sim import Recorder, plots, read_recording, write_recording
+
+    control, point = OperationalSpace(panda, HAND, point=[0, 0, 0.1]), [0.0, 0.0, 0.1]
+    goals = np.broadcast_to(np.multiply(control.command.neutral, [1, 1, 1, -1, -1, -1, -1]), (6, 2, 7))
+    with Runner(panda, 2, control=control, **OPTIONS) as runner:
+        first = runner.reset()
+        with Recorder(tmp_path / "run.h5", runner):
+            rollout = runner.rollout(goals)
+        runner.send(goals[0])
+        last = runner.recv()
+    for seen in (first, last, rollout):
+        wanted = ts.link_poses(panda.kinematic_tree(), seen.qpos, [HAND], point=point)[..., 0, :]
+        np.testing.assert_array_equal(seen.tool_pose, wanted.astype(np.float32))
+    write_recording(rollout, tmp_path / "run.npz")
+    for name in ("run.h5", "run.npz"):
+        recorded = read_recording(tmp_path / name)
+        np.testing.assert_array_equal(recorded.tool_pose, rollout.tool_pose)
+        assert recorded.info.tool == HAND
+        assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
+    assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
+    named = {axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout, mark=1).axes}
+    marked = [line.get_ydata() for line in named["setpoint qx"].get_lines()][-1]
+    np.testing.assert_allclose(marked, -rollout.tool_pose[:, 1, 4])
+    with Runner(panda, 1, **OPTIONS) as runner:
+        assert runner.reset().tool_pose is None
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def link_masses(robot: RobotDescription) -> dict[str, LinkMass]:
         inertia = link_inertia(component)
         source = "shapes" if not link.inertial else "repaired" if link.name in repaired else "inertial"
         gyration = float(np.sqrt(np.linalg.eigvalsh(inertia.tensor)[-1] / inertia.mass))
-        masses[link.name] = LinkMass(inertia.mass, source, gyration, _size(component.collision_shapes))
+        masses[link.name] = LinkMass(inertia.mass, source, gyration, _size(component.collision_shapes), inertia)
     return masses
 
 

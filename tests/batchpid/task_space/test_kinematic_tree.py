@@ -210,14 +210,15 @@ def test_errors_name_the_argument_and_the_remedy():
         ts.forward_dynamics(massless, np.zeros(2), np.zeros(2), np.zeros(2))
 
 
-def test_a_robot_whose_masses_only_the_engine_knows_is_refused(tmp_path):
+def test_the_mass_of_collision_shapes_is_sapiens_and_a_floating_base_is_refused(tmp_path):
     from tiny_urdf import joint, link, robot, write
 
     box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
     text = robot(link("base"), link("arm", box), joint("hinge", "base", "arm"))
-    with pytest.raises(RobotError, match="link 'arm' has no <inertial>"):
-        Robot.load(write(tmp_path, text)).kinematic_tree()
-    with pytest.raises(RobotError, match="fixed_base=True"):
+    tree = Robot.load(write(tmp_path, text)).kinematic_tree()
+    np.testing.assert_allclose(tree.mass[1], 6, rtol=1e-6)
+    np.testing.assert_allclose(tree.inertia[1].diagonal(), [0.065, 0.05, 0.025], rtol=1e-6)
+    with pytest.raises(RobotError, match=r"need a kinematic tree.*fixed_base=True, or control its joints"):
         Robot.load("panda", fixed_base=False).kinematic_tree()
     with pytest.raises(InvalidArgumentError, match="did you mean 'gravity'"):
         robot_of("panda").kinematic_tree(gravty=0)

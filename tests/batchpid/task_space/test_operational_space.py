@@ -19,6 +19,10 @@ START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
 HAND = "panda_hand"
 
 
+def advance(params, *inputs, dt=DT, **options):
+    return ts.advance(ts.discretise(params, dt), *inputs, **options)
+
+
 def accelerations(d, effort):
     """Return q'' = M^-1 (u - h), and the acceleration of the tool."""
     qacc = np.linalg.solve(d.mass_matrix, (effort - d.bias)[..., None])[..., 0]
@@ -49,7 +53,7 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, qvel, link)
     inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5), "terms": True}
-    _, effort, terms = ts.advance(params, state, d, goal, qpos, qvel, **inputs)
+    _, effort, terms = advance(params, state, goal, qpos, qvel, d, **inputs)
     qacc, tool = accelerations(d, effort - 0.5)
     error = frames.pose_error(goal, d.pose)
     for part, most in ((error[:, :3], 0.1), (error[:, 3:], 0.5)):
@@ -77,86 +81,11 @@ def test_the_posture_does_not_move_the_tool():
         for decoupling in ("full", "partial", "none"):
             chosen = params._replace(decoupling=ts.osc_params.TASK_CHOICES["decoupling"][decoupling])
             state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
-            terms = ts.advance(chosen, state, d, goal, qpos, qvel, terms=True)[2]
+            terms = advance(chosen, state, goal, qpos, qvel, d, terms=True)[2]
             moved = moved_by(d, tree.chain(HAND), terms.posture)
             moved = moved if axes is None else moved[:, axes]
             assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
             assert np.abs(terms.posture).max() > 1
-
-
-def run(tree, link, params, qpos, goal, steps, change=lambda d, q: d, dt=DT):
-    """Return the errors of the pose (steps, envs, 6) and the efforts of a closed loop, exact but for its time step."""
-    q, v, state = qpos.copy(), np.zeros_like(qpos), ts.init(params, qpos)
-    errors, efforts = [], []
-    for n in range(steps):
-        d = ts.task_dynamics(tree, q, v, link)
-        target = goal(n) if callable(goal) else goal
-        _, effort = ts.advance(params, state, change(d, q), target, q, v)
-        errors.append(frames.pose_error(target, d.pose))
-        efforts.append(effort)
-        v = v + dt * accelerations(d, effort)[0]
-        q = q + dt * v
-    return np.array(errors), np.array(efforts)
-
-
-def test_moves_are_those_of_unit_masses_on_springs():
-    """10 cm under kp = 150 and damping ratio 1: e = e0 (1 + w t) exp(-w t). Each part of the law is needed."""
-    tree, steps = tree_of("panda"), 1000
-    rng = np.random.default_rng(0)
-    qpos = np.tile(START, (7, 1))
-    way = rng.normal(size=(7, 3))
-    way *= 0.1 / np.linalg.norm(way, axis=1, keepdims=True)
-    way[4:6] = way[3]
-    goal = ts.link_poses(tree, qpos, [HAND])[:, 0]
-    goal[:, :3] += way
-    tilt = frames.matrix_of(np.array([0.8, 0.0, 0.6, 0.0]))
-    goal[6, 3:] = frames.wxyz_of(frames.multiply(tilt, frames.matrix_of(goal[6, 3:])))
-
-    def change(d, q):  # env 4 without J' q', env 5 without Coriolis and centrifugal forces
-        rate, bias = d.jacobian_rate.copy(), d.bias.copy()
-        rate[4], bias[5] = 0.0, ts.gravity(tree, q[5])
-        return d._replace(jacobian_rate=rate, bias=bias)
-
-    params = ts.make_osc_params(tree, position_error_limit=np.inf, rotation_error_limit=np.inf)
-    errors, _ = run(tree, HAND, params, qpos, goal, steps, change)
-    w, t = np.sqrt(150), np.arange(steps)[:, None, None] * DT
-    share = (1 + w * t) * np.exp(-w * t)
-    off = np.abs(errors[..., :3] - share * way).max((0, 2))
-    assert off[[0, 1, 2, 3, 6]].max() < 0.25e-3
-    assert off[4] > 1e-3
-    assert off[5] > 1e-3
-    assert np.abs(errors[:, :4, 3:]).max() < 1e-4  # the others hold their rotation
-    turn = errors[0, 6, 3:]
-    assert np.linalg.norm(turn) > 1.2
-    # With the time step's own recursion, most of what is left goes, for rotations too.
-    e, rate, exact = 1.0, 0.0, np.empty((steps, 1))
-    for n in range(steps):
-        exact[n] = e
-        rate -= DT * (150 * e + 2 * w * rate)
-        e += DT * rate
-    np.testing.assert_allclose(errors[:, 6, 3:], exact * turn, atol=4e-4)
-    np.testing.assert_allclose(errors[:, :4, :3], exact[:, None] * way[:4], atol=1e-4)
-
-
-def test_a_straight_elbow_neither_chatters_nor_holds_the_tool():
-    """A setpoint leaves the reach of an arm of 2 m at 0.5 m/s, waits outside, and comes back."""
-    tree, link, dt = planar(), "tip", 1 / 250
-    qpos = np.array([[0.3, 0.8], [0.2, -0.9]])
-    params = ts.make_osc_params(tree, axes=[True, True, *[False] * 4])
-    back = ts.link_poses(tree, qpos, [link])[:, 0]
-    radius = np.linalg.norm(back[:, :2], axis=1, keepdims=True)
-
-    def goal(n):
-        out = np.interp(n, [0, 200, 375, 500], [0.0, 0.39, 0.39, 0.0])
-        pose = back.copy()
-        pose[:, :2] *= 1 + out / radius
-        return pose
-
-    errors, efforts = run(tree, link, params, qpos, goal, 700, dt=dt)
-    assert np.linalg.norm(errors[374, :, :2], axis=1).min() > 0.15  # straight, and too short
-    chatter = np.abs(np.diff(efforts[250:370], n=2, axis=0)).max()
-    assert chatter < 0.4  # N m per step; an inverse that truncates small eigenvalues makes tens
-    assert np.linalg.norm(errors[-1, :, :2], axis=1).max() < 3e-4
 
 
 @settings(max_examples=30)
@@ -169,7 +98,7 @@ def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
     d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
     limit = np.abs(d.bias).max() * tight * rng.uniform(0.5, 2, (rows, tree.dof))
     params = ts.make_osc_params(tree, effort_limit=limit)
-    _, effort, terms = ts.advance(params, state, d, goal, qpos, 0.1 * qvel, terms=True)
+    _, effort, terms = advance(params, state, goal, qpos, 0.1 * qvel, d, terms=True)
     chain = tree.chain(HAND)
     base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
     task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, effort, limit))
@@ -198,7 +127,9 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
 
         def efforts(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
-            return ts.step(params, part, tree, HAND, goal[chosen], qpos[chosen], qvel[chosen], terms=True)[1:]
+            return ts.step(
+                params, part, goal[chosen], qpos[chosen], qvel[chosen], DT, tree=tree, link=HAND, terms=True
+            )[1:]
 
         effort, terms = efforts(slice(None))
         bad = [2, 3, 5]
@@ -222,8 +153,8 @@ def test_a_selected_force_is_that_of_the_wrench():
     wrench, chain = np.array([0.0, 0.0, -20.0, 0.0, 0.0, 0.0]), tree.chain(HAND)
     for frame in ("world", "tool"):
         params = ts.make_osc_params(tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame)
-        inputs = params, ts.OSCState(qpos + 0.3 * chain), d, d.pose, qpos, 0 * qpos
-        _, _, terms = ts.advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
+        inputs = params, ts.OSCState(qpos + 0.3 * chain), d.pose, qpos, 0 * qpos, d
+        _, _, terms = advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
         np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)
         tool = moved_by(d, chain, terms.posture)
         turn = frames.matrix_of(d.pose[:, 3:])
@@ -239,7 +170,7 @@ def test_without_decoupling_gains_are_forces():
     d = ts.task_dynamics(tree, qpos, qvel, HAND)
     goal = d.pose.copy()
     goal[:, 0] += 0.05
-    effort = ts.step(params, ts.init(params, qpos), tree, HAND, goal, qpos, 0 * qvel)[1]
+    effort = ts.step(params, ts.init(params, qpos), goal, qpos, 0 * qvel, DT, tree=tree, link=HAND)[1]
     chain = tree.chain(HAND)
     wanted = ts.gravity(tree, qpos)[:, chain] + 20.0 * d.jacobian[:, 0, chain]
     np.testing.assert_allclose(effort[:, chain], wanted, atol=1e-9)
@@ -263,7 +194,7 @@ def test_jax_computes_the_same(x64):
     inputs = params, ts.init(params, qpos), goal, qpos, qvel
 
     def step(params, state, *rest):
-        return ts.step(params, state, tree, link, *rest)[1]
+        return ts.step(params, state, *rest, DT, tree=tree, link=link)[1]
 
     with jax.numpy_rank_promotion("allow"):
         found = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
@@ -285,7 +216,7 @@ def test_inputs_of_a_step_are_checked():
     ):
         inputs = {"params": params, "state": state, "tree": tree, "link": "tip", "setpoint": goal} | change
         with pytest.raises(InvalidArgumentError, match=message):
-            ts.step(**inputs, qpos=qpos, qvel=qpos)
+            ts.step(**inputs, qpos=qpos, qvel=qpos, dt=DT)
 
 
 @pytest.mark.parametrize(

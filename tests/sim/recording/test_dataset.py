@@ -37,6 +37,14 @@ def test_setpoints_under_control_by_effort_are_efforts(panda):
     assert data.setpoint.attrs["units"] == "N m|N"
 
 
+def test_the_pose_of_a_tool_has_a_dimension(panda):
+    with Runner(panda, 2, workers=0, control="osc", tool="panda_hand") as runner:
+        data = to_dataset(runner.rollout(np.broadcast_to(runner.command.neutral, (3, 7))))
+    assert data.tool_pose.dims == ("time", "env", "pose")
+    assert data.pose.values.tolist() == data.entry.values.tolist()
+    assert data.tool_pose.sel(pose="z").shape == (3, 2)
+
+
 def test_a_file_opens_as_a_dataset(tmp_path, rollout):
     data = open_dataset(write_recording(rollout, tmp_path / "run.npz"))
     np.testing.assert_array_equal(data.qpos, rollout.qpos)

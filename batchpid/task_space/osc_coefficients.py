@@ -1,0 +1,113 @@
+r"""Coefficients of operational-space control at one time step: with constant params, a loop computes them once.
+
+The law is that of :mod:`batchpid.task_space.operational_space`, with the error e of the pose, the twist v of the tool,
+the setpoint's twist V and acceleration V', and the integral I::
+
+    a = kp* e - kd* v + c* V + g* V' + I        I <- I + ki* dt e - ki2* V
+
+- "explicit": kp* = kp, kd* = c* = kd, g* = 1, ki* = ki and ki2* = 0. Decoupled axes are stable for w dt < 0.828 with
+  kp = w^2, kd = 2 w.
+- "implicit": the error, the twist and the integral are those at the end of the step, where V and V' are given. As for
+  joints (:mod:`batchpid.law.implicit`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
+
+      kp* = (kp + dt ki) / D      kd* = (kd + dt kp + dt^2 ki) / D      c* = kd / D      g* = 1 / D      ki* = ki / D
+
+  and ki2* = ki* dt^2. A pole s becomes 1 / (1 - s dt): decoupled axes are stable at any dt.
+
+The posture has the same law, without V and integral.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import namespace
+from batchpid.checks.validate import positive
+from batchpid.task_space.osc_params import OSCParams
+
+
+class OSCCoefficients(NamedTuple):
+    """:class:`OSCParams` at one dt; None is off."""
+
+    kp: Any
+    kd: Any
+    c: Any
+    acceleration_share: Any
+    """g* (1 | envs, 6)."""
+    ki_dt: Any
+    ki_dt2: Any
+    posture_kp: Any
+    posture_kd: Any
+    limit_kp: Any
+    limit_kd: Any
+    limit_margin: Any
+    limit_low: Any
+    """Positions (1 | envs, dof) from which joints are pushed back: limits less their margins."""
+    limit_high: Any
+    integral_limit: Any
+    position_error_limit: Any
+    rotation_error_limit: Any
+    smallest_eigenvalue: Any
+    axes: Any
+    force_axes: Any
+    effort_min: Any
+    effort_max: Any
+    decoupling: Any
+    frame: Any
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "axes")
+
+
+def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
+    """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.task_space.advance`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        dt is a Python number that is not positive and finite.
+    """
+    if isinstance(dt, int | float):
+        positive("dt", dt, "s")
+    xp = namespace(*params, dt)
+    kp, kd, ki = params.stiffness, params.damping, params.integral_gain
+    posture_kp, posture_kd = params.posture_stiffness, params.posture_damping
+    limit_kp, margin = params.limit_stiffness, params.limit_margin
+    limit_kd = None if limit_kp is None else 2 * xp.sqrt(limit_kp)
+    c, share, ki_dt2 = kd, xp.ones_like(kp), None
+    if params.discretization is not None:
+        stiffness = kp if ki is None else kp + dt * ki
+        share = 1 / (1 + dt * kd + dt * dt * stiffness)
+        c, kd, kp = kd * share, (kd + dt * stiffness) * share, stiffness * share
+        if ki is not None:
+            ki = ki * share
+            ki_dt2 = ki * dt * dt
+        posture_kp, posture_kd = _implicit(posture_kp, posture_kd, dt)
+        if limit_kp is not None:
+            limit_kp, limit_kd = _implicit(limit_kp, limit_kd, dt)
+    same = {name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields}
+    own = {
+        "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
+        "limit_low": None if margin is None else xp.where(margin > 0, params.lower + margin, -xp.inf),
+        "limit_high": None if margin is None else xp.where(margin > 0, params.upper - margin, xp.inf),
+    }
+    return OSCCoefficients(
+        **same | own,
+        kp=kp,
+        kd=kd,
+        c=c,
+        acceleration_share=share,
+        ki_dt=None if ki is None else ki * dt,
+        ki_dt2=ki_dt2,
+        posture_kp=posture_kp,
+        posture_kd=posture_kd,
+        limit_kp=limit_kp,
+        limit_kd=limit_kd,
+    )
+
+
+def _implicit(kp: Any, kd: Any, dt: Any) -> tuple[Any, Any]:
+    """Return kp* and kd* of a law without integral."""
+    share = 1 / (1 + dt * kd + dt * dt * kp)
+    return kp * share, (kd + dt * kp) * share

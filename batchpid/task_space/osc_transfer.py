@@ -1,0 +1,66 @@
+"""Bumpless transfer to operational-space control, from other control or from other gains."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from batchpid.arrays.elementwise import clip, namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.operational_space import in_frame, posture_acceleration
+from batchpid.task_space.osc_coefficients import discretise
+from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_state import OSCState, TaskDynamics
+from batchpid.task_space.projections import projections
+from batchpid.task_space.symmetric import product, quiet, solve
+
+
+def track(
+    params: OSCParams,
+    state: OSCState,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    effort: Any,
+    dt: Any,
+    dynamics: TaskDynamics,
+    *,
+    twist: Any = None,
+    acceleration: Any = None,
+    feedforward: Any = None,
+) -> OSCState:
+    """Return the state whose next step, on these same inputs, gives ``effort`` (envs, dof) [N m or N].
+
+    The effort is that of other control, such as a joint PID, or of other gains. It accelerates the joints of the model
+    by M^-1 (effort - h - feedforward): the integral makes up the part of the task, the posture that of the null space
+    and of the joints outside the chain. Under a load that the model does not know, this is the posture in which the
+    robot rests. Effort limits, the limit of the integral, joints without posture stiffness, axes that are not selected
+    and poses near a singularity leave a difference. The way back is :func:`batchpid.track` with the last effort.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The params have no integral, or partial decoupling.
+    """
+    if params.integral_gain is None:
+        problem = "is off, so no integral can carry the effort over"
+        raise InvalidArgumentError("params.integral_gain", problem, remedy="give integral_gain; 0 is allowed")
+    if isinstance(params.decoupling, PartialDecoupling):
+        problem = "'partial' has an inertia that does not move the tool by its acceleration"
+        raise InvalidArgumentError("params.decoupling", problem, remedy="use 'full' or 'none'")
+    k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
+    xp = namespace(*k, *dynamics, setpoint, qpos, qvel, effort)
+    with quiet():
+        known = bias if feedforward is None else bias + feedforward
+        qacc = solve(mass, (effort - known)[..., None])[..., 0]
+        stiff = k.posture_kp > 0
+        rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)
+        posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
+        task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
+        wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
+        if isinstance(k.decoupling, NoDecoupling):
+            wanted = projections(k._replace(decoupling=None), task.dynamics, wanted, 0 * qpos).force
+        near, tool_twist, given, given_rate = task.motion
+        integral = wanted - k.kp * near + k.kd * tool_twist
+        integral = integral if given is None else integral - k.c * given
+        integral = integral if given_rate is None else integral - k.acceleration_share * given_rate
+        return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

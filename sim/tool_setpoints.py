@@ -1,0 +1,99 @@
+"""Poses of a tool as the setpoints of joint control, by inverse kinematics."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid.task_space as ts
+from batchpid.arrays.read_only import read_only
+from batchpid.checks.validate import array, entries, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.command import POSE_UNITS, CommandSpec
+from batchpid.sim.osc_controller import tool_pose
+from batchpid.sim.robot.robot import Robot
+
+Float64 = NDArray[np.float64]
+
+
+class ToolSetpoints:
+    """Inverse kinematics for ``Runner(setpoint_space="tool")``: poses of ``link`` become joint positions.
+
+    A search starts at the last joint setpoints of its env, and stays near them: successive poses give continuous joint
+    positions. A pose that is not reached gives the nearest one that was found, and one
+    :class:`batchpid.task_space.InverseKinematicsWarning` per runner.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The link is unknown.
+    RobotError
+        The robot has no kinematic tree: see :meth:`Robot.kinematic_tree`.
+    """
+
+    def __init__(self, robot: Robot, link: str) -> None:
+        self._tree, self.link = robot.kinematic_tree(), link
+        self._others = np.flatnonzero(~self._tree.chain(link))
+        names, units = ([of[joint] for joint in self._others] for of in (robot.joint_names, robot.units))
+        self.command = CommandSpec((*POSE_UNITS, *names), (*POSE_UNITS.values(), *units))
+        """Names and units of a setpoint: the pose, and the positions of joints outside the chain to the link."""
+        self._has_warned = False
+
+    def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
+        """Return the poses of the link (..., 7) at ``qpos`` (..., dof)."""
+        return tool_pose(self._tree, self.link, None, qpos)
+
+    def joints(
+        self, name: str, setpoint: Any, last: Float64, finite: bool, ticks: int | None, stacklevel: int
+    ) -> Float64:
+        """Return joint setpoints (envs, dof), or (ticks, envs, dof), for poses after ``last`` (envs, dof).
+
+        Setpoints have 7 entries, or those of :attr:`command`; without them the other joints keep their setpoint. A
+        quaternion is normalised. If invalid numbers are allowed (not ``finite``), they make their env's setpoint NaN.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A shape is wrong, or a number is not finite, or a quaternion has the length 0.
+        """
+        given = read_array(name, setpoint)
+        names = self.command.names[: 7 if given.shape[-1:] == (7,) else None]
+        if ticks is not None and given.ndim == 2:
+            given = given[:, None]
+        lead = (len(last),) if ticks is None else (ticks, len(last))
+        rows = array(name, given, (*lead, len(names)), names, finite=finite, kind="entry").astype(np.float64)
+        rows = rows.reshape(-1, len(last), len(names))
+        length = np.linalg.norm(rows[..., 3:7], axis=-1, keepdims=True)
+        if finite:
+            for part in length:
+                entries(
+                    name, part, part > 0, "has a quaternion of length 0", ["qw"], kind="entry", remedy="give w, x, y, z"
+                )
+        found = np.empty((*rows.shape[:2], last.shape[1]))
+        for tick, poses in enumerate(rows):
+            good = np.isfinite(poses).all(1) & (length[tick, :, 0] > 0)
+            found[tick] = np.nan
+            start = last.copy()
+            start[:, self._others[: len(names) - 7]] = np.where(good[:, None], poses[:, 7:], 0.0)
+            unit = poses[good, :7] / np.where(np.arange(7) < 3, 1.0, length[tick, good])
+            if good.any():
+                solved = ts.inverse_kinematics(self._tree, self.link, unit, start[good], starts=1, on_failure="return")
+                found[tick, good] = solved.qpos
+                self._warn(name, np.flatnonzero(good)[~solved.success], solved, stacklevel + 1)
+            last = np.where(good[:, None], found[tick], last)
+        return read_only(found.reshape(*lead, -1))
+
+    def _warn(self, name: str, failed: Any, found: ts.IKResult, stacklevel: int) -> None:
+        """Warn of the first env whose pose was not reached, once."""
+        if not len(failed) or self._has_warned:
+            return
+        self._has_warned, row = True, int(np.flatnonzero(~found.success)[0])
+        problem = (
+            f"is a pose that was not reached: {found.position_error[row] * 1e3:.3g} mm and "
+            f"{found.rotation_error[row] * 1e3:.3g} mrad are left; the nearest pose is used, without further warning"
+        )
+        error = InvalidArgumentError(name, problem, env=int(failed[0]), remedy="keep setpoints within reach")
+        warnings.warn(str(error), ts.InverseKinematicsWarning, stacklevel=stacklevel + 1)

@@ -1,0 +1,242 @@
+"""Integral, limits of joints, implicit gains, bumpless transfer and presets of operational-space control."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import jax
+import numpy as np
+import pytest
+from quick_jit import quick_jit
+from trees import TOOLS, planar, states, tree_of
+
+import batchpid as bp
+import batchpid.task_space as ts
+from batchpid.errors import InvalidArgumentError
+from batchpid.native.availability import SWITCH
+from batchpid.task_space import frames
+
+START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
+HAND = TOOLS["panda"]
+
+
+def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias=None):
+    """Return the errors of the pose (steps, envs, 6), the last state, positions and velocities of a closed loop.
+
+    ``load`` (envs, 6) is a wrench on the tool that the law does not know.
+    """
+    k, q, v, errors = ts.discretise(params, dt), qpos.copy(), np.zeros_like(qpos), []
+    state = ts.init(params, qpos) if state is None else state
+    for _ in range(steps):
+        d = ts.task_dynamics(tree, q, v, link)
+        state, effort = ts.advance(k, state, goal, q, v, d)
+        errors.append(frames.pose_error(goal, d.pose))
+        outside = (d.jacobian * np.broadcast_to(load, (len(q), 6))[..., None]).sum(1)
+        v = v + dt * np.linalg.solve(d.mass_matrix, (effort - d.bias + outside)[..., None])[..., 0]
+        q = q + dt * v
+    return np.array(errors), state, q, v
+
+
+def test_an_integral_learns_a_load_that_the_model_does_not_know():
+    tree, qpos = tree_of("panda"), np.tile(START, (2, 1))
+    goal, load = ts.link_poses(tree, qpos, [HAND])[:, 0], np.array([0, 0, -20.0, 0, 1.0, 0])
+    gains = {"stiffness": 400.0, "posture_stiffness": 40.0}
+    without, *_ = run(tree, HAND, ts.make_osc_params(tree, **gains), qpos, goal, 800, 1 / 500, load=load)
+    assert np.abs(without[-1, :, 2]).min() > 5e-3
+    for extra in ({}, {"discretization": "implicit", "frame": "tool"}):
+        params = ts.make_osc_params(tree, integral_gain=2000.0, **gains, **extra)
+        found, state, *_ = run(tree, HAND, params, qpos, goal, 800, 1 / 500, load=load)
+        assert np.abs(found[-1]).max() < 1e-4
+        assert np.abs(state.integral).max() > 1
+    small = ts.make_osc_params(tree, integral_gain=2000.0, integral_limit=0.5, **gains)
+    _, state, *_ = run(tree, HAND, small, qpos, goal, 200, 1 / 500, load=load)
+    assert np.abs(state.integral).max() == 0.5
+
+
+def test_the_integral_does_not_wind_up():
+    """It does not grow while efforts are at their limits or the pose is out of reach, and shrinks at once."""
+    tree = planar()
+    qpos = np.array([[0.3, 0.8]] * 2)
+    params = ts.make_osc_params(
+        tree, axes=[True, True, *[False] * 4], integral_gain=500.0, effort_limit=[[0.05], [1e3]] * np.ones((2, 2))
+    )
+    near = ts.link_poses(tree, qpos, ["tip"])[:, 0]
+    far = np.add(near, [3.0, 0, 0, 0, 0, 0, 0])
+    k, held = ts.discretise(params, 1e-3), ts.init(params, qpos)
+    d = ts.task_dynamics(tree, qpos, 0 * qpos, "tip")
+    for _ in range(3):
+        held, _ = ts.advance(k, held, far, qpos, 0 * qpos, d)
+    np.testing.assert_array_equal(held.integral[0], 0.0)
+    assert held.integral[1, 0] > 0.1
+    back = held._replace(integral=np.full((2, 6), 5.0))
+    free, _ = ts.advance(k, back, near - [0.01, 0, 0, 0, 0, 0, 0], qpos, 0 * qpos, d)
+    assert (free.integral[:, 0] < 5.0).all()
+    straight = np.array([[0.3, 1e-3]] * 2)
+    d = ts.task_dynamics(tree, straight, 0 * straight, "tip")
+    state, _ = ts.advance(k, ts.init(params, straight), far, straight, 0 * straight, d)
+    np.testing.assert_array_equal(state.integral, 0.0)
+
+
+def test_joints_keep_away_from_their_limits_within_the_null_space():
+    tree = tree_of("panda")
+    qpos = np.tile(START, (1, 1))
+    qpos[:, 5] = tree.lower[5] + 0.02
+    goal = ts.link_poses(tree, qpos, [HAND])[:, 0]
+    options = {"axes": [True] * 3 + [False] * 3, "posture_stiffness": 4.0}
+    ends = {}
+    for margin in (None, 0.0, 0.3):
+        params = ts.make_osc_params(tree, limit_margin=margin, **options)
+        errors, _, ends[margin], _ = run(tree, HAND, params, qpos, goal, 800, 1 / 500)
+        assert np.abs(errors[..., :3]).max() < 1e-3
+    assert abs(ends[None][0, 5] - qpos[0, 5]) < 1e-3
+    np.testing.assert_array_equal(ends[None], ends[0.0])
+    assert 0.2 < ends[0.3][0, 5] - tree.lower[5] < 0.35
+    fingers = ~tree.chain(HAND)
+    np.testing.assert_allclose(ends[0.3][:, fingers], qpos[:, fingers], atol=1e-6)  # of the setpoint, not of the chain
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize("w", [30.0, 100.0])
+def test_implicit_gains_are_stable_at_100_hz(name, w):
+    """Explicit gains are stable for w dt < 0.828."""
+    tree, link = tree_of(name), TOOLS[name]
+    qpos = np.array([START[: tree.dof]]) if name == "panda" else states(tree, 1, 4)[0] * 0.5
+    goal = ts.link_poses(tree, qpos, [link])[:, 0] + [0.02, 0, -0.02, 0, 0, 0, 0]
+    ends = {}
+    for how in ("explicit", "implicit"):
+        params = ts.make_osc_params(
+            tree, stiffness=w * w, posture_stiffness=100.0, discretization=how, smallest_eigenvalue=1e-3
+        )
+        with np.errstate(all="ignore"):
+            ends[how] = np.abs(run(tree, link, params, qpos, goal, 150, 1 / 100)[0][-1]).max()
+    assert ends["implicit"] < 1e-3
+    assert (ends["explicit"] < 1e-3) == (w / 100 < 0.828)
+
+
+def test_implicit_gains_act_on_the_end_of_the_step():
+    """One decoupled axis: a = kp (r+ - y+) + kd (V+ - v+) + V' + I+, with y+ and v+ at the end of the step."""
+    tree, dt, rng = tree_of("panda"), 0.02, np.random.default_rng(0)
+    qpos, qvel = states(tree, 5)
+    kp, kd, ki = 300.0, 30.0, 900.0
+    options = {"position_error_limit": np.inf, "rotation_error_limit": np.inf, "smallest_eigenvalue": 1e-9}
+    params = ts.make_osc_params(tree, stiffness=kp, damping=kd, integral_gain=ki, discretization="implicit", **options)
+    d = ts.task_dynamics(tree, qpos, qvel, HAND)
+    goal, twist, acc = d.pose.copy(), *rng.normal(size=(2, 5, 6))
+    goal[:, :3] += 0.05 * rng.normal(size=(5, 3))
+    state = ts.init(params, qpos)._replace(integral=rng.normal(size=(5, 6)))
+    k = ts.discretise(params, dt)
+    new, effort = ts.advance(k, state, goal, qpos, qvel, d, twist, acc)
+    qacc = np.linalg.solve(d.mass_matrix, (effort - d.bias)[..., None])[..., 0]
+    a = (d.jacobian * qacc[:, None]).sum(-1) + d.jacobian_rate
+    e, v = frames.pose_error(goal, d.pose), (d.jacobian * qvel[:, None]).sum(-1)
+    share = 1 + dt * kd + dt**2 * kp + dt**3 * ki
+    end = e - dt * v - dt**2 * a
+    wanted = kp * end + kd * (twist - v - dt * a) + acc + share * state.integral + ki * dt * end
+    np.testing.assert_allclose(a, wanted, rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(share * (new.integral - state.integral), ki * dt * (e - dt * twist), atol=1e-9)
+
+
+@pytest.mark.parametrize("how", ["explicit", "implicit"])
+@pytest.mark.parametrize("decoupling", ["full", "none"])
+def test_transfer_from_a_joint_pid_and_back_is_bumpless(how, decoupling):
+    if (how, decoupling) == ("implicit", "none"):
+        pytest.skip("refused: test_options_are_checked")
+    tree, rows, dt = tree_of("panda"), 6, 1e-3
+    qpos, qvel = states(tree, rows, 2)
+    d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
+    pid = bp.make_params(tree.dof, 400.0, 50.0, 40.0)
+    state, effort = bp.step(
+        pid, bp.init(pid, qpos), qpos + 0.1, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias
+    )
+    options = {"damping": 30.0, "discretization": how, "decoupling": decoupling, "smallest_eigenvalue": 1e-6}
+    params = ts.make_osc_params(tree, integral_gain=0.0, **options)
+    inputs = np.add(d.pose, [0.03, 0, 0, 0, 0, 0, 0]), qpos, 0.1 * qvel
+    twist = np.full((rows, 6), 0.1)
+    found = ts.track(params, ts.init(params, qpos), *inputs, effort, dt, d, twist=twist)
+    after, again = ts.advance(ts.discretise(params, dt), found, *inputs, d, twist)
+    np.testing.assert_allclose(again, effort, atol=1e-6)
+    joint = bp.track(pid, state, qpos, qpos, again, measurement_rate=0.1 * qvel, feedforward=d.bias)
+    _, back = bp.step(pid, joint, qpos, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias)
+    np.testing.assert_allclose(back, again, atol=1e-9)
+    stiffer = params._replace(stiffness=2 * params.stiffness, posture_stiffness=3 * params.posture_stiffness)
+    found = ts.track(stiffer, after, *inputs, again, dt, d)
+    np.testing.assert_allclose(ts.advance(ts.discretise(stiffer, dt), found, *inputs, d)[1], again, atol=1e-6)
+
+
+def test_native_numpy_and_jax_compute_the_same(x64):
+    tree, rows, dt = planar((1.0, 0.8, 0.5)), 5, 1 / 300
+    qpos, qvel = states(tree, rows)
+    qpos[0, 0] = 2.99
+    tree = ts.KinematicTree(**{**vars_of(tree), "lower": -3.0, "upper": 3.0})
+    goal = ts.link_poses(tree, qpos + 0.1, ["tip"])[:, 0]
+    for how in ("explicit", "implicit"):
+        params = ts.make_osc_params(
+            tree,
+            axes=[True, True, *[False] * 4],
+            integral_gain=[300.0] * 6,
+            integral_limit=0.2,
+            limit_margin=0.5,
+            effort_limit=30.0,
+            discretization=how,
+        )
+        state = ts.init(params, qpos)._replace(integral=np.full((rows, 6), 0.1))
+        twist = np.full((rows, 6), 0.2)
+
+        def step(params, state, *rest, twist=twist):
+            return ts.step(params, state, *rest, dt, tree=tree, link="tip", twist=twist)
+
+        inputs = params, state, goal, qpos, qvel
+        native = step(*inputs)
+        with mock.patch.dict("os.environ", {SWITCH: "0"}):
+            plain = step(*inputs)
+        with jax.numpy_rank_promotion("allow"):
+            traced = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
+        for found in (plain, traced):
+            np.testing.assert_allclose(found[1], native[1], atol=1e-9)
+            np.testing.assert_allclose(found[0].integral, native[0].integral, atol=1e-9)
+        alone = step(
+            params, ts.OSCState(*[leaf[2:3] for leaf in state]), *[x[2:3] for x in inputs[2:]], twist=twist[2:3]
+        )
+        np.testing.assert_array_equal(alone[1], native[1][2:3])
+        np.testing.assert_array_equal(alone[0].integral, native[0].integral[2:3])
+
+
+def vars_of(tree):
+    return {name: getattr(tree, name) for name in tree.__dataclass_fields__ if name != "_"}
+
+
+def test_presets_are_params():
+    tree = tree_of("panda")
+    robosuite = ts.presets.robosuite(tree, effort_limit=80.0)
+    assert (robosuite.stiffness == 150).all()
+    assert robosuite.decoupling == ts.osc_params.PartialDecoupling()
+    assert (robosuite.effort_max == 80).all()
+    isaac = ts.presets.isaac_lab(tree)
+    qpos, qvel = states(tree, 3)
+    d = ts.task_dynamics(tree, qpos, qvel, HAND)._replace(bias=np.zeros_like(qpos))
+    goal = np.add(d.pose, [0.01, 0, 0, 0, 0, 0, 0])
+    _, effort = ts.advance(ts.discretise(isaac, 0.01), ts.init(isaac, qpos), goal, qpos, qvel, d)
+    wrench = 100 * frames.pose_error(goal, d.pose) - 20 * (d.jacobian * qvel[:, None]).sum(-1)
+    chain = tree.chain(HAND)
+    np.testing.assert_allclose(effort[:, chain], (d.jacobian * wrench[..., None]).sum(1)[:, chain], atol=1e-9)
+
+
+def test_options_are_checked():
+    tree = planar()
+    for options, message in (
+        ({"integral_gain": -1.0}, "integral_gain, .* 'x'"),
+        ({"integral_gain": 1.0, "integral_limit": np.nan}, "integral_limit"),
+        ({"limit_margin": -0.1}, "limit_margin"),
+        ({"discretization": "tustin"}, "discretization: unknown option"),
+        ({"discretization": "implicit", "decoupling": "none", "damping": 1.0}, "discretization: 'implicit' needs"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            ts.make_osc_params(tree, **options)
+    params, q = ts.make_osc_params(tree), np.ones((1, 2))
+    with pytest.raises(InvalidArgumentError, match="dt"):
+        ts.discretise(params, 0.0)
+    d = ts.task_dynamics(tree, q, q, "tip")
+    for changed, message in ((params, "integral_gain: is off"), (None, "partial")):
+        changed = changed or ts.make_osc_params(tree, decoupling="partial", integral_gain=1.0)
+        with pytest.raises(InvalidArgumentError, match=message):
+            ts.track(changed, ts.init(changed, q), d.pose, q, q, q, 0.01, d)
