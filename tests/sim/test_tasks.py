@@ -404,7 +404,8 @@ class Closing:
 
 
 def test_without_stable_baselines3_the_error_names_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    for name in ("stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "batchpid.sim.gym.stable_baselines3", raising=False)
     with pytest.raises(MissingDependencyError, match=r"stable-baselines3.*pip install 'batchpid\[sb3\]'"):
         importlib.import_module("batchpid.sim.gym.stable_baselines3")
