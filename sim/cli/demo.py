@@ -46,7 +46,8 @@ class DemoCommand:
         from batchpid.sim.cli.run import hold_setpoint, start_poses
 
         if self.viewer:
-            from batchpid.sim.view.film import check_renderer, show_window
+            from batchpid.sim.view.film import show_window
+            from batchpid.sim.view.renderer import check_renderer
 
             check_renderer()
         robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)

@@ -23,6 +23,7 @@ def chosen(command: Any, names: str) -> dict[str, Any]:
 
 
 OptionalPath = Annotated[Path | None, _flag()]
+OptionalName = Annotated[str | None, _flag(metavar="NAME")]
 OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT ...]")]
 Switch = Annotated[bool, _flag()]
 Force = Annotated[bool, _flag("Replace output files that exist.")]

@@ -32,8 +32,10 @@ class ViewCommand:
     robot: flags.RecordedRobot = None
     num_envs: int = 16
     """Number of robots in each group; 64 in all at most."""
-    control: tuple[Literal["pid", "drive"], ...] = ("pid",)
-    """Batch PID, PhysX's internal drive, or both side by side."""
+    control: tuple[Literal["pid", "drive", "osc"], ...] = ("pid",)
+    """Batch PID, PhysX's internal drive, or both side by side; or operational-space control, to drag a tool."""
+    tool: flags.OptionalName = None
+    """With --control osc: link of the tool. Default: the last link of the robot's longest chain."""
     gains: flags.Gains = None
     compensate: flags.Compensate = "gravity+coriolis+friction"
     engine: flags.Engine = "sapien"
@@ -80,6 +82,8 @@ class ViewCommand:
 
         robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes, actuators=self.actuators)
         gains = None if self.gains is None else gain_set(robot, self.gains)
+        if gains and "osc" in self.control:
+            raise InvalidArgumentError("gains", "are not for control 'osc'", value=self.gains, remedy="leave it out")
         if gains and gains.control != "pid":
             raise InvalidArgumentError(
                 "gains", "must be gains of a PID", value=self.gains, remedy="use --control drive"
@@ -88,11 +92,12 @@ class ViewCommand:
             robot,
             self.num_envs,
             controls=self.control,
+            tool=self.tool,
             period=1 / self.fps,
             **flags.chosen(self, "compensate engine physics workers"),
             params=gains and gains.params,
         )
-        if robot.settings is not None:
+        if robot.settings is not None and live.command is None:
             live.set_setpoint(robot.settings.target)
         return live
 

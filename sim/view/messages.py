@@ -59,7 +59,37 @@ class _ViewerCameraMessage(_Message, tag="ViewerCameraMessage"):
     up_direction: _Vector
 
 
-_DECODER = msgspec.msgpack.Decoder(_GuiUpdateMessage | _SceneNodeClickMessage | _ViewerCameraMessage)
+class _TransformControlsDragStartMessage(_Message, tag="TransformControlsDragStartMessage"):
+    """Frame at the tool that the pointer takes."""
+
+    name: _Text
+    owner: _Text = ""
+
+
+class _TransformControlsUpdateMessage(_Message, tag="TransformControlsUpdateMessage"):
+    """Frame at the tool that was dragged."""
+
+    name: _Text
+    wxyz: tuple[_Number, _Number, _Number, _Number]
+    position: _Vector
+    owner: _Text = ""
+
+
+class _TransformControlsDragEndMessage(_Message, tag="TransformControlsDragEndMessage"):
+    """Frame at the tool that the pointer leaves."""
+
+    name: _Text
+    owner: _Text = ""
+
+
+_DECODER = msgspec.msgpack.Decoder(
+    _GuiUpdateMessage
+    | _SceneNodeClickMessage
+    | _ViewerCameraMessage
+    | _TransformControlsDragStartMessage
+    | _TransformControlsUpdateMessage
+    | _TransformControlsDragEndMessage
+)
 
 
 def check_message(data: bytes | str) -> None:

@@ -17,8 +17,10 @@ from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.view.charts import Charts
 from batchpid.sim.view.data import ViewData
+from batchpid.sim.view.gizmo import TargetGizmo
 from batchpid.sim.view.panel import Panel
 from batchpid.sim.view.scene import RobotScene
+from batchpid.sim.view.simulation import LiveSimulation
 
 CHARTS_EVERY = 5
 """Frames between two updates of the charts."""
@@ -67,6 +69,12 @@ class View(SingleOwner, AbstractContextManager["View"]):
         """Sentences on meshes that cannot be read, which the page shows as well."""
         self.panel = Panel(self._server, data, self._problems.append, self.findings)
         self._scene.on_click(self.panel.select)
+        self._gizmo: TargetGizmo | None = None
+        if isinstance(data, LiveSimulation) and data.command is not None:
+            layout, panel = self._scene.layout, self.panel
+            self._gizmo = TargetGizmo(
+                self._server, data, layout.positions, layout.reach, panel.requests.put, lambda: panel.only_watched
+            )
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         charts = gui.add_panel()
@@ -143,6 +151,8 @@ class View(SingleOwner, AbstractContextManager["View"]):
         self._shown, self._settled = shown, settled
         if not settled:
             self._scene.update(frame, panel.env, panel.show_setpoint)
+        if self._gizmo is not None:
+            self._gizmo.update(panel.env)
         if settling or (not settled and count % CHARTS_EVERY == 0):
             self._charts.update(panel.env, panel.joint)
         if settling or (not settled and count % STATUS_EVERY == 0):

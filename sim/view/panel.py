@@ -39,7 +39,10 @@ class Panel:
         self, server: Any, data: ViewData, refuse: Callable[[str], object], findings: Sequence[str] = ()
     ) -> None:
         self._gui, self._data = server.gui, data
-        self._requests = Requests(refuse)
+        self.requests = Requests(refuse)
+        """Requests of the page, which are carried out between two frames."""
+        self.only_watched = True
+        """True if a target is that of the watched robot alone."""
         self.frames_left = math.inf
         """Frames to run before the next pause."""
         self._names = short_names(data.robot)
@@ -68,6 +71,8 @@ class Panel:
         if isinstance(data, LiveSimulation):
             tabs = gui.add_tab_group()
             adders = {"Setpoint": self._add_setpoints, "Gains": self._add_gains, "Disturb": self._add_disturbances}
+            if data.command is not None:
+                adders = {"Target": self._add_target, "Disturb": self._add_disturbances}
             for title, add in adders.items():
                 with tabs.add_tab(title):
                     add(data)
@@ -97,13 +102,13 @@ class Panel:
         try:
             robot = integer("robot", robot, 0, len(self._data.groups) * self._data.per_group - 1)
         except InvalidArgumentError as error:
-            self._requests.refuse(str(error))
+            self.requests.refuse(str(error))
         else:
-            self._requests.put(partial(self._robot.change, robot % self._data.per_group))
+            self.requests.put(partial(self._robot.change, robot % self._data.per_group))
 
     def run_requests(self) -> None:
         """Carry out the requests of the page since the last call."""
-        self._requests.run()
+        self.requests.run()
 
     def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
         """Show time, real-time factor, frame rate, and the robots that diverged or saturate."""
@@ -125,7 +130,7 @@ class Panel:
             self._entries.content = f'<p style="{_ENTRY_STYLE}">{html.escape(f"setpoint: {numbers}")}</p>'
 
     def _control(self, handle: Any) -> Control:
-        return Control(handle, self._requests)
+        return Control(handle, self.requests)
 
     def _control_motion(self, button: str) -> None:
         if button == "Reset":
@@ -166,6 +171,14 @@ class Panel:
             slider = gui.add_slider(f"{name} [{joint.unit}]", low, high, min(_slider_step(high - low), 0.01), value)
             sliders[index] = self._control(slider).on_change(partial(move, index))
         self._robot.on_change(update)
+
+    def _add_target(self, live: LiveSimulation) -> None:
+        gui = self._gui
+        gui.add_markdown("Drag the frame at the tool: arrows move, arcs turn its target.")
+        watched_only = self._control(gui.add_checkbox("Watched robot only", True))
+        watched_only.on_change(partial(setattr, self, "only_watched"))
+        back = self._control(gui.add_button_group("Go to", ("start",)))
+        back.on_change(lambda _: live.set_target(live.neutral, env=self.env if self.only_watched else None))
 
     def _add_gains(self, live: LiveSimulation) -> None:
         gui = self._gui

@@ -39,8 +39,8 @@ class RobotScene:
 
     def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:
         self._server, self._kinematics = server, Kinematics(robot)
-        self._layout = arrange_robots(self._kinematics, robot, len(groups), per_group, ground)
-        count = len(self._layout.positions)
+        self.layout = arrange_robots(self._kinematics, robot, len(groups), per_group, ground)
+        count = len(self.layout.positions)
         self.findings: list[Finding] = []
         """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at all."""
         self._robots: list[Any] = []
@@ -63,7 +63,7 @@ class RobotScene:
 
     def update(self, frame: Rollout, selected: int, show_setpoint: bool) -> None:
         """Place every robot, the ring under the selected one, and its setpoint if that is shown and is a pose."""
-        positions, ok = self._layout.positions, frame.ok[0]
+        positions, ok = self.layout.positions, frame.ok[0]
         with self._server.atomic():
             self._place(self._robots, self._kinematics.poses(frame.qpos[0]), positions)
             if (ok != self._ok).any():
@@ -74,7 +74,7 @@ class RobotScene:
             show_setpoint = show_setpoint and frame.info.sets_positions
             if (shown := (selected, show_setpoint, setpoint.tobytes())) != self._shown_setpoint:
                 self._shown_setpoint = shown
-                self._ring.position = (*positions[selected][:2], self._layout.floor + 0.004)
+                self._ring.position = (*positions[selected][:2], self.layout.floor + 0.004)
                 for node in self._setpoints:
                     node.visible = show_setpoint
                 if show_setpoint:
@@ -111,7 +111,7 @@ class RobotScene:
         """Add floor, lights, the ring under the selected robot, labels of the groups, and set the camera."""
         import trimesh  # installed with viser
 
-        scene, layout = self._server.scene, self._layout
+        scene, layout = self._server.scene, self.layout
         scene.set_up_direction("+z")
         # Where a browser draws in software, the environment map costs more than all robots.
         scene.configure_environment_map(None)

@@ -8,16 +8,18 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import choice, integer, number
+from batchpid.checks.validate import array, choice, integer, number
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -28,7 +30,9 @@ from batchpid.sim.view.playback import HISTORY_SECONDS
 
 Float64 = NDArray[np.float64]
 
-CONTROLS: tuple[ControlMode, ...] = ("pid", "drive")
+CONTROLS = ("pid", "drive", "osc")
+MAX_DISTANCE = 10.0
+"""Largest distance of a target from the robot's base along an axis [m]."""
 PUSH_SECONDS = 0.25
 """Duration of a push [s]."""
 GRAVITY = 9.81
@@ -41,7 +45,9 @@ class LiveSimulation(SingleOwner):
     Parameters
     ----------
     controls
-        ``"pid"``, ``"drive"``, or both.
+        ``"pid"``, ``"drive"``, or both; or ``"osc"``, whose setpoints are poses of the link ``tool`` (7,).
+    tool
+        Link that control "osc" moves; default the last link of the robot's longest chain.
     period
         Simulated time between frames [s], rounded to whole sim steps.
     spread
@@ -64,7 +70,8 @@ class LiveSimulation(SingleOwner):
         robot: Robot,
         num_envs: int,
         *,
-        controls: tuple[ControlMode, ...] = ("pid",),
+        controls: tuple[ControlMode | Literal["osc"], ...] = ("pid",),
+        tool: str | None = None,
         period: float = 1 / 30,
         spread: float = 0.2,
         seed: int = 0,
@@ -73,7 +80,9 @@ class LiveSimulation(SingleOwner):
         **options: Any,
     ) -> None:
         self.robot = robot
-        self.groups = tuple(dict.fromkeys(choice("controls", control, CONTROLS) for control in controls))
+        self.groups: tuple[Any, ...] = tuple(
+            dict.fromkeys(choice("controls", control, CONTROLS) for control in controls)
+        )
         groups = integer("controls", len(self.groups), 1, len(CONTROLS))
         self.per_group = integer("num_envs", num_envs, 1, MAX_ROBOTS // groups)
         timestep = options.get("timestep", RunnerOptions.timestep)
@@ -82,12 +91,20 @@ class LiveSimulation(SingleOwner):
         self.kinematics = Kinematics(robot)
         self._random = np.random.default_rng(seed)
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
-        self.start = np.clip(robot.start + offsets, robot.lower, robot.upper)
+        osc = self._operational_space(tool)
+        home = robot.start if osc is None else self._home()
+        self.start = np.clip(home + offsets, robot.lower, robot.upper)
         """Joint positions at the beginning (envs, dof) [rad or m]."""
-        self.gains = {control: GroupGains(robot, offered_gains(robot, control, params)) for control in self.groups}
-        """Gains of each group, by control."""
-        self.setpoint = np.tile(robot.start, (self.per_group, 1))
-        """Setpoints of the robots of each group (envs, dof) [rad or m]."""
+        self.gains = {}
+        """Gains of each group, by control; none of control "osc"."""
+        if osc is None:
+            self.gains = {each: GroupGains(robot, offered_gains(robot, each, params)) for each in self.groups}
+        self.command = None if osc is None else osc.command
+        """Entries of a setpoint, if these are not joints: a pose of the tool."""
+        self.neutral = robot.start if osc is None else np.array(osc.command.neutral)
+        """Setpoint at the start (dof,) [rad or m], or (7,)."""
+        self.setpoint = np.tile(self.neutral, (self.per_group, 1))
+        """Setpoints of the robots of each group (envs, dof) [rad or m], or (envs, 7)."""
         self.payload = 0.0
         """Mass at the load link, a weight without inertia [kg]."""
         self.load_link = self.kinematics.tool
@@ -99,14 +116,15 @@ class LiveSimulation(SingleOwner):
         options = dict(substeps=substeps, workers=0 if cores == 0 else max(1, cores // groups), **options)
         with ExitStack() as stack:
             self._pool = stack.enter_context(ThreadPoolExecutor(groups))
+            own: list[Any] = [{"control": each, "params": gains.params} for each, gains in self.gains.items()]
             self._runners = [
-                stack.enter_context(Runner(robot, self.per_group, params=gains.params, control=control, **options))
-                for control, gains in self.gains.items()
+                stack.enter_context(Runner(robot, self.per_group, **each, **options))
+                for each in own or [{"control": osc}]
             ]
             self._resources = stack.pop_all()
         self.ground = self._runners[0].options.ground
         """True if the scenes have a ground at height 0."""
-        self._info = robot.run_info(ground=self.ground)
+        self._info = robot.run_info(ground=self.ground, own_command=self.command)
         self.reset()
 
     def reset(self) -> None:
@@ -121,6 +139,26 @@ class LiveSimulation(SingleOwner):
         """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env of each group or all."""
         self.setpoint[slice(None) if env is None else env, slice(None) if joint is None else joint] = position
         self.setpoint = self.robot.coupled(self.setpoint)
+
+    def set_target(self, pose: ArrayLike, *, env: int | None = None) -> None:
+        """Set the setpoint of one env, or all, under control "osc": position [m] and quaternion (w, x, y, z) (7,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            There is no tool, the target is farther than :data:`MAX_DISTANCE`, or its quaternion has length 0.
+        """
+        if self.command is None:
+            raise InvalidArgumentError("pose", "is for control 'osc'", remedy="use set_setpoint")
+        target = array("pose", pose, (1, 7), self.command.names, kind="entry")[0]
+        if np.abs(target[:3]).max() > MAX_DISTANCE:
+            problem, remedy = "is out of reach", f"stay within {MAX_DISTANCE:g} m of the robot"
+            raise InvalidArgumentError("pose", problem, value=target[:3].tolist(), remedy=remedy)
+        if not 1e-3 < np.abs(target[3:]).max() < 1e3:
+            raise InvalidArgumentError(
+                "pose", "has no orientation", value=target[3:].tolist(), remedy="give a quaternion of length 1"
+            )
+        self.setpoint[slice(None) if env is None else env] = target
 
     def randomize_setpoints(self) -> None:
         """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start pose."""
@@ -146,6 +184,8 @@ class LiveSimulation(SingleOwner):
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits of a joint [N m or N]."""
+        if not self.gains:
+            return -float(self.robot.effort_limit[joint]), float(self.robot.effort_limit[joint])
         values = self.gains[self.groups[robot // self.per_group]].values
         return float(values["effort_min"][joint]), float(values["effort_max"][joint])
 
@@ -161,11 +201,12 @@ class LiveSimulation(SingleOwner):
         """Close the runners."""
         self._resources.close()
 
-    def _step(self, control: ControlMode, runner: Runner, disturbance: Float64) -> None:
-        gains, loaded = self.gains[control], bool(disturbance.any())
-        params = gains.params_under(disturbance) if loaded and control == "pid" else gains.params
-        if runner.params is not params:
-            runner.params = params
+    def _step(self, control: str, runner: Runner, disturbance: Float64) -> None:
+        loaded = bool(disturbance.any())
+        if (gains := self.gains.get(control)) is not None:
+            params = gains.params_under(disturbance) if loaded and control == "pid" else gains.params
+            if runner.params is not params:
+                runner.params = params
         runner.step(self.setpoint, feedforward=disturbance if loaded else None)
 
     def _disturbance(self) -> Float64:
@@ -190,6 +231,23 @@ class LiveSimulation(SingleOwner):
         row = observation.map(lambda array: array[None])
         self._frames.append(Rollout(np.array([self.time]), self._setpoints(), row, self.period, self._info))
 
+    def _home(self) -> Float64:
+        """Return the pose around which robots start under control "osc", where the tool can move in any direction."""
+        return self.robot.start if self.robot.settings is None else self.robot.settings.target
+
+    def _operational_space(self, tool: str | None) -> OperationalSpace | None:
+        """Return the controller of control "osc", None for another control."""
+        if "osc" not in self.groups:
+            if tool is not None:
+                raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+            return None
+        if len(self.groups) > 1:
+            problem = "take different setpoints, joint positions and poses"
+            raise InvalidArgumentError("controls", problem, value=self.groups, remedy="show 'osc' alone")
+        link = self.kinematics.links[self.kinematics.tool] if tool is None else tool
+        link = choice("tool", link, self.kinematics.links)
+        return OperationalSpace(self.robot, link, posture=self._home())
+
     def _setpoints(self) -> Float64:
-        """Return the setpoints of all robots (1, robots, dof) [rad or m]."""
+        """Return the setpoints of all robots (1, robots, size) [rad or m]."""
         return np.tile(self.setpoint, (1, len(self.groups), 1))

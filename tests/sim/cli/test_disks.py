@@ -17,7 +17,7 @@ from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
 from batchpid.sim.benchmark import benchmark
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
-from batchpid.sim.view import film
+from batchpid.sim.view import film, renderer
 
 SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
 TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
@@ -50,29 +50,22 @@ def rollout(panda):
 class Grey:
     """Stand-in for the scene of a film on machines that cannot render."""
 
-    camera_pose = None
-
     def __init__(self, *_):
-        self.scene = self.entity = self
+        pass
 
-    def add_camera(self, name, width, height, *_):
-        self._picture = np.random.default_rng(0).random((height, width, 4))
-        return self
-
-    def get_picture(self, kind):
-        return self._picture
+    def add_camera(self, width, height):
+        picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+        return lambda: picture
 
     def place(self, *_):
         pass
-
-    set_pose = take_picture = place
 
 
 @pytest.fixture
 def command(batchpid, rollout, tmp_path, monkeypatch):
     """Function that runs a command of the table with its output in a folder and returns (exit status, stderr)."""
-    monkeypatch.setattr(film, "render_problem", lambda: None)
-    monkeypatch.setattr(film, "_RenderScene", Grey)
+    monkeypatch.setattr(renderer, "render_problem", lambda: None)
+    monkeypatch.setattr(film, "RenderScene", Grey)
     run = write_recording(rollout, tmp_path / "run.npz")
     urdf = write(tmp_path, one_joint(), "one_joint.urdf")
 

@@ -9,7 +9,7 @@ import pytest
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 from batchpid.sim.cli import main
-from batchpid.sim.view import film
+from batchpid.sim.view import film, renderer
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +20,9 @@ def rollout(panda):
 
 def test_without_a_device_the_error_gives_the_remedy(rollout, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setattr(film, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
+    monkeypatch.setattr(renderer, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
     with pytest.raises(
-        film.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers.*batchpid view"
+        renderer.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers.*batchpid view"
     ):
         film.write_film(rollout, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
@@ -37,7 +37,7 @@ def test_without_a_device_the_error_gives_the_remedy(rollout, tmp_path, monkeypa
     ],
 )
 def test_a_crash_of_the_test_program_does_not_end_this_process(program, problem):
-    found = film.render_problem(program)
+    found = renderer.render_problem(program)
     assert found is None if problem is None else problem in found
 
 
@@ -57,7 +57,7 @@ def read_film(path, width, height):
 
 def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
-    if film.render_problem() is not None:
+    if renderer.render_problem() is not None:
         pytest.skip("needs a Vulkan device")
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
@@ -72,34 +72,22 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
 class Slides:
     """Stand-in for the scene of a film on machines that cannot render: the picture changes with the pose."""
 
-    camera_pose = None
-
     def __init__(self, *_):
-        self.scene = self.entity = self
         self._level = 0.0
 
-    def add_camera(self, name, width, height, *_):
-        self._noise = np.random.default_rng(0).random((height, width, 4))
-        return self
-
-    def set_pose(self, pose):
-        pass
-
-    def take_picture(self):
-        pass
+    def add_camera(self, width, height):
+        noise = np.random.default_rng(0).random((height, width, 3))
+        return lambda: (255 * np.clip(noise * self._level, 0, 1)).astype(np.uint8)
 
     def place(self, qpos):
         self._level += 0.04
-
-    def get_picture(self, kind):
-        return np.clip(self._noise * self._level, 0, 1)
 
 
 @pytest.fixture
 def slides(monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setattr(film, "render_problem", lambda: None)
-    monkeypatch.setattr(film, "_RenderScene", Slides)
+    monkeypatch.setattr(renderer, "render_problem", lambda: None)
+    monkeypatch.setattr(film, "RenderScene", Slides)
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "-film.mp4", "film.GIF"])
@@ -128,13 +116,13 @@ def test_a_film_that_is_interrupted_leaves_the_older_one(rollout, tmp_path, slid
 
 
 def test_the_window_plays_for_the_given_time(rollout):
-    if not os.environ.get("DISPLAY") or film.render_problem() is not None:
+    if not os.environ.get("DISPLAY") or renderer.render_problem() is not None:
         pytest.skip("needs a display and a Vulkan device")
     film.show_window(rollout, seconds=1.0)
 
 
 def test_the_demo_with_a_window_fails_before_it_runs_where_nothing_renders(monkeypatch, capsys):
-    monkeypatch.setattr(film, "render_problem", lambda: "no device")
+    monkeypatch.setattr(renderer, "render_problem", lambda: "no device")
     assert main(["demo", "--viewer"]) == 2
     output = capsys.readouterr()
     assert "batchpid view" in output.err

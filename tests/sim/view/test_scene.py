@@ -9,8 +9,8 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.sim import Robot, Runner, read_recording, write_recording
 from batchpid.sim.view import LiveSimulation, Playback
-from batchpid.sim.view.film import add_floor
 from batchpid.sim.view.layout import arrange_robots
+from batchpid.sim.view.renderer import add_floor
 from batchpid.sim.view.scene import RobotScene
 
 pytest.importorskip("trimesh")

@@ -1,0 +1,66 @@
+"""One robot of a task as an environment of Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.checks.keywords import check_keywords
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.sim.gym.pictures import RENDER_MODES
+from batchpid.sim.gym.robot_vector_env import Float32, RobotVectorEnv, arguments_of
+from batchpid.sim.robot.robot import Robot
+
+_FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")
+
+
+class RobotEnv(SingleOwner, gymnasium.Env):
+    """One robot of a task as a :class:`gymnasium.Env`, by default in this process. A subclass names its ``task``.
+
+    Episodes have no time limit, which :func:`gymnasium.make` adds. Other arguments are those of the task.
+    """
+
+    instead = RobotVectorEnv.instead
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    task: ClassVar[type[RobotVectorEnv]]
+    """Class of the task."""
+
+    def __init__(self, robot: str | Robot = "panda", *, render_mode: str | None = None, **options: Any) -> None:
+        check_keywords(type(self).__name__, options, [name for name in arguments_of(self.task) if name not in _FIXED])
+        options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
+        self._envs = self.task(1, robot, max_episode_steps=None, render_mode=render_mode, **options)
+        self.runner, self.render_mode = self._envs.runner, render_mode
+        self.metadata = self._envs.metadata  # type: ignore[misc]
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32, dict[str, Any]]:
+        """Begin a new episode."""
+        super().reset(seed=seed)
+        observation, info = self._envs.reset(seed=seed)
+        return observation[0], self._single(info)
+
+    def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
+        """Apply an action (size,) for one step; return observation, reward, terminated, truncated and info."""
+        observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture (height, width, 3) in RGB; None without a ``render_mode``."""
+        pictures = self._envs.render()
+        return None if pictures is None else pictures[0]
+
+    def close(self) -> None:
+        """Close the runner."""
+        self._envs.close()
+
+    @staticmethod
+    def _single(info: dict[str, Any]) -> dict[str, Any]:
+        """Return the info of the first env."""
+        return {key: value[0].item() for key, value in info.items() if not key.startswith("_")}

@@ -1,0 +1,417 @@
+"""Base class of tasks: N robots under a Runner as a vector environment of Gymnasium, with hooks for the task.
+
+Longer than 300 lines because one class is the whole environment, and documents every hook of a task.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import error, spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from batchpid.checks.keywords import check_keywords
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import array, choice, env_mask, flag, integer, number
+from batchpid.errors import CallOrderError, InvalidArgumentError
+from batchpid.sim.gym.pictures import RENDER_MODES, EnvPictures, check_render_mode
+from batchpid.sim.observation import Observation
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import RunnerKeywords
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+RUNNER_OPTIONS = tuple({"params", *RunnerKeywords.__annotations__} - {"substeps"})
+"""Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
+
+
+class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
+    """Task of N robots: a :class:`gymnasium.vector.VectorEnv` over the Runner. A task is a subclass with hooks.
+
+    This class has the spaces, seeds, episodes, autoreset, send and recv, faults and randomization. The hooks define the
+    task, in the order of a step. All but :meth:`spaces`, :meth:`observe` and :meth:`reward` have a default:
+
+    - :meth:`spaces`: spaces of observation and action of one env; called once, before the runner starts;
+    - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and ``build``;
+    - :meth:`draw`: the start and the goal of an episode, drawn for one env;
+    - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an action;
+    - :meth:`observe`: the observation, from that of the runner;
+    - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the observation.
+
+    Hooks get and return arrays with a row for each env. Each row may depend on that env alone, so that an episode is
+    the same in any number of envs. An env that diverged keeps its last finite observation, is terminated, and its
+    ``info["diverged"]`` is True.
+
+    Parameters
+    ----------
+    num_envs
+        Number of robots.
+    robot
+        Name of a bundled robot, URDF path, or :class:`batchpid.sim.Robot`.
+    rate_hz
+        Actions per second; the control runs at every sim step in between.
+    terminate_on_success
+        Whether an episode ends with success.
+    max_episode_steps
+        Steps after which an episode is truncated; None: never.
+    autoreset_mode
+        Of :class:`gymnasium.vector.AutoresetMode`.
+    render_mode
+        ``"rgb_array"``: :meth:`render` returns pictures, drawn by SAPIEN's renderer, which needs a Vulkan device.
+    options
+        Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument is out of range, is unknown, or is chosen by the task.
+    RenderError
+        ``render_mode`` is "rgb_array", and SAPIEN cannot render on this machine.
+    """
+
+    instead = "make another env with the same arguments"
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    picture_size: ClassVar[tuple[int, int]] = (640, 480)
+    """Width and height of a picture of :meth:`render` [pixels]."""
+
+    robot: Robot
+    """Robot of every env."""
+    runner: Runner
+    """Runner of the robots: ``runner.poses()``, ``runner.faults``, ... may be used in hooks."""
+    step_seconds: float
+    """Simulated time of a step [s]."""
+    action: Float64
+    """Last action (envs, size), within the action space."""
+    observed: Observation
+    """Last observation of the runner: joint positions, velocities, efforts, ..."""
+    action_names: tuple[str, ...]
+    """Names of an action's entries, for errors; a task may set them in :meth:`spaces`. Default: numbers."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        robot: str | Robot = "panda",
+        *,
+        rate_hz: float = 50.0,
+        terminate_on_success: bool = False,
+        max_episode_steps: int | None = 250,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        name = type(self).__name__
+        check_keywords(name, options, arguments_of(type(self)))
+        self.robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+        self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
+        self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
+        self.max_episode_steps = (
+            None if max_episode_steps is None else integer("max_episode_steps", max_episode_steps, 1, 10**9)
+        )
+        modes = {mode.value: mode for mode in AutoresetMode}
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
+        timestep = number("timestep", options.get("timestep", RunnerOptions.timestep), 1e-6, 0.1, "seconds")
+        substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
+        self.step_seconds = substeps * timestep
+        own = dict(self.runner_options())
+        for given in options:
+            if given in own:
+                raise InvalidArgumentError(given, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}")
+        self._options = options | own
+        self.single_observation_space, self.single_action_space = self.spaces()
+        size: int = self.single_action_space.shape[0]
+        self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.render_mode = check_render_mode(render_mode, self.num_envs)
+        self.metadata = {  # type: ignore[misc]
+            "render_modes": RENDER_MODES,
+            "render_fps": 1 / self.step_seconds,
+            "autoreset_mode": self.autoreset_mode,
+        }
+
+        self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **self._options)
+        self._generators = np.random.default_rng().spawn(self.num_envs)
+        self._starts = np.tile(self.robot.start, (self.num_envs, 1))
+        self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
+        self.action = np.zeros((self.num_envs, size))
+        self._observation = np.zeros((self.num_envs, *self.single_observation_space.shape), np.float32)
+        self._success = self._diverged = np.zeros(self.num_envs, bool)
+        self._steps = np.zeros(self.num_envs, np.int64)
+        self._done = np.ones(self.num_envs, bool)
+        self._is_stepping = False
+        self._received: Observation | None = None
+        self._pictures: EnvPictures | None = None
+
+    # -- hooks -----------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def spaces(self) -> tuple[spaces.Box, spaces.Box]:
+        """Return the spaces of the observation (n,) and of the action (size,) of one env.
+
+        Attributes ``robot``, ``num_envs`` and ``step_seconds`` exist by now, ``runner`` does not. Actions are clipped
+        to their space, and observations to theirs.
+        """
+
+    def runner_options(self) -> Mapping[str, Any]:
+        """Return the options of the Runner that belong to the task; the caller cannot give these. Default: none."""
+        return {}
+
+    def draw(self, env: int, random: np.random.Generator) -> ArrayLike:
+        """Draw an episode of one env: keep its goal, and return the joint positions at its start (dof,) [rad or m].
+
+        ``random`` is the generator of this env, so that episodes depend on its seed alone. Default: ``robot.start``.
+        """
+        return self.robot.start
+
+    def first_setpoint(self, qpos: Float64) -> ArrayLike:
+        """Return the setpoints (envs, command size) at the start of an episode from ``qpos`` (envs, dof).
+
+        Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the command.
+        """
+        return qpos if self.runner.options.sets_positions else np.asarray(self.runner.command.neutral)
+
+    def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
+        """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
+
+        ``setpoint`` are those of the last step. Default: the action is the setpoint.
+        """
+        return action
+
+    @abstractmethod
+    def observe(self, observed: Observation) -> ArrayLike:
+        """Return the observations (envs, n) for the last observation of the runner.
+
+        Poses of user content are ``self.runner.poses()`` (envs, entities, 7): the entities that ``build`` returned. It
+        is one more message to each worker. Rows of envs that are not ``observed.ok`` are ignored.
+        """
+
+    def success(self, observation: Float32) -> ArrayLike:
+        """Return whether each env has reached its goal (envs,). Default: no env has."""
+        return np.zeros(self.num_envs, bool)
+
+    @abstractmethod
+    def reward(self, observation: Float32, success: Bool) -> ArrayLike:
+        """Return the reward of each env (envs,)."""
+
+    def terminated(self, observation: Float32, success: Bool) -> ArrayLike:
+        """Return whether each env's episode ends (envs,); one that diverged always does.
+
+        Default: with success, under ``terminate_on_success``.
+        """
+        return success & self.terminate_on_success
+
+    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+        """Return further entries of the info, arrays (envs,), between "success" and "diverged". Default: none."""
+        return {}
+
+    # -- the vector environment ------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32, dict[str, Any]]:
+        """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
+
+        An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
+        an env draws depends on its own seed alone, which is the stream of a ``randomization``, too.
+
+        Raises
+        ------
+        CallOrderError
+            A step was begun and has not been waited for.
+        """
+        self._expect_no_step("reset")
+        mask = np.ones(self.num_envs, bool)
+        if options and "reset_mask" in options:
+            mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
+        if not mask.any():
+            raise InvalidArgumentError(
+                "options['reset_mask']", "selects no env", remedy="use e.g. mask = terminated | truncated"
+            )
+        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
+        if seeds is not None and len(seeds) != self.num_envs:
+            raise InvalidArgumentError(
+                "seed", f"has {len(seeds)} entries for {self.num_envs} envs", remedy="give an int, or one for each env"
+            )
+        streams: dict[int, int] = {}
+        for env in np.flatnonzero(mask).tolist():
+            if seeds is not None and (stream := seeds[env]) is not None:
+                self._generators[env], streams[env] = np.random.default_rng(stream), stream
+        self._begin(mask, streams)
+        return self._observation.copy(), self._info(mask)
+
+    def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, dict[str, Any]]:
+        """Apply an action (envs, size) for one step; return observation, reward, terminated, truncated and info."""
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: ArrayLike) -> None:
+        """Begin a step, which the workers make while the caller computes something else, and return.
+
+        Raises
+        ------
+        CallOrderError
+            The last step that was begun has not been waited for.
+        """
+        self._expect_no_step("step_async")
+        space: Any = self.single_action_space
+        kind: Any = "joint" if set(self.action_names) <= set(self.robot.joint_names) else "entry"
+        action = array("actions", actions, self.action.shape, self.action_names, kind=kind)
+        action = np.clip(action, space.low, space.high)
+        begins = self._done.copy()
+        if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+            raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
+        setpoint = self._returned("command", self.command(action, self._setpoint), self._setpoint.shape, np.float64)
+        setpoint = np.where(begins[:, None], self._setpoint, setpoint)
+        self.runner.send(setpoint)
+        self.action, self._setpoint, self._is_stepping = action, setpoint, True
+
+    def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, dict[str, Any]]:
+        """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
+
+        Raises
+        ------
+        CallOrderError
+            No step was begun.
+        """
+        if not self._is_stepping:
+            raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
+        try:
+            self._received = self.runner.recv() if self._received is None else self._received
+            self._observe(self._received)
+        except Exception:  # the step has ended; after an interrupt, in contrast, the call can be repeated
+            self._is_stepping, self._received = False, None
+            raise
+        self._is_stepping, self._received = False, None
+        begins = self._done.copy()
+        self._steps += 1
+
+        count = (self.num_envs,)
+        reward = self._returned("reward", self.reward(self._observation, self._success), count, np.float64)
+        ends = self._returned("terminated", self.terminated(self._observation, self._success), count, np.bool_)
+        terminated = self._diverged | ends
+        truncated = self._steps >= (np.inf if self.max_episode_steps is None else self.max_episode_steps)
+        if begins.any():  # in next-step mode this step begins the next episode
+            self._begin(begins)
+            reward = np.where(begins, 0.0, reward)
+            terminated, truncated = terminated & ~begins, truncated & ~begins
+        self._done = terminated | truncated
+        everywhere = np.ones(self.num_envs, bool)
+        info = self._info(everywhere)
+        if self._done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            done = self._done
+            final = np.full(self.num_envs, None, object)
+            for env in np.flatnonzero(done):
+                final[env] = self._observation[env].copy()
+            info = {"final_obs": final, "_final_obs": done, "final_info": self._info(done), "_final_info": done}
+            self._begin(done)
+            info |= self._info(everywhere)
+        return self._observation.copy(), reward, terminated, truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture (height, width, 3) of each env, in RGB; None without a ``render_mode``.
+
+        The entities that ``build`` returned are drawn where they are, other content where ``build`` put it.
+
+        Raises
+        ------
+        CallOrderError
+            A step was begun and has not been waited for.
+        """
+        if self.render_mode is None:
+            return None
+        self._expect_no_step("render")
+        if self._pictures is None:
+            build, ground = self.runner.options.build, self.runner.options.ground
+            self._pictures = EnvPictures(self.robot, self.num_envs, ground, build, self.picture_size)
+        poses = None if self.runner.options.build is None else self.runner.poses()
+        return self._pictures.draw(self.runner.observe().qpos, poses)
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the runner."""
+        self.runner.close()
+
+    # -- episodes --------------------------------------------------------------------------------------------------
+
+    def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
+        """Draw episodes for the masked envs, and place their robots; ``streams`` are new ones of some envs."""
+        dof = (self.robot.dof,)
+        for env in np.flatnonzero(mask).tolist():
+            drawn = self.draw(env, self._generators[env])
+            self._starts[env] = self._returned("draw", drawn, dof, np.float64)
+        first = np.broadcast_to(np.asarray(self.first_setpoint(self._starts)), self._setpoint.shape)
+        self._setpoint = np.where(mask[:, None], first, self._setpoint)
+        self._steps[mask] = 0
+        self._done = self._done & ~mask
+        seeds = np.zeros(self.num_envs, np.int64)
+        if streams and self.runner.options.randomization is not None:
+            seeded = np.isin(np.arange(self.num_envs), list(streams))
+            seeds[list(streams)] = list(streams.values())
+            self._observe(self.runner.reset(self._starts, mask=seeded, seed=seeds))
+            mask = mask & ~seeded
+        if mask.any():
+            self._observe(self.runner.reset(self._starts, mask=mask))
+
+    def _observe(self, observed: Observation) -> None:
+        """Update observation and success; an env that diverged keeps its last finite observation."""
+        space: Any = self.single_observation_space
+        self.observed = observed
+        rows = self._returned("observe", self.observe(observed), self._observation.shape, np.float32, observed.ok)
+        self._diverged = ~observed.ok
+        rows = np.clip(rows, space.low, space.high)
+        self._observation = np.where(observed.ok[:, None], rows, self._observation)
+        success = self._returned("success", self.success(self._observation), (self.num_envs,), np.bool_)
+        self._success = observed.ok & success
+
+    def _returned(
+        self, hook: str, value: ArrayLike, shape: tuple[int, ...], dtype: Any, ok: Bool | None = None
+    ) -> NDArray[Any]:
+        """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or infinity.
+
+        Where ``ok`` (envs,) is given, the rows of other envs are not checked.
+        """
+        rows = np.asarray(value)
+        name = f"{type(self).__name__}.{hook}"
+        if rows.shape != shape:
+            problem = f"returned an array of shape {rows.shape}"
+            raise InvalidArgumentError(name, problem, remedy=f"return one of shape {shape}")
+        finite = np.isfinite(rows)
+        bad = ~finite if ok is None else ~finite & ok[:, None]
+        if bad.any():
+            at = tuple(int(index[0]) for index in np.nonzero(bad))
+            problem = f"returned a number that is not finite, at index {at}"
+            raise InvalidArgumentError(name, problem, value=rows[at], remedy="return finite numbers")
+        return rows.astype(dtype, copy=False)
+
+    def _expect_no_step(self, call: str) -> None:
+        """Raise CallOrderError if a step has begun and has not been waited for."""
+        if self._is_stepping:
+            raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
+
+    def _info(self, mask: Bool) -> dict[str, Any]:
+        """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
+        own = {
+            key: self._returned("info", value, (self.num_envs,), value.dtype)
+            for key, value in self.info(self._observation).items()
+        }
+        values = {"success": self._success, **own, "diverged": self._diverged}
+        info = {key: np.where(mask, value, np.zeros_like(value)) for key, value in values.items()}
+        return info | {f"_{key}": mask.copy() for key in values}
+
+
+def arguments_of(task: type[RobotVectorEnv]) -> tuple[str, ...]:
+    """Return the names of the arguments of a task: its own, those of its bases, and the options of the runner."""
+    bases = task.__mro__[: task.__mro__.index(RobotVectorEnv) + 1]
+    parameters = [each for base in bases for each in inspect.signature(base).parameters.values()]
+    names = dict.fromkeys(each.name for each in parameters if each.kind is not each.VAR_KEYWORD)
+    return (*names, *RUNNER_OPTIONS)

@@ -1,0 +1,183 @@
+"""Base class of tasks whose actions move a tool, by operational-space control."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike
+
+import batchpid.task_space as ts
+from batchpid.checks.validate import array, choice, entries, number
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.gym.joint_space import JointSpace
+from batchpid.sim.gym.reach import ACTIONS
+from batchpid.sim.gym.robot_vector_env import Float32, Float64, RobotVectorEnv
+from batchpid.sim.observation import Observation
+from batchpid.sim.osc_controller import OperationalSpace
+from batchpid.sim.robot.kinematics import Kinematics
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.rotations import about, multiply
+from batchpid.task_space.frames import rotation_error
+
+STIFFNESS = 400.0
+"""Default stiffness of the tool [1/s^2]: with damping ratio 1, a time constant of 50 ms."""
+MAX_INCREMENT = (0.02, 0.02, 0.02, 0.1, 0.1, 0.1)
+"""Default change of the tool's target by an increment of 1 [m, rad]."""
+FAR = 3.0
+"""Bound of observed positions, as a distance from the workspace [m]."""
+
+
+class ToolVectorEnv(RobotVectorEnv, ABC):
+    """Task of a tool in a box, the workspace, under control "osc". A task is a subclass.
+
+    An action (envs, 3) in [-1, 1] is the target of the tool: its position in the workspace, or an increment of it. With
+    a ``rotation`` it is (envs, 6): the last three turn the target from the tool's orientation in the posture, by a
+    rotation vector in the world's axes. Without, the target keeps that orientation. An episode begins with the target
+    at the tool.
+
+    Parameters
+    ----------
+    num_envs, robot
+        As for :class:`RobotVectorEnv`.
+    tool
+        Link of the tool; default the last link of the robot's longest chain.
+    posture
+        Joint positions (dof,) at the start [rad or m], to which the null space is drawn. Default: for a panda one with
+        the hand down; other robots need one in which the tool is where it works, and no direction is singular.
+    workspace
+        Distances (3,) [m] from the center of the workspace to its sides, along x, y and z of the world.
+    rotation
+        Largest component of the rotation vector of a target [rad].
+    actions
+        ``"setpoint"``: the target in the workspace; or ``"increment"``: a change of it.
+    max_increment
+        Change of the target by an increment of 1, scalar or (3,), with a rotation (6,) [m, rad].
+    osc
+        Options of :class:`batchpid.sim.OperationalSpace`, such as ``{"stiffness": 400.0}``, the default.
+    options
+        Of :class:`RobotVectorEnv`, and of :class:`batchpid.sim.Runner` except ``control`` and ``tool``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        An argument is out of range, or ``posture`` is needed.
+    """
+
+    panda_posture: ClassVar[tuple[float, ...]] = (0.0, -0.255, 0.0, -2.437, 0.0, 2.182, 0.786, 0.02, 0.02)
+    """Default ``posture`` of a panda: the hand down, at (0.45, 0, 0.4) m."""
+    spread: ClassVar[float] = 0.1
+    """Largest distance of a joint from the posture at the start of an episode [rad or m]."""
+    center_offset: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    """Center of the workspace, from the tool in the posture [m]."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        robot: str | Robot = "panda",
+        *,
+        tool: str | None = None,
+        posture: ArrayLike | None = None,
+        workspace: ArrayLike = 0.15,
+        rotation: float = 0.0,
+        actions: str = "setpoint",
+        max_increment: ArrayLike | None = None,
+        osc: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        self.actions = choice("actions", actions, ACTIONS)
+        self.rotation = number("rotation", rotation, 0.0, 1.5, "rad")
+        size = 6 if self.rotation else 3
+        self.action_names = ("x", "y", "z", "rx", "ry", "rz")[:size]
+        self._half = array("workspace", workspace, (1, 3), "xyz", kind="entry")[0]
+        entries("workspace", self._half, self._half >= 0, "is negative", "xyz", kind="entry")
+        increment = MAX_INCREMENT[:size] if max_increment is None else max_increment
+        self.max_increment = array("max_increment", increment, (1, size), self.action_names, kind="entry")[0]
+        self._tool, self._posture = tool, posture
+        self._osc = {"stiffness": STIFFNESS} if osc is None else dict(osc)
+        super().__init__(num_envs, robot, **options)
+
+    def runner_options(self) -> Mapping[str, Any]:
+        """Return the control of the tool."""
+        robot, posture = self.robot, self._posture
+        if posture is None:
+            if robot.name != "panda":
+                remedy = "give joint positions in which the tool is where it works, such as robot.settings.target"
+                raise InvalidArgumentError("posture", f"is needed for the robot {robot.name!r}", remedy=remedy)
+            posture = self.panda_posture
+        self.posture = array("posture", posture, (1, robot.dof), robot.joint_names)[0]
+        kinematics = Kinematics(robot)
+        self.tool = kinematics.links[kinematics.tool]
+        if self._tool is not None:
+            self.tool = choice("tool", self._tool, kinematics.links)
+        control = OperationalSpace(robot, self.tool, posture=self.posture, **self._osc)
+        self._tree = robot.kinematic_tree()
+        self._home = ts.link_poses(self._tree, self.posture, [self.tool])[0]
+        self.center = self._home[:3] + self.center_offset
+        """Center of the workspace (3,) [m]."""
+        return {"control": control}
+
+    def spaces(self) -> tuple[spaces.Box, spaces.Box]:
+        """Return the spaces: joints, pose of the tool, and further entries with :meth:`task_bounds`."""
+        self._joints = JointSpace(self.robot)
+        position, unit = self._half + FAR, np.ones(4)
+        ends = [
+            (*self._joints.bounds(),),
+            (np.r_[self.center - position, -unit], np.r_[self.center + position, unit]),
+            self.task_bounds(),
+        ]
+        low, high = (np.concatenate(parts).astype(np.float32) for parts in zip(*ends, strict=True))
+        return spaces.Box(low, high), spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
+
+    def task_bounds(self) -> tuple[Float64, Float64]:
+        """Return the bounds of the task's own entries of the observation. Default: none."""
+        return np.zeros(0), np.zeros(0)
+
+    def draw(self, env: int, random: np.random.Generator) -> Float64:
+        """Draw a start around the posture; joints outside the chain to the tool start in it."""
+        moves = self._tree.chain(self.tool) & self.robot.independent
+        drawn = self.posture + self.spread * moves * random.uniform(-1.0, 1.0, self.robot.dof)
+        return np.clip(drawn, self.robot.lower, self.robot.upper)
+
+    def first_setpoint(self, qpos: Float64) -> Float64:
+        """Return the poses of the tool."""
+        return self.tool_poses(qpos)
+
+    def command(self, action: Float64, setpoint: Float64) -> Float64:
+        """Return the poses of the target (envs, 7) for actions in [-1, 1]."""
+        limits = np.concatenate([self._half, np.full(3, self.rotation)])[: action.shape[1]]
+        if self.actions == "setpoint":
+            return self.pose_at(action * limits)
+        turn = rotation_error(setpoint[:, 3:], self._home[3:])
+        last = np.concatenate([setpoint[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
+        return self.pose_at(np.clip(last + action * self.max_increment, -limits, limits))
+
+    def pose_at(self, place: Float64) -> Float64:
+        """Return the poses (..., 7) at places in the workspace (..., 3) or (..., 6).
+
+        A place is a position from the center [m], and a rotation vector from the orientation in the posture [rad].
+        """
+        turn = place[..., 3:]
+        wxyz = np.broadcast_to(self._home[3:], (*place.shape[:-1], 4))
+        if turn.shape[-1]:
+            angle = np.sqrt((turn * turn).sum(-1))
+            axis = turn / np.where(angle > 0, angle, 1.0)[..., None]
+            wxyz = multiply(about(axis, angle), wxyz)
+        return np.concatenate([self.center + place[..., :3], wxyz], axis=-1)
+
+    def tool_poses(self, qpos: Float64 | Float32) -> Float64:
+        """Return the poses of the tool in the world (envs, 7): position [m], quaternion (w, x, y, z).
+
+        Of the two quaternions of an orientation, the one nearer to that of the posture.
+        """
+        poses = ts.link_poses(self._tree, np.asarray(qpos, np.float64), [self.tool])[:, 0].copy()
+        opposite = (poses[:, 3:] * self._home[3:]).sum(1) < 0
+        poses[opposite, 3:] *= -1.0
+        return poses
+
+    def observe(self, observed: Observation) -> Float64:
+        """Return the joints' positions and velocities, and the pose of the tool."""
+        return np.concatenate([self._joints.observe(observed), self.tool_poses(observed.qpos)], axis=1)

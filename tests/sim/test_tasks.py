@@ -1,0 +1,436 @@
+"""Tasks: the hooks of the base class, the tool's and the box's tasks, pictures, and adapters of other libraries."""
+
+import importlib
+import os
+import signal
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium import spaces  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+
+from batchpid.errors import InvalidArgumentError, MissingDependencyError  # noqa: E402
+from batchpid.sim import RecoveryWarning, Robot  # noqa: E402
+from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv  # noqa: E402
+from batchpid.sim.view import renderer  # noqa: E402
+from batchpid.task_space.frames import rotation_error  # noqa: E402
+from tests.sim.tiny_urdf import one_joint, write  # noqa: E402
+
+
+class Swing(RobotVectorEnv):
+    """A hinge that swings to one side: the action is the effort."""
+
+    returned = None  # another value of a hook, by name
+
+    def runner_options(self):
+        return {"control": "effort"}
+
+    def spaces(self):
+        return spaces.Box(-50, 50, (2,)), spaces.Box(-3.0, 3.0, (1,), np.float32)
+
+    def draw(self, env, random):
+        return self._or("draw", random.uniform(-0.1, 0.1, 1))
+
+    def command(self, action, setpoint):
+        self.last = setpoint
+        return self._or("command", action)
+
+    def observe(self, observed):
+        return self._or("observe", np.concatenate([observed.qpos, observed.qvel], axis=1))
+
+    def success(self, observation):
+        return self._or("success", observation[:, 0] > 0.2)
+
+    def reward(self, observation, success):
+        return self._or("reward", observation[:, 0] - 0.01 * self.action[:, 0] ** 2)
+
+    def terminated(self, observation, success):
+        return self._or("terminated", observation[:, 0] < -0.2)
+
+    def info(self, observation):
+        return {"speed": self._or("info", np.abs(self.observed.qvel[:, 0]))}
+
+    def _or(self, hook, value):
+        name, other = self.returned or (None, None)
+        return other if name == hook else value
+
+
+class SwingEnv(RobotEnv):
+    task = Swing
+
+
+@pytest.fixture(scope="module")
+def hinge(tmp_path_factory):
+    return Robot.load(write(tmp_path_factory.mktemp("hinge"), one_joint()))
+
+
+@pytest.fixture
+def swings(hinge):
+    envs = Swing(3, hinge, workers=0, rate_hz=100.0, autoreset_mode="SameStep", max_episode_steps=20)
+    yield envs
+    envs.close()
+
+
+def test_a_task_is_defined_by_its_hooks(swings):
+    observation, info = swings.reset(seed=1)
+    assert np.abs(observation[:, 0]).max() <= 0.1
+    ends, actions = set(), np.array([[9.0], [-9.0], [0.0]])  # beyond the action space
+    for _ in range(20):
+        before = observation[:, 0]
+        observation, reward, terminated, truncated, info = swings.step(actions)
+        assert swings.action.ravel().tolist() == [3.0, -3.0, 0.0]
+        final = np.where(info.get("_final_obs", np.zeros(3, bool)), 0, observation[:, 0])
+        np.testing.assert_allclose(reward[final != 0], (final - [0.09, 0.09, 0.0])[final != 0], atol=1e-6)
+        ends |= {(env, "terminated") for env in np.flatnonzero(terminated)}
+        ends |= {(env, "truncated") for env in np.flatnonzero(truncated)}
+        assert (info["success"] == (observation[:, 0] > 0.2)).all()
+    assert before.shape == (3,)
+    assert ends >= {(1, "terminated"), (2, "truncated")}
+    assert not any(env == 0 and how == "terminated" for env, how in ends)  # success does not end it
+    assert swings.last.shape == (3, 1)
+
+
+def test_an_effort_is_zero_until_the_first_action(swings):
+    swings.reset(seed=1)
+    swings.step(np.ones((3, 1)))
+    assert swings.last.tolist() == [[0.0]] * 3
+
+
+@pytest.mark.parametrize(
+    ("hook", "value", "message"),
+    [
+        ("draw", np.zeros(2), r"Swing.draw: returned an array of shape \(2,\); return one of shape \(1,\)"),
+        ("observe", np.zeros((3, 1)), r"Swing.observe: .*\(3, 1\)"),
+        ("observe", np.array([[0.0, 0], [0, np.nan], [0, 0]]), r"Swing.observe: .*not finite, at index \(1, 1\)"),
+        ("command", np.zeros(3), "Swing.command"),
+        ("success", np.zeros((3, 1), bool), "Swing.success"),
+        ("reward", 0.0, "Swing.reward"),
+        ("reward", np.array([0, np.inf, 0]), r"Swing.reward: .*index \(1,\)"),
+        ("terminated", np.zeros(2, bool), "Swing.terminated"),
+        ("info", np.zeros(2), "Swing.info"),
+    ],
+)
+def test_a_wrong_result_of_a_hook_is_named(swings, hook, value, message):
+    swings.reset(seed=0)
+    swings.returned = hook, value
+    with pytest.raises(InvalidArgumentError, match=message):
+        swings.reset() if hook == "draw" else swings.step(np.zeros((3, 1)))
+    swings.returned = None
+    swings.reset(seed=0)  # the task goes on
+    assert np.isfinite(swings.step(np.zeros((3, 1)))[0]).all()
+
+
+def test_a_step_whose_hook_was_interrupted_can_be_waited_for_again(swings, monkeypatch):
+    def interrupted(observed):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    first, _ = swings.reset(seed=2)
+    expected = swings.step(np.ones((3, 1)))[0]
+    assert (swings.reset(seed=2)[0] == first).all()
+    swings.step_async(np.ones((3, 1)))
+    monkeypatch.setattr(swings, "observe", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        swings.step_wait()
+    assert (swings.step_wait()[0] == expected).all()
+
+
+def test_a_task_without_its_hooks_and_options_of_the_task_are_refused(hinge):
+    with pytest.raises(TypeError, match="observe"):
+        RobotVectorEnv(1)
+    with pytest.raises(InvalidArgumentError, match="control: is chosen by Swing; leave it out"):
+        Swing(1, hinge, control="pid")
+    with pytest.raises(InvalidArgumentError, match="did you mean 'rate_hz'"):
+        Swing(1, hinge, rate_h=20)
+    with pytest.raises(InvalidArgumentError, match="max_episode_steps: is not an argument of SwingEnv"):
+        SwingEnv(hinge, max_episode_steps=3)
+    env = SwingEnv(hinge)
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (2,)
+    assert env.render() is None
+    env.close()
+
+
+# -- tasks of a tool ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_targets_at_the_goals_bring_the_tools_there(engine):
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
+    envs = ToolReachVectorEnv(3, workers=0, rotation=0.4, engine=engine, terminate_on_success=True)
+    observation, info = envs.reset(seed=4)
+    goals, first = observation[:, -7:].astype(float), info["distance"]
+    turns = rotation_error(goals[:, 3:], envs.pose_at(np.zeros(6))[3:])
+    assert np.abs(turns).max() <= 0.4
+    action = np.concatenate([(goals[:, :3] - envs.center) / 0.15, turns / 0.4], axis=1)
+    reached = np.zeros(3, bool)
+    for _ in range(40):
+        if reached.all():
+            break
+        observation, reward, terminated, _, info = envs.step(action)
+        assert (terminated == info["success"]).all()
+        assert (reward[terminated & ~reached] > 0.98).all()
+        reached |= terminated
+    assert reached.all()
+    assert (first > 0.05).all()
+    envs.close()
+
+
+def test_increments_move_the_target_within_the_workspace():
+    envs = ToolReachVectorEnv(2, workers=0, actions="increment", workspace=(0.05, 0.1, 0.1), rotation=0.2)
+    observation, _ = envs.reset(seed=0)
+    tool = observation[:, -14:-7]
+    envs.step(np.array([[0, 0.5, 0, 0, 0, 0]] * 2))
+    moved = envs._setpoint - tool
+    np.testing.assert_allclose(moved[:, :3], [[0, 0.01, 0]] * 2, atol=2e-7)
+    np.testing.assert_allclose(moved[:, 3:], 0, atol=2e-7)  # the orientation is the one drawn at the start
+    for _ in range(12):
+        observation, *_ = envs.step(np.array([[1.0, -1, 0, 1, 0, 0]] * 2))
+    np.testing.assert_allclose(envs._setpoint[:, :2] - envs.center[:2], [[0.05, -0.1]] * 2, atol=1e-12)
+    turn = rotation_error(envs._setpoint[:, 3:], envs.pose_at(np.zeros(6))[3:])
+    np.testing.assert_allclose(turn[:, 0], 0.2, atol=1e-12)
+    assert envs.observation_space.contains(observation)
+    envs.close()
+
+
+def test_the_tools_task_is_bit_identical_to_gymnasiums_vector_of_single_envs():
+    name, options = "batchpid.sim.gym:batchpid/ToolReach-v0", {"actions": "increment"}
+    ours = gymnasium.make_vec(name, num_envs=2, workers=0, max_episode_steps=3, **options)
+    theirs = SyncVectorEnv([lambda: gymnasium.make(name, max_episode_steps=3, **options)] * 2)
+    same = [(ours.reset(seed=5)[0], theirs.reset(seed=5)[0])]
+    for _ in range(5):
+        action = ours.action_space.sample()
+        for one, other in zip(ours.step(action)[:4], theirs.step(action)[:4], strict=True):
+            same.append((one, other))
+    assert all((one == other).all() for one, other in same)
+    ours.close()
+    theirs.close()
+
+
+def test_bad_arguments_of_a_tools_task_are_named():
+    with pytest.raises(InvalidArgumentError, match="posture: is needed for the robot 'jaco2'"):
+        ToolReachVectorEnv(1, "jaco2")
+    for options in ({"control": "pid"}, {"tool": "hand"}, {"workspace": -1.0}, {"posture": np.zeros(3)}):
+        with pytest.raises(InvalidArgumentError, match=f"^{next(iter(options))}"):
+            ToolReachVectorEnv(1, workers=0, **options)
+    with pytest.raises((InvalidArgumentError, TypeError), match="stifness"):
+        ToolReachVectorEnv(1, osc={"stifness": 1.0})
+    with pytest.raises(InvalidArgumentError, match="build: is chosen by PushVectorEnv"):
+        PushVectorEnv(1, build=print)
+    pytest.importorskip("mujoco")
+    with pytest.raises(InvalidArgumentError, match="build"):
+        PushVectorEnv(1, engine="mujoco")
+
+
+def test_a_pushed_box_is_the_same_in_workers_and_after_a_lost_one():
+    """Both tools go straight ahead; the goal of each is beyond its box."""
+    runs = []
+    for workers in (0, 1):
+        envs = PushVectorEnv(2, workers=workers, actions="increment", max_episode_steps=26)
+        observation, first = envs.reset(seed=1)
+        rows, action = [observation], np.array([[0.35, 0, 0], [0, 0.2, 0]])
+        for step in range(28):
+            if workers and step == 20:
+                os.kill(envs.runner.pids[0], signal.SIGKILL)
+                with pytest.warns(RecoveryWarning):
+                    observation, *_, info = envs.step(action)
+            else:
+                observation, *_, info = envs.step(action)
+            rows.append(observation)
+            if step == 24:
+                nearer = info["distance"] < first["distance"] - 0.02
+            np.testing.assert_array_equal(observation[:, -9:-2], envs.runner.poses()[:, 0])
+        runs.append(rows)
+        assert nearer.tolist() == [True, False]
+        np.testing.assert_array_equal(rows[-2][:, -9:-2], rows[0][:, -9:-2])  # a new episode: the boxes are back
+        assert (rows[-2][:, -2:] != rows[0][:, -2:]).all()  # and have other goals
+        envs.close()
+    np.testing.assert_array_equal(*runs)
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+class Still:
+    """Stand-in for a scene on machines that cannot render: the picture has the numbers that the scene was given."""
+
+    def __init__(self, robot, count, ground):
+        assert count == 1
+        self.content, self.size = np.zeros(7), None
+
+    def add_camera(self, width, height):
+        self.size = height, width, 3
+        return lambda: np.full(self.size, 100 * (self.qpos[0, 0] + 1) + 10 * self.content[0], np.uint8)
+
+    def add_content(self, build, env):
+        self.content = np.full(7, np.nan)
+
+    def place_content(self, poses):
+        self.content = poses[0]
+
+    def place(self, qpos):
+        self.qpos = qpos
+
+
+def test_pictures_show_each_env(hinge, monkeypatch):
+    monkeypatch.setattr(renderer, "render_problem", lambda: None)
+    monkeypatch.setattr(renderer, "RenderScene", Still)
+    envs = Swing(2, hinge, workers=0, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs.runner.reset([[0.0], [1.0]])
+    pictures = envs.render()
+    assert [(each.shape, each.dtype, each[0, 0, 0]) for each in pictures] == [
+        ((480, 640, 3), np.uint8, 100),
+        ((480, 640, 3), np.uint8, 200),
+    ]
+    assert envs.metadata["render_fps"] == pytest.approx(50)
+    envs.close()
+    pushes = PushVectorEnv(1, workers=0, render_mode="rgb_array")
+    pushes.reset(seed=0)
+    assert pushes.render()[0][0, 0, 0] == 104  # the box is at x = 0.49 m
+    pushes.close()
+
+
+def test_pictures_of_a_box_where_sapien_renders():
+    if renderer.render_problem() is not None:
+        pytest.skip("needs a Vulkan device")
+    env = gymnasium.make("batchpid.sim.gym:batchpid/Push-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    for _ in range(10):
+        env.step(np.array([1.0, 0, 0]))
+    assert before.std() > 5
+    assert np.abs(env.render().astype(int) - before).max() > 40
+    env.close()
+
+
+def test_a_render_mode_that_cannot_be_is_refused_before_anything_runs(hinge, monkeypatch):
+    monkeypatch.setattr(renderer, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
+    with pytest.raises(renderer.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers"):
+        Swing(1, hinge, render_mode="rgb_array")
+    with pytest.raises(InvalidArgumentError, match=r"render_mode: is not supported.*'rgb_array'.*batchpid view"):
+        Swing(1, hinge, render_mode="human")
+    monkeypatch.setattr(renderer, "render_problem", lambda: None)
+    with pytest.raises(InvalidArgumentError, match="num_envs"):
+        Swing(65, hinge, render_mode="rgb_array")
+
+
+# -- adapters ----------------------------------------------------------------------------------------------------------
+
+
+class StandInVecEnv:
+    """What the adapter uses of Stable-Baselines3's VecEnv, for machines without it."""
+
+    def __init__(self, num_envs, observation_space, action_space):
+        self.num_envs, self.observation_space, self.action_space = num_envs, observation_space, action_space
+        self._reset_seeds()
+
+    def _reset_seeds(self):
+        self._seeds = [None] * self.num_envs
+
+    def seed(self, seed):
+        self._seeds = [seed + env for env in range(self.num_envs)]
+
+    def step(self, actions):
+        self.step_async(actions)
+        return self.step_wait()
+
+    def _get_indices(self, indices):
+        return range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
+
+
+@pytest.fixture
+def adapter(monkeypatch):
+    """The module of the adapter, over the real package where it is installed."""
+    try:
+        import stable_baselines3  # noqa: F401
+    except ImportError:
+        stand_in = ModuleType("stable_baselines3.common.vec_env")
+        stand_in.VecEnv = StandInVecEnv
+        for name in ("stable_baselines3", "stable_baselines3.common"):
+            monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
+    yield importlib.import_module("batchpid.sim.gym.stable_baselines3")
+    del sys.modules["batchpid.sim.gym.stable_baselines3"]
+
+
+def test_stable_baselines3_gets_the_last_observation_of_an_episode(adapter, swings):
+    vec = adapter.TaskVecEnv(swings)
+    vec.seed(3)
+    first = vec.reset()
+    assert (first == swings.reset(seed=3)[0]).all()
+    assert vec.reset_infos[0].keys() == {"success", "speed", "diverged", "is_success"}
+    for _ in range(20):
+        observation, reward, ends, infos = vec.step(np.array([[3.0], [-3.0], [0.0]]))
+        assert reward.dtype == np.float32
+        assert [info["is_success"] for info in infos] == [info["success"] for info in infos]
+        for env, (end, info) in enumerate(zip(ends, infos, strict=True)):
+            assert ("terminal_observation" in info) == end
+            if end:
+                last = info["terminal_observation"][0]
+                assert info["TimeLimit.truncated"] == (last >= -0.2)
+                assert abs(observation[env, 0]) <= 0.1 < abs(last) or env == 2
+                assert info["is_success"] == (last > 0.2)
+            else:
+                assert not info["TimeLimit.truncated"]
+    assert ends[2]
+    assert vec.get_attr("num_envs", [0, 1]) == [3, 3]
+    assert vec.env_is_wrapped(RobotEnv) == [False] * 3
+    assert list(vec.get_images()) == [None] * 3
+
+
+def test_stable_baselines3_needs_the_resets_within_a_step(adapter, hinge):
+    with Closing(Swing(1, hinge, workers=0)) as envs, pytest.raises(InvalidArgumentError, match="SameStep"):
+        adapter.TaskVecEnv(envs)
+    with pytest.raises(InvalidArgumentError, match="envs: is not a task"):
+        adapter.TaskVecEnv(3)
+
+
+class Closing:
+    def __init__(self, envs):
+        self.envs = envs
+
+    def __enter__(self):
+        return self.envs
+
+    def __exit__(self, *_):
+        self.envs.close()
+
+
+def test_without_stable_baselines3_the_error_names_what_to_install(monkeypatch):
+    for name in ("stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "batchpid.sim.gym.stable_baselines3", raising=False)
+    with pytest.raises(MissingDependencyError, match=r"stable-baselines3.*pip install 'batchpid\[sb3\]'"):
+        importlib.import_module("batchpid.sim.gym.stable_baselines3")
+
+
+def test_stable_baselines3_trains(swings):
+    library = pytest.importorskip("stable_baselines3")
+    from batchpid.sim.gym.stable_baselines3 import TaskVecEnv
+
+    model = library.PPO("MlpPolicy", TaskVecEnv(swings), n_steps=16, batch_size=48, n_epochs=1, device="cpu")
+    assert model.learn(48).num_timesteps == 48
+
+
+def test_torchrl_wraps_tasks_that_do_not_reset_themselves(hinge):
+    """Its GymWrapper resets ended envs by ``options["reset_mask"]``, and keeps the last observation of an episode."""
+    library = pytest.importorskip("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    task = Swing(2, hinge, workers=0, autoreset_mode=AutoresetMode.DISABLED, max_episode_steps=4)
+    envs = library.GymWrapper(task)
+    check_env_specs(envs)
+    envs.set_seed(3)
+    run = envs.rollout(6, break_when_any_done=False)
+    assert run.batch_size == (2, 6)
+    assert run["next", "truncated"][..., 0].int().tolist() == [[0, 0, 0, 1, 0, 0]] * 2
+    assert (run["next", "observation"][:, 2] == run["observation"][:, 3]).all()
+    assert (run["next", "observation"][:, 3] != run["observation"][:, 4]).all()  # the last one, and the next first one
+    envs.close()
