@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.jax_settings import own_settings
-from batchpid.errors import MissingDependencyError
+from batchpid.arrays.jax_settings import own_settings, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
@@ -91,10 +90,9 @@ class JAXBackend:
     native = False
 
     def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
-        try:
-            import jax
-        except ImportError:
-            raise MissingDependencyError("jax", "backend='jax'", "jax") from None
+        require_jax()
+        import jax
+
         from batchpid.law import blocks
 
         self.jax, self.terms = jax, terms

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.digest import digest
+from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.keywords import check_keywords
@@ -161,6 +162,8 @@ class RunnerOptions:
             raise InvalidArgumentError(
                 "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
             )
+        if self.backend == "jax":
+            require_jax()
         self._check_engine()
         if self.build is not None and not callable(self.build):
             raise InvalidArgumentError(

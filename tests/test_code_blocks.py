@@ -60,6 +60,12 @@ def blocks(page: Path, *languages: str) -> list[re.Match]:
     return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
 
 
+def shell_lines(page: Path) -> list[list[str]]:
+    """Return the words of each command in the shell blocks that can be run here."""
+    code = "".join(match["code"] for match in blocks(page, "sh") if not missing(match))
+    return [words for line in code.splitlines() if (words := shlex.split(line, comments=True))]
+
+
 def missing(match: re.Match) -> list[str]:
     needed = re.findall(r"\w+", match["needs"] or "")
     return [name for name in needed if importlib.util.find_spec(name) is None]
@@ -135,13 +141,8 @@ def test_commands_run(page, tmp_path, monkeypatch, capsys):
     Path("arm.xml").write_text(MJCF)
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
     bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
-    for match in blocks(page, "sh"):
-        if missing(match):
-            continue
-        for line in match["code"].splitlines():
-            words = shlex.split(line, comments=True)
-            if words:
-                run(words)
+    for words in shell_lines(page):
+        run(words)
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")

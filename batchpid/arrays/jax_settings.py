@@ -10,7 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from typing import Any
+
+from batchpid.errors import MissingDependencyError
 
 NEEDED: dict[str, tuple[Any, ...]] = {
     "jax_debug_nans": (False,),
@@ -24,6 +27,12 @@ NEEDED: dict[str, tuple[Any, ...]] = {
     "jax_transfer_guard_device_to_device": ("allow", None),
 }
 """Accepted values of each setting; any other value is replaced by the first of them."""
+
+
+def require_jax() -> None:
+    """Raise MissingDependencyError if JAX is not installed. It is not imported."""
+    if find_spec("jax") is None:
+        raise MissingDependencyError("jax", "backend='jax'", "jax")
 
 
 @contextmanager

@@ -26,10 +26,10 @@ def advance_in_blocks(
 ) -> tuple[PIDState, Any]:
     """Advance the law ``rows`` envs at a time, for jax.jit with ``out`` donated.
 
-    ``inputs`` are the inputs of :func:`batchpid.advance`, in order: setpoint, measurement and, optionally, measurement_rate,
-    setpoint_rate, feedforward. ``out`` is a state and an effort, (envs, joints) each, to overwrite, such as the results
-    of the step before last, but not ``state`` itself; None takes new ones. On several devices use it under ``jax.shard_map``,
-    each device with a part of the envs.
+    ``inputs`` are the inputs of :func:`batchpid.advance`, in order: setpoint, measurement and, optionally,
+    measurement_rate, setpoint_rate, feedforward. ``out`` is a state and an effort, (envs, joints) each, to overwrite,
+    such as the results of the step before last, but not ``state`` itself; None takes new ones. On several devices use
+    it under ``jax.shard_map``, each device with a part of the envs.
     """
     measurement = inputs[1]
     envs, joints = measurement.shape

@@ -19,7 +19,7 @@ def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
 
     Masses are those of the URDF; SAPIEN has those of links without ``<inertial>`` but with collision shapes.
 
-    Raises RobotError if the base is not fixed, or SAPIEN cannot build a link whose mass comes from its collision shapes.
+    Raises RobotError if the base is not fixed, or SAPIEN cannot build a link whose mass comes from its shapes.
     """
     if not robot.fixed_base:
         problem = "operational space and inverse kinematics need a kinematic tree, which has a fixed base"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import pickle
+import sys
 from dataclasses import fields
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
 from batchpid.sim.engine.scene_spec import SceneSpec
 
@@ -42,6 +43,12 @@ def test_a_misspelled_option_names_the_nearest_one(name, near):
 def test_an_unknown_engine_is_an_error_that_lists_the_known_ones():
     with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of.*'sapien'"):
         Runner(PANDA, 1, engine="bullet")
+
+
+def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax", None)
+    with pytest.raises(MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"):
+        Runner(PANDA, 1, backend="jax")
 
 
 def test_options_are_plain_values_of_their_documented_type():

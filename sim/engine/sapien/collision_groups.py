@@ -76,7 +76,7 @@ def may_touch(first: Words, second: Words) -> bool:
 
 
 def _cliques(bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair]) -> list[list[str]]:
-    """Return cliques of the graph with the edges ``ignored`` and ``free`` that together contain every edge of ``ignored``."""
+    """Return cliques of the graph of edges ``ignored`` and ``free`` that together hold every edge of ``ignored``."""
     uncovered, allowed, cliques = set(ignored), {*ignored, *free}, []
     for pair in combinations(bodies, 2):
         if frozenset(pair) in uncovered:

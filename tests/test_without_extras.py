@@ -1,0 +1,87 @@
+"""The README followed to the letter without any extra: each command and program runs, or names the extra it needs."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from test_code_blocks import ROOT, SHORTER, SHORTER_CODE, TWO_JOINTS, blocks, shell_lines
+from tiny_urdf import write
+
+README = ROOT / "README.md"
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+FOR_USERS = set(re.findall(r"\[(.*)\]", EXTRAS["all"][0])[0].split(","))
+MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
+"""Name of a package's module, where it is another than the package's."""
+NEEDED = {"parity": "mujoco", "tune": "tune", "identify": "tune", "view": "view"}
+"""Commands of the README that need an extra."""
+TOO_LONG = ("bench",)
+SIZES = SHORTER | {"survey": ["--workers", "0"]}
+PROGRAM = """
+import contextlib, io, json, sys, warnings
+from importlib.machinery import PathFinder
+import batchpid as bp
+warnings.simplefilter("ignore")
+absent, commands, programs = json.load(sys.stdin)
+find = PathFinder.find_spec
+PathFinder.find_spec = lambda name, *place: None if name.partition(".")[0] in absent else find(name, *place)
+from batchpid.sim import Robot
+from batchpid.sim.cli import main
+panda = Robot.load("panda")
+open("arm.urdf", "w").write(open(panda.path).read())
+open("log.csv", "w").write("time\\n0\\n")
+results = []
+for words in commands:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as errors:
+        results.append((words, main(words), errors.getvalue()))
+    if words[0] == "tune":  # it would have written them
+        bp.save_params("gains.yaml", panda.params(), panda.joint_names)
+for program in programs:
+    with contextlib.redirect_stdout(io.StringIO()):
+        exec(program, {})
+print(json.dumps(results))
+"""
+
+
+def modules_of_extras() -> list[str]:
+    """Return the modules of all packages of the users' extras."""
+    packages = {Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra]} - {"batchpid"}
+    return sorted(MODULES.get(package, package) for package in packages)
+
+
+def test_the_readme_lists_every_extra_for_users():
+    rows = re.findall(r"^\| (.*) \|.*\|.*[GM]B \|$", README.read_text(), re.MULTILINE)
+    assert [row.strip("`") for row in rows if row != "none"][-1] == "all"
+    assert {row.strip("`") for row in rows} == {"none", "all"} | FOR_USERS
+
+
+def test_the_base_contains_no_package_of_an_extra():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    base = {Requirement(need).name for need in project["dependencies"]}
+    assert base.isdisjoint(Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra])
+
+
+def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
+    lines = [words[1:] for words in shell_lines(README) if words[0] == "batchpid"]
+    commands = [[*words, *SIZES.get(words[0], [])] for words in lines if words[0] not in TOO_LONG]
+    commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.npz"])
+    (tmp_path / "robots").mkdir()
+    write(tmp_path / "robots", TWO_JOINTS, "two.urdf")
+    programs = [match["code"] for match in blocks(README, "python")]
+    for pattern, size in (SHORTER_CODE | {"workers=2": "workers=0"}).items():
+        programs = [re.sub(pattern, size, program) for program in programs]
+    assert len(commands) > 10
+    assert len(programs) == 2
+    given = json.dumps([modules_of_extras(), commands, programs])
+    done = subprocess.run([sys.executable, "-c", PROGRAM], input=given, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for words, status, errors in json.loads(done.stdout):
+        extra = "jax" if "jax" in words else NEEDED.get(words[0])
+        remedy = f"install it with: pip install 'batchpid[{extra}]'\n" if extra else ""
+        assert (status or 0) == (2 if extra else 0), (words, errors)
+        assert errors.endswith(remedy), (words, errors)
