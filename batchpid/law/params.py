@@ -1,8 +1,8 @@
 """The parameters of the control law: build, broadcast, validate.
 
 A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An option
-that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a law without it. Choices that have no
-number, such as the integration order, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
+that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a law without it. Choices without
+a number, such as the integration order, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
 structure, and so static under every JAX transform.
 """
 
