@@ -151,10 +151,14 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
-@pytest.mark.parametrize("build", ["make_params", "replace"])
 @pytest.mark.parametrize(
-    "strategy",
-    [{"anti_windup": "clamp"}, {"anti_windup": "back_calculation"}, {"anti_windup": "conditional", "ki": 0.0}],
+    ("build", "strategy"),
+    [
+        ("make_params", {"anti_windup": "back_calculation"}),
+        ("make_params", {"anti_windup": "conditional", "ki": 0.0}),
+        ("replace", {"anti_windup": "back_calculation"}),
+        ("replace", {"anti_windup": "clamp"}),
+    ],
     ids=str,
 )
 def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, inputs, x64):

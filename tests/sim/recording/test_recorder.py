@@ -359,7 +359,9 @@ def assert_at_most_a_second_is_lost(recording, ticks):
     np.testing.assert_allclose(recording.time, (1 + np.arange(kept)) * 2 / 2000)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_a_kill_loses_at_most_a_second(number, tmp_path):
     ticks = kill_after(1.7, str(tmp_path / "run.h5"), number)
     recording = read_recording(tmp_path / ("run.h5" if number == signal.SIGINT else "run.h5.partial"))

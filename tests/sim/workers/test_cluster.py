@@ -73,7 +73,7 @@ def assert_same(expected, got):
         assert_identical(first, second)
 
 
-@pytest.mark.parametrize("nodes", [1, 2, 3])
+@pytest.mark.parametrize("nodes", [2, *(pytest.param(each, marks=pytest.mark.slow) for each in (1, 3))])
 def test_results_are_bit_identical_for_any_number_of_nodes(nodes, machines, expected):
     with make_runner(cluster=machines.ensure(nodes).options(nodes)) as runner:
         assert len(runner.nodes) == nodes
@@ -114,6 +114,7 @@ def lossy_rollout(machines, losses):
     return rollout
 
 
+@pytest.mark.slow
 def test_a_killed_process_and_a_killed_worker_are_replaced(machines, undisturbed):
     losses = {
         20: lambda runner: os.kill(runner.nodes[1].pid, signal.SIGKILL),
@@ -147,6 +148,7 @@ def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monke
     assert have_ended(pids)
 
 
+@pytest.mark.slow
 def test_an_interrupted_tick_is_finished_before_the_next_call(machines):
     results = []
     for interrupted in (False, True):
@@ -202,6 +204,7 @@ def test_machines_that_round_differently_are_accepted_on_request(machines, odd_m
         assert len({info.digest for info in runner.nodes}) == 2
 
 
+@pytest.mark.slow
 def test_steps_whose_time_are_messages_are_warned_of(machines):
     with Runner(ROBOT, 1, params=ROBOT.params(), substeps=1, cluster=machines.ensure(1).options(1)) as runner:
         for _ in range(49):
