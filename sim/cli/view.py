@@ -85,9 +85,7 @@ class ViewCommand:
         if gains and "osc" in self.control:
             raise InvalidArgumentError("gains", "are not for control 'osc'", value=self.gains, remedy="leave it out")
         if gains and gains.control != "pid":
-            raise InvalidArgumentError(
-                "gains", "must be gains of a PID", value=self.gains, remedy="use --control drive"
-            )
+            raise InvalidArgumentError("gains", "must be PID gains", value=self.gains, remedy="use --control drive")
         live = LiveSimulation(
             robot,
             self.num_envs,

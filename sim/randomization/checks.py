@@ -29,7 +29,7 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
     if randomization.damping is not None and robot.dissipation != "urdf":
         remedy = "load the robot with dissipation='urdf'"
         raise InvalidArgumentError(
-            "damping", "cannot be drawn: with this dissipation the engine sets it", remedy=remedy
+            "damping", "cannot be drawn: the engine sets it with this dissipation", remedy=remedy
         )
     if randomization.payload_link is not None:
         choice("payload_link", randomization.payload_link, [link.name for link in robot.links])

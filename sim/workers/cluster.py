@@ -72,7 +72,7 @@ class Cluster:
             raise InvalidArgumentError(
                 "cluster",
                 f"has no machine of {least} CPUs",
-                remedy="pass a smaller cpus_per_node, or add larger machines",
+                remedy="lower cpus_per_node, or add larger machines",
             )
         packs = -(-options.num_envs // options.inseparable_envs)
         if self.options.placement == "PACK":

@@ -224,7 +224,7 @@ def test_what_does_not_fit_is_refused(fields, message):
 
 
 def test_damping_that_the_engine_simulates_is_not_drawn():
-    with pytest.raises(InvalidArgumentError, match="damping: is the engine's"):
+    with pytest.raises(InvalidArgumentError, match="damping: cannot be drawn: the engine sets it"):
         check_robot(Randomization(damping=Uniform(0, 1)), Robot.load("panda", dissipation="sapien"))
 
 

@@ -42,11 +42,11 @@ def test_inputs_that_differ_are_named(path):
 
 def test_a_state_that_fits_no_fit_is_refused(path):
     for unknowns, evaluations, problems in ((3, 25, 2), (2, 4, 2), (2, 25, 0)):
-        with pytest.raises(InvalidArgumentError, match="no history of a fit"):
+        with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
             History(path, SETTINGS).state(unknowns, evaluations, problems)
     for state in (7, {}, {"theta": 1}, [], {"theta": [1], "left": 1e999, "last": [1], "cost": 0, "done": 4}):
         HistoryFile(path, "fit", SETTINGS).write(state)
-        with pytest.raises(InvalidArgumentError, match="no history of a fit"):
+        with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
             History(path, SETTINGS).state(2, 25, 2)
 
 
@@ -78,10 +78,10 @@ HOSTILE = st.one_of(
 @given(HOSTILE)
 def test_hostile_content_ends_in_one_error(path, content):
     path.write_bytes(content)
-    with pytest.raises(InvalidArgumentError, match="no history of a fit"):
+    with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
         History(path, SETTINGS).state(2, 25, 2)
 
 
 def test_a_folder_is_no_history(tmp_path):
-    with pytest.raises(InvalidArgumentError, match="no history of a search"):
+    with pytest.raises(InvalidArgumentError, match="not a history of a search"):
         HistoryFile(tmp_path, "search", SETTINGS).read()

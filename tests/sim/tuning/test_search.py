@@ -72,7 +72,7 @@ def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
     with pytest.raises(InvalidArgumentError, match="another search"):
         tune(panda, generations=3, history=history, seed=9, **options)
     history.write_text("{}")
-    with pytest.raises(InvalidArgumentError, match="no history"):
+    with pytest.raises(InvalidArgumentError, match="not a history"):
         tune(panda, generations=3, history=history, **options)
 
 
