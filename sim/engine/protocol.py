@@ -266,6 +266,7 @@ class Engine(description.RobotFunctions, Protocol):
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
+        workspace: dict[Any, Any] | None = None,
     ) -> EnginePack:
         """Return a new pack of ``size`` envs.
 
@@ -277,6 +278,9 @@ class Engine(description.RobotFunctions, Protocol):
             Differences of the robots from the model; None for robots that :meth:`EnginePack.vary` never changes.
         carrier, links
             Link of the URDF that carries the payload, and links whose mass or center of mass varies.
+        workspace
+            Working memory that packs share which are never at work at the same time, such as those of a loop. Only the
+            engine knows its content. None for a pack of its own.
 
         Raises
         ------

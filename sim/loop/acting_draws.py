@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 import batchpid as bp
@@ -12,14 +14,21 @@ from batchpid.sim.randomization.draws import Draws
 from batchpid.sim.randomization.fields import PHYSICAL, elements, nominal_values
 
 
-def make_pack(options: RunnerOptions, scene: SceneSpec, size: int, first_env: int, draws: Draws | None) -> EnginePack:
+def make_pack(
+    options: RunnerOptions,
+    scene: SceneSpec,
+    size: int,
+    first_env: int,
+    draws: Draws | None,
+    workspace: dict[Any, Any],
+) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
     randomization, robot, packed = options.randomization, options.robot, options.scenes_per_system
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
-        return make(scene, size, first_env, packed)
+        return make(scene, size, first_env, packed, workspace=workspace)
     varied, links = variation(options, size, draws), elements("link_mass", robot)
-    return make(scene, size, first_env, packed, varied, randomization.carrier(robot), links)
+    return make(scene, size, first_env, packed, varied, randomization.carrier(robot), links, workspace)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:

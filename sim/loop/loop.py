@@ -7,6 +7,7 @@ group, so that its working set stays in the cache; nothing depends on how envs a
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,7 @@ class Loop:
             **options.values_for("scene"),
         )
         self._steps = 0
+        self._workspace: dict[Any, Any] = {}
         count, pack_size = envs.stop - envs.start, options.scenes_per_system
         size = max(options.load_engine().group_size // pack_size, 1) * pack_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
@@ -68,7 +70,9 @@ class Loop:
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
-        return make_pack(self.options, self._scene, envs.stop - envs.start, self._first_env + envs.start, draws)
+        return make_pack(
+            self.options, self._scene, envs.stop - envs.start, self._first_env + envs.start, draws, self._workspace
+        )
 
     def reset(
         self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], draws: Draws = NOTHING

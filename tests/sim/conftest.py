@@ -8,14 +8,19 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Robot, RunnerOptions
+from batchpid.sim.engine.engines import load_engine
 
 
 @pytest.fixture(params=["sapien", "mujoco"])
 def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Engine of the runners that this test makes without naming one, which have no ``pack_size`` in MuJoCo."""
+    """Engine of the runners that this test makes without naming one.
+
+    In MuJoCo they have no ``pack_size``, and in this process small groups, which share their working memory.
+    """
     name: str = request.param
     if name == "mujoco":
         pytest.importorskip("mujoco.batch")
+        monkeypatch.setattr(type(load_engine("mujoco")), "group_size", 4)
     original = RunnerOptions.__init__
 
     def init(options: RunnerOptions, *args: Any, **given: Any) -> None:

@@ -42,9 +42,10 @@ class MujocoEngine:
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
+        workspace: dict[Any, Any] | None = None,
     ) -> MujocoPack:
         """Return a new pack; its robots share nothing, for any ``system_size``."""
-        return MujocoPack(spec, size, first_env, variation, carrier, links)
+        return MujocoPack(spec, size, first_env, variation, carrier, links, workspace)
 
     def scene_dynamics(self, spec: SceneSpec) -> MujocoDynamics:
         """Return the model of the robot of ``spec``, in double precision."""

@@ -21,6 +21,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.batch_model import FLOATING, BatchModel, set_inertia
+from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.model_builder import LARGEST_FORCE, RobotMj, robot_model
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, functions
 from batchpid.sim.engine.native.interface import FARTHEST
@@ -53,8 +54,10 @@ class MujocoPack(SingleOwner):
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
+        workspace: dict[Any, Any] | None = None,
     ) -> None:
         self.spec, self.size, self.first_env = spec, size, first_env
+        self._workspace = {} if workspace is None else workspace
         self.steps_natively = native.status().active and functions() is not None
         self.dof, self._variation = len(spec.joints), variation or Variation()
         varied = self._variation
@@ -78,25 +81,32 @@ class MujocoPack(SingleOwner):
 
     def _make_data(self, robot: RobotMj) -> None:
         """Make the robots, with their masses."""
-        self._robot = robot
-        self._models = [robot.model] * self.size
-        self._data = [mujoco.MjData(robot.model) for _ in range(self.size)]
+        if robot not in self._workspace:
+            self._workspace[robot] = DataPool(robot)
+        self._robot, self._pool = robot, self._workspace[robot]
+        self.models, self.rows = [robot.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
         self._change_masses(range(self.size))
         self._update(range(self.size))
 
+    @property
+    def _data(self) -> list[Any]:
+        """``mujoco.MjData`` of each robot, in its state."""
+        return self._pool.take(self)
+
     def _update(self, rows: Iterable[int]) -> None:
         """Compute all that follows from the states of robots ``rows``, after a change of state or model."""
+        data = self._data
         for row in rows:
-            mujoco.mj_step1(self._models[row], self._data[row])
+            mujoco.mj_step1(self.models[row], data[row])
         self._calls: object = object()
         self._own_step: MujocoStep | None = None
 
     def _own_model(self, row: int) -> Any:
         """Return the model of robot ``row`` alone, which may be changed."""
-        model = self._models[row]
-        if model is self._robot.model or self._models.count(model) > 1:
-            model = self._models[row] = copy.copy(model)
+        model = self.models[row]
+        if model is self._robot.model or self.models.count(model) > 1:
+            model = self.models[row] = copy.copy(model)
         return model
 
     # -- reading -----------------------------------------------------------------------------------------------
@@ -135,7 +145,7 @@ class MujocoPack(SingleOwner):
     @cached_property
     def _varied_model(self) -> BatchModel:
         """Dynamics of the robots with their variation."""
-        return BatchModel(self._robot, self.size, self._models) if self._masses_vary else self._model
+        return BatchModel(self._robot, self.size, self.models) if self._masses_vary else self._model
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
@@ -163,17 +173,16 @@ class MujocoPack(SingleOwner):
         if self.steps_natively:
             if self._own_step is None:
                 applied = np.zeros_like(self.qf)
-                self._own_step = MujocoStep(
-                    self._robot, self._models, self._data, applied, self._suspended, False, None
-                )
+                self._own_step = self._make_step(applied, False, None)
             if self._own_step(np.ascontiguousarray(effort), *np.empty((3, *effort.shape))) & FAILED:
                 raise RuntimeError(self._own_step.message)
             return
         handler = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(lambda message: None)  # the loop finds states that are not finite
         try:
+            everyone = self._data
             for row in np.flatnonzero(~self._suspended):
-                model, data = self._models[row], self._data[row]
+                model, data = self.models[row], everyone[row]
                 data.qfrc_applied[self._moves] = effort[row]
                 mujoco.mj_step2(model, data)
                 if (np.abs(data.qpos[self._at]) <= FARTHEST).all():
@@ -195,9 +204,10 @@ class MujocoPack(SingleOwner):
     ) -> MujocoStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         reads_force = gravity and coriolis
-        return MujocoStep(
-            self._robot, self._models, self._data, self.qf, self._suspended, reads_force, speed_limit
-        )  # fmt: skip
+        return self._make_step(self.qf, reads_force, speed_limit)
+
+    def _make_step(self, qf: Float64, reads_force: bool, speed_limit: NDArray[np.float64] | None) -> MujocoStep:
+        return MujocoStep(self._robot, self.models, lambda: self._data, qf, self._suspended, reads_force, speed_limit)
 
     def look(self, left: list[int]) -> None:
         """Do nothing: MuJoCo needs no care before a contact."""
@@ -206,10 +216,11 @@ class MujocoPack(SingleOwner):
 
     def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at the origin."""
+        everyone = self._data
         for row, position, velocity in zip(rows, qpos, qvel, strict=True):
-            data = self._data[row]
+            data = everyone[row]
             ctrl = data.ctrl.copy()
-            mujoco.mj_resetData(self._models[row], data)
+            mujoco.mj_resetData(self.models[row], data)
             if not self.spec.fixed_base:
                 data.qpos[: FLOATING + 1] = _ORIGIN
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
@@ -231,7 +242,7 @@ class MujocoPack(SingleOwner):
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
         values = np.broadcast_to(self._implicit, self.qf.shape)
         for row in range(self.size) if rows is None else rows:
-            if not np.array_equal(self._models[row].dof_armature[self._robot.qvel], values[row]):
+            if not np.array_equal(self.models[row].dof_armature[self._robot.qvel], values[row]):
                 model = self._own_model(row)
                 model.dof_armature[self._robot.qvel] = values[row]
                 mujoco.mj_setConst(model, self._scratch)
@@ -239,13 +250,13 @@ class MujocoPack(SingleOwner):
 
     def _share(self) -> None:
         """Return to one shared model if neither masses nor armature nor drives of the robots differ."""
-        first = self._models[0]
+        first = self.models[0]
         if not self._masses_vary and all(
             np.array_equal(getattr(first, field), getattr(model, field))
-            for model in self._models[1:]
+            for model in self.models[1:]
             for field in _JOINTS
         ):
-            self._models = [first] * self.size
+            self.models = [first] * self.size
         self._update(range(self.size))
 
     @cached_property
@@ -288,7 +299,7 @@ class MujocoPack(SingleOwner):
         )
         gains = np.stack([-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2)
         for row in range(self.size):
-            model = self._models[row]
+            model = self.models[row]
             if not (
                 np.array_equal(model.actuator_biasprm[:, 1:3], gains[row])
                 and np.array_equal(model.actuator_forcerange[:, 1], limit[row])
@@ -335,7 +346,8 @@ class MujocoPack(SingleOwner):
 
     def close(self) -> None:
         """Free the robots. The pack cannot be used afterwards."""
-        self._data, self._models, self._own_step = [], [], None
+        self._pool.leave(self)
+        self.models, self._own_step = [], None
         for name in ("_model", "_varied_model", "_scratch"):
             self.__dict__.pop(name, None)
 

@@ -7,7 +7,7 @@ that follows from that state alone, so also gravity and Coriolis forces).
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,8 +47,10 @@ class MujocoStep:
     ----------
     robot
         Places of the joints in MuJoCo's arrays.
-    models, data
+    models
         Of each robot.
+    take_data
+        Function that returns the ``mujoco.MjData`` of each robot, the same at every call, in its state.
     qf, skip
         Efforts last applied (robots, dof), and the robots that are not stepped (robots,).
     reads_force
@@ -61,13 +63,13 @@ class MujocoStep:
         self,
         robot: RobotMj,
         models: Sequence[Any],
-        data: Sequence[Any],
+        take_data: Callable[[], Sequence[Any]],
         qf: NDArray[np.float64],
         skip: NDArray[np.bool_],
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
     ) -> None:
-        addresses = functions()
+        addresses, data = functions(), take_data()
         assert addresses is not None
         self._native = native.extension("_gateway")
         tables = {
@@ -89,10 +91,11 @@ class MujocoStep:
             velocities=True,
             speed_limit=None if limit is None else limit.ctypes.data,
         )
-        self._kept = models, data, arrays, robots, skip, limit
+        self._take_data, self._kept = take_data, (models, data, arrays, robots, skip, limit)
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA."""
+        """Return the address of the group, for a call of the extension or of XLA; the robots are in their states."""
+        self._take_data()
         return ctypes.addressof(self._group)
 
     def left(self) -> list[int]:

@@ -38,6 +38,7 @@ class SapienEngine:
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
+        workspace: dict[Any, Any] | None = None,
     ) -> Pack:
         """Return a new pack, with at most ``system_size`` scenes to a PhysX system."""
         if variation is None:

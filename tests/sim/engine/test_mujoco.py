@@ -9,6 +9,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
+from identical import assert_identical  # noqa: E402
 from robots import RUBBING, load_bundled  # noqa: E402
 from tiny_urdf import INERTIAL, joint, link, one_joint, random_tree, robot, write  # noqa: E402
 
@@ -235,6 +236,20 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
     both = run_drives(50.0, 200.0)
     for env, stiffness in enumerate((50.0, 200.0)):
         assert_same_env(run_drives(stiffness), both, env)
+
+
+def test_groups_that_share_their_working_memory_move_as_one_that_does_not(jaco2, monkeypatch):
+    """Arms lie on the ground and their fingers touch, where the next step depends on the solver's warm start."""
+    efforts = 0.02 * np.random.default_rng(0).normal(size=(60, 6, jaco2.dof)) * jaco2.effort_limit
+    runs = []
+    for size in (64, 2):
+        monkeypatch.setattr(type(load_engine("mujoco")), "group_size", size)
+        with Runner(jaco2, 6, engine="mujoco", workers=0, control="effort", compensate="none") as runner:
+            runner.reset(jaco2.sample(6, seed=1))
+            runs.append([runner.step(effort) for effort in efforts])
+    for one, other in zip(*runs, strict=True):
+        assert_identical(one, other)
+    assert runs[0][-1].ok.all()
 
 
 def test_a_snapshot_of_the_other_engine_is_refused(panda):

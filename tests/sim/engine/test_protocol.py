@@ -144,7 +144,7 @@ class ToyEngine:
     def is_physics(self, settings):
         return False
 
-    def make_pack(self, spec, size, first_env=0, system_size=8, variation=None, carrier="", links=()):
+    def make_pack(self, spec, size, first_env=0, system_size=8, variation=None, carrier="", links=(), workspace=None):
         return DoubleIntegrators(spec, size, first_env)
 
     def robot_dynamics(self, robot, ground=None):

@@ -53,11 +53,14 @@ def test_more_envs_than_the_machine_has_memory_for_are_refused():
     assert estimate_memory(RunnerOptions(ROBOT, smaller), smaller) < psutil.virtual_memory().total
 
 
-def test_the_estimate_is_below_what_the_envs_take_but_not_far():
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_the_estimate_is_below_what_the_envs_take_but_not_far(engine):
+    pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     program = (  # a new process, so that no memory is reused
         "import psutil, warnings; warnings.simplefilter('ignore'); from sim import Robot, Runner\n"
         "from batchpid.sim.workers.memory import estimate_memory\n"
-        "robot = Robot.load('jaco2'); options = dict(params=robot.params(), workers=0)\n"
+        "robot = Robot.load('jaco2'); "
+        f"options = dict(params=robot.params(), workers=0, engine={engine!r})\n"
         "rss = lambda: psutil.Process().memory_info().rss\n"
         "with Runner(robot, 1, **options): before = rss()\n"
         "with Runner(robot, 200, **options) as runner:\n"

@@ -1,0 +1,68 @@
+"""Working memory of packs in MuJoCo, which the packs of a loop use in turn.
+
+A ``mujoco.MjData`` takes half a megabyte, of which a hundred numbers are the state of a robot. So the packs of a loop,
+which runs them one after another, share as many as the largest of them needs. A pack that is not at work keeps the rows
+of its states; back at work it computes the rest by ``mj_step1``, with the same result to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.native.interface import FARTHEST
+
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+"""Parts of the state: all of the inputs of a sim step."""
+POSITIONS = 1
+"""Place of the positions in the state, after the time."""
+
+
+class User(Protocol):
+    """Pack that uses a :class:`DataPool`: a model and a row of the state for each robot."""
+
+    models: Sequence[Any]
+    rows: NDArray[np.float64]
+
+
+class DataPool:
+    """``mujoco.MjData`` of ``robot`` for one pack at a time."""
+
+    def __init__(self, robot: RobotMj) -> None:
+        self.robot, self._data = robot, list[Any]()
+        self._user: User | None = None
+        self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
+        mujoco.mj_getState(robot.model, self._new(1)[0], self._initial, STATE)
+
+    def initial(self, size: int) -> NDArray[np.float64]:
+        """Return the rows of ``size`` robots at rest, with their joints at 0."""
+        return np.tile(self._initial, (size, 1))
+
+    def take(self, user: User) -> list[Any]:
+        """Return the data of the robots of ``user``, in their states; another user's states are kept in its rows."""
+        data = self._new(len(user.rows))
+        if self._user is not user:
+            if self._user is not None:
+                for model, each, row in zip(self._user.models, self._data, self._user.rows, strict=False):
+                    mujoco.mj_getState(model, each, row, STATE)
+            self._user = user
+            sound = np.all(np.abs(user.rows[:, POSITIONS + self.robot.qpos]) <= FARTHEST, axis=1)
+            for model, each, row, finite in zip(user.models, data, user.rows, sound.tolist(), strict=True):
+                mujoco.mj_setState(model, each, row, STATE)
+                if finite:
+                    mujoco.mj_step1(model, each)
+        return data
+
+    def leave(self, user: User) -> None:
+        """Forget the states of ``user``."""
+        if self._user is user:
+            self._user = None
+
+    def _new(self, size: int) -> list[Any]:
+        self._data += [mujoco.MjData(self.robot.model) for _ in range(size - len(self._data))]
+        return self._data[:size]
