@@ -1,8 +1,11 @@
-"""Result of an export."""
+"""Results of an export and of an import."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+from batchpid.law.params import PIDParams
+from batchpid.motors.actuators import Actuators
 
 
 class Exported(NamedTuple):
@@ -11,3 +14,20 @@ class Exported(NamedTuple):
     text: str
     differences: tuple[str, ...] = ()
     """One sentence each; empty where the target computes the same law."""
+
+
+class Imported(NamedTuple):
+    """Params, the names of their joints, and the differences of the law from that of the file."""
+
+    params: PIDParams
+    joint_names: list[str]
+    differences: tuple[str, ...] = ()
+
+
+class ImportedMotors(NamedTuple):
+    """Params with the motors of their joints, and the differences of both from the file."""
+
+    params: PIDParams
+    joint_names: list[str]
+    differences: tuple[str, ...]
+    actuators: Actuators

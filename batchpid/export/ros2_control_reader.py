@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.checks.validate import choice, names
 from batchpid.errors import InvalidArgumentError
+from batchpid.export.exported import Imported
 from batchpid.export.ros2_control import LEAVES, NEUTRAL, STRATEGIES
 from batchpid.io import documents
 from batchpid.law.params import PIDParams, make_params
@@ -24,14 +25,6 @@ _KNOWN: dict[str, Any] = {
 }
 """Gains of both controllers, with their defaults."""
 _ANTI_WINDUP = {theirs: ours for ours, theirs in STRATEGIES.items()}
-
-
-class Imported(NamedTuple):
-    """Params, the names of their joints, and the differences of the law from the file's controller."""
-
-    params: PIDParams
-    joint_names: list[str]
-    differences: tuple[str, ...] = ()
 
 
 def from_ros2_control(

@@ -252,6 +252,7 @@ class Robot(RobotDescription):
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control.
+        Of <pid> also ki and its limit.
 
         Raises
         ------
@@ -262,7 +263,11 @@ class Robot(RobotDescription):
         if defaults is None or defaults.kp is None or defaults.kv is None:
             problem = f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an affine bias)"
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        return self.params(kp=defaults.kp, ki=0.0, kd=defaults.kv, measurement_rate="measured")
+        options: dict[str, Any] = {"ki": 0.0}
+        if defaults.ki is not None and defaults.imax is not None and defaults.ki.any():
+            limit = np.where(defaults.ki > 0, defaults.ki, 1.0) * defaults.imax
+            options = {"ki": defaults.ki, "anti_windup": "none", "integral_limit": limit}
+        return self.params(kp=defaults.kp, kd=defaults.kv, measurement_rate="measured", **options)
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -282,10 +287,10 @@ def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
     start = read_only(np.array([mjcf.start[name] for name in names]))
     if not any(mjcf.motors.kp.values()):
         return FileDefaults(start)
-    kp, kv = (
-        read_only(np.array([gains.get(name, 0.0) for name in names])) for gains in (mjcf.motors.kp, mjcf.motors.kv)
-    )
-    return FileDefaults(start, kp, kv)
+    motors = mjcf.motors
+    columns = (motors.kp, 0.0), (motors.kv, 0.0), (motors.ki, 0.0), (motors.imax, np.inf)
+    kp, kv, ki, imax = (read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns)
+    return FileDefaults(start, kp, kv, ki, imax)
 
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:

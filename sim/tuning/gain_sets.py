@@ -10,6 +10,8 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.export.exported import Imported, ImportedMotors
+from batchpid.export.isaac_lab_reader import from_isaac_lab
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
 from batchpid.io import documents
 from batchpid.sim.robot.robot import Robot
@@ -32,8 +34,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
     "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial" are the gains in
     SAPIEN's tutorial, for a bundled robot, "mjcf" is :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
-    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or files of ros2_control,
-    whose differences from the law are warnings.
+    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or gains of other programs:
+    YAML of ros2_control, Python of Isaac Lab (parsed, not executed), MJCF (.xml); their differences are warnings.
 
     Raises
     ------
@@ -58,20 +60,25 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         raise InvalidArgumentError(
             "gains", "is neither a name nor a file", value=name, remedy=f"use a file or {', '.join(NAMES)}"
         )
-    if path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
-        return GainSet(path.name, _of_ros2_control(robot, path))
-    return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
-
-
-def _of_ros2_control(robot: Robot, path: Path) -> bp.PIDParams:
-    """Return the params in a file of ros2_control; followers, which it does not name, get their leaders' gains."""
-    own = robot.independent
-    joints = [name for name, independent in zip(robot.joint_names, own, strict=True) if independent]
-    found = from_ros2_control(path.read_text(), joints, continuous=robot.continuous[own])
+    own = [joint for joint, independent in zip(robot.joint_names, robot.independent, strict=True) if independent]
+    if path.suffix.lower() == ".py":
+        found: Imported | ImportedMotors = from_isaac_lab(path.read_text(), own)
+    elif path.suffix.lower() == ".xml":
+        found = _of_mjcf(path, own)
+    elif path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
+        found = from_ros2_control(path.read_text(), own, continuous=robot.continuous[robot.independent])
+    else:
+        return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
     for each in found.differences:
-        warnings.warn(f"{path}: {each}", stacklevel=3)
-    return (
-        found.params
-        if robot.coupling is None
-        else found.params.for_joints(robot.coupling.of_all(np.arange(len(joints))))
-    )
+        warnings.warn(f"{path}: {each}", stacklevel=2)
+    if robot.coupling is None:
+        return GainSet(path.name, found.params)
+    return GainSet(path.name, found.params.for_joints(robot.coupling.of_all(np.arange(len(own)))))
+
+
+def _of_mjcf(path: Path, joints: list[str]) -> Imported:
+    """Return the gains of the servos in an MJCF file of a robot with the same joints."""
+    other = Robot.load(path)
+    if missing := sorted(set(joints) - set(other.joint_names)):
+        raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
+    return Imported(other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints]), joints)

@@ -35,6 +35,9 @@ class Motors(NamedTuple):
     kp: dict[str, float]
     kv: dict[str, float]
     """Gains of servos; joints without servo are left out."""
+    ki: dict[str, float]
+    imax: dict[str, float]
+    """Limits of the integral of the error [rad s or m s] of <pid>; joints without one are left out."""
 
 
 def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplings:
@@ -74,8 +77,10 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     limits: dict[str, float] = defaultdict(float)
     kp: dict[str, float] = defaultdict(float)
     kv: dict[str, float] = defaultdict(float)
+    ki: dict[str, float] = defaultdict(float)
+    imax: dict[str, float] = {}
     driven: set[str] = set()
-    for actuator in range(model.nu):
+    for actuator in range(len(model.actuator_trntype)):  # nu counts inputs, of which <pid> has up to three
         arms = _arms(model, actuator, names)
         label = model.actuator(actuator).name or f"number {actuator}"
         if not arms:
@@ -92,9 +97,14 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
         if len(leading) > 1:
             text = f"actuator {label!r} pulls several joints: each has a motor of its own here, as strong as all"
             findings += [Finding("warning", "actuator", text, "control them together", name) for name in leading]
-        if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE:
+        integrates = len(leading) == 1 and _is_pid(model, actuator)
+        if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE and not integrates:
             text = f"actuator {label!r} has dynamics of its own, which are not simulated"
             findings.append(Finding("warning", "actuator", text, "give lag= to make_actuators", next(iter(leading))))
+        if (delay := _field(model, "actuator_delay", actuator)) > 0:
+            text = f"actuator {label!r} has a delay, which is not simulated"
+            remedy = "give command_delay= to make_actuators"
+            findings.append(Finding("warning", "actuator", text, remedy, next(iter(leading)), detail=f"{delay:g} s"))
         force = _force_limit(model, actuator, next(iter(leading)), findings)
         stiffness, rate = -model.actuator_biasprm[actuator, 1:3]
         for name, arm in leading.items():
@@ -102,6 +112,10 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             if model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE and len(leading) == 1:
                 kp[name] += max(float(arm**2 * stiffness), 0.0)
                 kv[name] += max(float(arm**2 * rate), 0.0)
+            if integrates:
+                ki[name] += arm**2 * float(model.actuator_gainprm[actuator, 0])
+                if (most := float(model.actuator_dynprm[actuator, 0])) > 0:
+                    imax[name] = most / abs(arm)
     own, armature = armature, {name: value * (name not in couplings) for name, value in armature.items()}
     for follower in couplings:
         for leader, multiplier in _leading({follower: 1.0}, couplings).items():
@@ -114,7 +128,15 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             text = "no actuator of the file moves the joint: it is controlled as all others"
             findings.append(Finding("warning", "actuator", text, "give it gains of 0 to let it move freely", name))
     findings += _tendons(model)
-    return Motors(dict(limits), armature, damping, dict(kp), dict(kv))
+    return Motors(dict(limits), armature, damping, dict(kp), dict(kv), dict(ki), imax)
+
+
+def _is_pid(model: Any, actuator: int) -> bool:
+    """Return whether an actuator is MuJoCo's <pid> (3.15 and later) without a limit of the setpoint's rate."""
+    kind = getattr(mujoco.mjtDyn, "mjDYN_PID", None)
+    return bool(
+        kind is not None and model.actuator_dyntype[actuator] == kind and model.actuator_dynprm[actuator, 1] <= 0
+    )
 
 
 def _field(model: Any, name: str, index: int) -> float:
@@ -155,8 +177,10 @@ def _force_limit(model: Any, actuator: int, name: str, findings: list[Finding]) 
     if model.actuator_forcelimited[actuator]:
         return _magnitude(model.actuator_forcerange[actuator], name, findings)
     fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-    if fixed and model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE and model.actuator_ctrllimited[actuator]:
-        ends = model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]
+    inputs = getattr(model, "actuator_ctrladr", None)  # older versions have one input for each actuator
+    first = actuator if inputs is None else int(inputs[actuator])
+    if fixed and model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE and model.actuator_ctrllimited[first]:
+        ends = model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[first]
         return _magnitude(ends, name, findings)
     return math.inf
 

@@ -113,10 +113,66 @@ def test_the_file_is_that_of_a_controller_manager():
     assert body == {"joints": JOINTS, "command_interfaces": ["effort"], "state_interfaces": ["position", "velocity"]}
 
 
+GAINS = dict.fromkeys(("p", "i", "d", "u_clamp_max", "u_clamp_min", "i_clamp_max", "i_clamp_min"), float)
+GAINS |= {"antiwindup_strategy": ("back_calculation", "conditional_integration", "none")}
+GAINS |= {"tracking_time_constant": float, "error_deadband": float}
+SCHEMA = {
+    "joint_trajectory_controller": {
+        "joints": [str],
+        "command_interfaces": ("position", "velocity", "acceleration", "effort"),
+        "state_interfaces": ("position", "velocity", "acceleration"),
+        "gains": GAINS | {"ff_velocity_scale": float},
+    },
+    "pid_controller": {
+        "dof_names": [str],
+        "command_interface": str,
+        "reference_and_state_interfaces": [str],
+        "gains": GAINS | {"feedforward_gain": float, "angle_wraparound": bool},
+    },
+}
+"""Types, or values, of the parameters that the files use, after those that generate_parameter_library declares in
+ros2_controllers 5. Its lists are not empty and without repetition, its doubles refuse integers."""
+
+
+def fits(value, kind):
+    if isinstance(kind, type):
+        return type(value) is kind and not (kind is float and math.isnan(value))
+    if isinstance(kind, tuple) and isinstance(value, str):
+        return value in kind
+    entry = kind[0] if isinstance(kind, list) else kind
+    return isinstance(value, list) and len(set(value)) == len(value) > 0 and all(fits(each, entry) for each in value)
+
+
+def check_schema(text, controller):
+    body = yaml.safe_load(text)[controller]["ros__parameters"]
+    schema = SCHEMA[controller]
+    assert body.keys() == schema.keys()
+    assert set(body["gains"]) == set(body.get("joints", body.get("dof_names")))
+    for key in body.keys() - {"gains"}:
+        assert fits(body[key], schema[key]), (key, body[key])
+    for gains in body["gains"].values():
+        assert set(gains) <= set(schema["gains"])
+        assert all(fits(value, schema["gains"][key]) for key, value in gains.items()), gains
+        # Checks of control_toolbox's gains.
+        assert gains["i_clamp_min"] <= 0 <= gains["i_clamp_max"]
+        assert gains["u_clamp_min"] < gains["u_clamp_max"]
+        assert gains["tracking_time_constant"] >= 0
+
+
+def test_the_schema_refuses_what_the_target_refuses():
+    text = to_ros2_control(bp.make_params(3, 1.0), JOINTS, DT).text
+    check_schema(text, CONTROLLERS[0])
+    for before, after in (("p: 1.0", "p: 1"), ("p: 1.0", "q: 1.0"), ("none", "legacy"), ("[effort]", "[torque]")):
+        assert before in text
+        with pytest.raises(AssertionError):
+            check_schema(text.replace(before, after), CONTROLLERS[0])
+
+
 @given(random_params(), st.sampled_from(CONTROLLERS))
 @settings(max_examples=80, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(params, controller):
     exported = to_ros2_control(params, JOINTS, DT, controller=controller, inertia=[2.0, 1.0, 0.5])
+    check_schema(exported.text, controller)
     back, joints, _ = from_ros2_control(exported.text)
     assert joints == JOINTS
     listed = {each.partition(":")[0] for each in exported.differences}

@@ -6,6 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from export_cases import JOINTS, random_params, values
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
 import batchpid as bp
@@ -210,3 +213,41 @@ def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
         apart = np.abs(np.array(reached[1::2]) - ours[:, move]).max()
         assert apart < 2e-3, (move, apart)
     assert np.abs(ours[-1] - moves.start).max() > 0.5
+
+
+LINKS = [link(name, INERTIAL) for name in "wxyz"]
+CHAIN = [*LINKS, *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy", "yz"), strict=True))]
+
+
+@given(random_params(), st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
+    params = params.replace(kp=params.kp + 1.0)  # a file without any stiffness has no servos
+    folder, inertia, rng = tmp_path_factory.mktemp("chain"), np.array([2.0, 1.0, 0.5]), np.random.default_rng(seed)
+    chain = Robot.load(write(folder, robot(*CHAIN)))
+    motors = {"armature": rng.uniform(0.01, 1, 3), "coulomb": rng.uniform(0, 1, 3), "viscous": rng.uniform(0, 1, 3)}
+    assert list(chain.joint_names) == JOINTS
+    exported = to_mjcf(chain, params, DT, actuators=bp.make_actuators(3, **motors), inertia=inertia)
+    (folder / "chain.xml").write_text(exported.text)
+    other = Robot.load(folder / "chain.xml")
+    back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
+    scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
+    kept = params.ki is not None and np.array(values(params, "ki")) > 0
+    for name in ("kp", "ki", "kd"):
+        np.testing.assert_allclose(values(back, name), np.array(values(params, name)) * scale, rtol=tolerance)
+    if np.any(kept) and "integral_limit" not in listed:
+        assert params.integral_max is None
+    if np.any(kept) and params.integral_max is not None and back.integral_max is not None:
+        low, high = np.array(values(params, "integral_min")), np.array(values(params, "integral_max"))
+        limit = np.minimum(-low, high)
+        np.testing.assert_allclose(np.array(values(back, "integral_max"))[kept], limit[kept], rtol=tolerance)
+    model = model_of(exported)
+    ends = np.clip([values(params, "effort_min"), values(params, "effort_max")], -1e10, 1e10).T
+    limited = np.abs(ends).min(1) < 1e10
+    np.testing.assert_allclose(model.actuator_forcerange[limited], ends[limited], rtol=tolerance)
+    found = {"armature": other.actuators.armature[0], "coulomb": other.friction, "viscous": other.damping}
+    for name, was in motors.items():
+        np.testing.assert_allclose(found[name], was, rtol=1e-12)
+    lost = {"effort_rate_limit", "setpoint_weight", "deadband", "continuous", "non_finite", "gain_units"}
+    lost |= {"setpoint_weight_derivative", "derivative_filter_time"} if params.kd is not None else set()
+    assert {name for name in lost if getattr(params, name) is not None} == listed & lost

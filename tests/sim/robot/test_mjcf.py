@@ -368,6 +368,19 @@ def test_several_actuators_of_a_joint_add_up(load):
     np.testing.assert_array_equal([np.ravel(robot.mjcf_gains().kp), np.ravel(robot.mjcf_gains().kd)], [[20], [3]])
 
 
+@pytest.mark.skipif(not hasattr(mujoco.mjtDyn, "mjDYN_PID"), reason="an older MuJoCo")
+def test_a_pid_has_an_integral_and_may_have_several_inputs(load):
+    text = two_links(
+        rest="""<actuator><pid joint="j" kp="5" kv="1" ki="3" imax=".5" gear="2" input="pos vel ff"/>
+        <motor joint="j" gear="3" ctrlrange="-2 2" delay="0.01" nsample="9"/></actuator>"""
+    )
+    robot = load(text)
+    gains = robot.mjcf_gains()
+    figures = gains.kp, gains.ki, gains.kd, gains.integral_max
+    np.testing.assert_array_equal(np.ravel(figures), [20, 12, 4, 3])
+    assert any("'number 1' has a delay, which is not simulated" in str(each) for each in robot.check())
+
+
 @pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
 def test_armature_and_damping_of_actuators(load):
     text = two_links(rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>')

@@ -9,6 +9,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
+from batchpid.export import to_isaac_lab
 from batchpid.sim.tuning.gain_sets import gain_set
 
 
@@ -55,3 +56,28 @@ def test_unknown_names_are_refused(panda, name):
 def test_tuned_gains_of_a_robot_without_are_refused(panda):
     with pytest.raises(InvalidArgumentError, match="tuned"):
         gain_set(dataclasses.replace(panda, settings=None), "tuned")
+
+
+def test_gains_of_other_programs_are_read_from_their_files(panda, tmp_path):
+    params = bp.make_params(9, np.linspace(5, 80, 9), None, 2.0, effort_limit=20.0, measurement_rate="measured")
+    (path := tmp_path / "arm.py").write_text(to_isaac_lab(params, panda.joint_names, 0.005, model="ideal_pd").text)
+    found = gain_set(panda, str(path))
+    assert (found.name, found.control) == ("arm.py", "pid")
+    assert same(found.params, params)
+    path.write_text(to_isaac_lab(params, panda.joint_names, 0.005).text)
+    with pytest.warns(UserWarning, match=r"arm.py: law: Isaac Lab's implicit drive"):
+        gain_set(panda, str(path))
+
+
+def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
+    pytest.importorskip("mujoco", "3.17")
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    params = bp.make_params(
+        9, np.linspace(5, 80, 9), 3.0, 2.0, effort_limit=20.0, integral_limit=7.0, measurement_rate="measured"
+    )
+    (path := tmp_path / "arm.xml").write_text(to_mjcf(panda, params, 1 / 2000).text)
+    assert same(gain_set(panda, str(path)).params, params)
+    path.write_text(path.read_text().replace("panda_joint1", "joint_1"))
+    with pytest.raises(InvalidArgumentError, match="panda_joint1"):
+        gain_set(panda, str(path))

@@ -1,0 +1,117 @@
+"""Gains and motors read from actuator configurations of Isaac Lab: of an export, and as people write them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from export_cases import DT, JOINTS, random_params, values
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.export import from_isaac_lab, to_isaac_lab
+
+MINE = """
+import isaaclab.sim as sim_utils
+from isaaclab import actuators
+raise SystemExit("never executed")
+ARMATURE, HERTZ = 0.01, 10
+INERTIA = 0.02
+STIFFNESS = INERTIA * (HERTZ_ := 3)
+OMEGA = 2.0 * math.pi * 5
+ROBOT = ArticulationCfg(
+    spawn=sim_utils.UsdFileCfg(usd_path=f"{ROOT}/arm.usd"),
+    actuators={
+        "arm": actuators.IdealPDActuatorCfg(
+            joint_names_expr=["shoulder", "elb.*"],
+            stiffness={"shoulder": INERTIA * OMEGA**2, ".*bow": 20},
+            damping=2.5,
+            effort_limit=40.0,
+            velocity_limit=3.0,
+            armature=INERTIA / 2,
+        ),
+        "hand": actuators.DelayedPDActuatorCfg(
+            joint_names_expr=["wr.*"], stiffness=5.0, damping=0.1, friction=0.3, min_delay=0, max_delay=4
+        ),
+    },
+)
+"""
+
+
+def test_configurations_by_hand_are_read_and_not_executed():
+    params, joints, differences, motors = from_isaac_lab(MINE, JOINTS, dt=0.005)
+    assert joints == JOINTS
+    np.testing.assert_allclose(params.kp, [[0.02 * (10 * np.pi) ** 2, 20.0, 5.0]], rtol=1e-15)
+    np.testing.assert_array_equal(params.kd, [[2.5, 2.5, 0.1]])
+    np.testing.assert_array_equal(params.effort_max, [[40.0, 40.0, np.inf]])
+    np.testing.assert_array_equal(motors.armature, [[0.01, 0.01, 0.0]])
+    np.testing.assert_array_equal(motors.coulomb, [[0.0, 0.0, 0.3]])
+    np.testing.assert_array_equal(motors.command_delay, [[0.0, 0.0, 0.01]])
+    assert [each.partition(":")[0] for each in differences] == ["command_delay", "velocity_limit", "command_delay"]
+    unknown = from_isaac_lab(MINE, JOINTS[::-1])
+    assert unknown.actuators.command_delay is None
+    assert "not read" in unknown.differences[-1]
+    np.testing.assert_array_equal(unknown.params.kp, params.kp[:, ::-1])
+
+
+@given(random_params(), st.sampled_from(["implicit", "ideal_pd", "dc_motor", "delayed_pd"]), st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_a_round_trip_loses_only_what_is_listed(params, model, seed):
+    rng = np.random.default_rng(seed)
+    coulomb = rng.uniform(0, 2, 3)
+    own = {
+        "armature": rng.uniform(0, 1, 3),
+        "coulomb": coulomb,
+        "static": coulomb * 1.5,
+        "viscous": rng.uniform(0, 1, 3),
+    }
+    if model == "dc_motor":
+        own |= {"saturation_effort": rng.uniform(1, 99, 3), "no_load_speed": rng.uniform(1, 9, 3), "effort_limit": 30.0}
+    if model == "delayed_pd":
+        own["command_delay"] = DT * rng.integers(0, 5, 3)
+    motors = bp.make_actuators(3, **own)
+    inertia = np.array([2.0, 1.0, 0.5])
+    exported = to_isaac_lab(params, JOINTS, DT, actuators=motors, model=model, inertia=inertia)
+    back = from_isaac_lab(exported.text, JOINTS, dt=DT)
+    listed = {each.partition(":")[0] for each in exported.differences}
+    scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
+    for name in ("kp", "kd"):
+        np.testing.assert_allclose(values(back.params, name), np.array(values(params, name)) * scale, rtol=tolerance)
+    high = np.array(values(params, "effort_max")) if "effort_limit" not in listed or model == "implicit" else None
+    if high is not None and np.array_equal(high, np.negative(values(params, "effort_min"))):
+        limit = np.minimum(high, 30.0) if model == "dc_motor" else high
+        np.testing.assert_allclose(values(back.params, "effort_max"), limit, rtol=tolerance)
+    for name in set(own) - {"effort_limit"}:
+        was, now = getattr(motors, name), getattr(back.actuators, name)
+        np.testing.assert_allclose(0.0 if now is None else now, 0.0 if was is None else was, rtol=1e-12, atol=1e-18)
+    lost = {"ki", "effort_rate_limit", "setpoint_weight", "setpoint_weight_derivative", "derivative_filter_time"}
+    lost |= {"deadband", "continuous", "non_finite"}
+    for name in lost - listed:
+        if name in ("setpoint_weight_derivative", "derivative_filter_time") and params.kd is None:
+            continue
+        assert getattr(params, name) is None or not np.any(getattr(params, name)), name
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        ("stiffness=5.0", "stiffness=None", "gives no stiffness.*wrist|wrist.*gives no stiffness"),
+        ("stiffness=5.0, ", "", "gives no stiffness"),
+        ("stiffness=5.0", "stiffness=read()", r"read\(\) is no number \(got 'line 2\d'"),
+        ("stiffness=5.0", "stiffness=9**9**9", "is no number"),
+        ("stiffness=5.0", "stiffness='5'", "stiffness is no number"),
+        ("stiffness=5.0", "stiffness=-5.0", "kp"),
+        ('["wr.*"]', '["finger"]', "no actuators of the text match"),
+        ('["wr.*"]', '[".*"]', "several actuators"),
+        ('["wr.*"]', '["("]', "regular expression"),
+        ('".*bow"', '".*"', "several keys of stiffness"),
+        ("DelayedPDActuatorCfg", "ActuatorNetLSTMCfg", "ActuatorNetLSTMCfg"),
+        ("joint_names_expr", "joints", "holds no actuators"),
+        ("ROBOT = ", "ROBOT = = ", "is no Python"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(before, after, named):
+    assert before in MINE
+    with pytest.raises(InvalidArgumentError, match=named):
+        from_isaac_lab(MINE.replace(before, after), JOINTS)
