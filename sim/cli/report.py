@@ -14,6 +14,7 @@ from tabulate import tabulate
 from batchpid.metrics import StepMetrics
 from batchpid.sim import Robot, Rollout, Runner
 from batchpid.sim.tuning.evaluation import Evaluation, arm_joints
+from batchpid.task_space.frames import pose_error
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
@@ -27,6 +28,23 @@ def run_report(runner: Runner, rollout: Rollout, metrics: StepMetrics, wall: flo
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
     outcome = "\n".join(outcome_lines(runner.robot, rollout, metrics))
     return f"{speed}\n\n{joint_table(runner.robot, metrics)}\n\n{outcome}"
+
+
+def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
+    """Return the report of a ``rollout`` to a pose of the tool (7,) that took ``wall`` seconds."""
+    speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
+    assert rollout.tool_pose is not None
+    error = pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float))
+    rows = []
+    for name, part in (("position [mm]", error[..., :3]), ("rotation [mrad]", error[..., 3:])):
+        size = 1e3 * np.linalg.norm(part, axis=-1)
+        ends = size[-max(1, len(size) // 10) :].max(0)
+        rows.append([name, *(f"{np.median(each):.3g} / {each.max():.3g}" for each in (size[0], ends))])
+    headers = ["median / worst env", "first error", "final error"]
+    failed = np.flatnonzero(~rollout.ok.all(0))
+    outcome = f"FAILED: {len(failed)} of {rollout.num_envs} envs, the first is env {failed[0]}." if len(failed) else ""
+    about = f"Tool: {runner.options.tool}. final error: the largest in the last tenth of the run."
+    return f"{speed}\n\n{table(rows, headers, 'lrr')}\n\n{about}\n{outcome}".rstrip()
 
 
 def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:

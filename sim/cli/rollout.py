@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from batchpid.checks.validate import array, number
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
@@ -18,16 +21,19 @@ class RolloutCommand:
     """Move N of any robot from seeded poses to a setpoint; print a table and write the run to a file.
 
     The file holds time (ticks,), setpoint, qpos, qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs),
-    and the robot's joint names, units and limits.
+    with --control osc tool_pose (ticks, envs, 7), and the robot's joint names, units and limits.
     """
 
     robot: flags.RobotName = "panda"
     num_envs: flags.NumEnvs = 64
     gains: flags.Gains = None
-    control: Literal["pid", "drive"] = "pid"
-    """Batch PID, or PhysX's internal drive."""
+    control: Literal["pid", "drive", "osc"] = "pid"
+    """Batch PID, PhysX's internal drive, or operational-space control of a tool."""
+    tool: Annotated[str | None, tyro.conf.arg(metavar="LINK", help_behavior_hint="")] = None
+    """With --control osc: link to move. Default: the last one of the longest chain."""
     setpoint: flags.OptionalFloats = None
-    """One position per joint [rad or m]. Default: the bundled robot's target, else the start pose."""
+    """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
+    target, else the start pose, or the tool's pose there."""
     seconds: flags.Seconds = 2.0
     timestep: float = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -60,7 +66,7 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.run import hold_setpoint, read_variation, start_poses
+        from batchpid.sim.cli.run import hold_pose, hold_setpoint, read_variation, start_poses
 
         outputs = Outputs(force=self.force)
         out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
@@ -73,19 +79,30 @@ class RolloutCommand:
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         target = robot.start if robot.settings is None else robot.settings.target
         goal: Any = target if self.setpoint is None else self.setpoint
-        setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
-        gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
+        if osc := self.control == "osc":
+            if self.gains is not None:
+                problem = "are those of joints, and --control osc has its own"
+                raise InvalidArgumentError("gains", problem, value=self.gains, remedy="leave them out")
+            params: Any = None
+            control: Any = "osc"
+        else:
+            setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
+            gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
+            params, control = gains.params, "drive" if gains.control == "drive" else self.control
         with Runner(
             robot,
             self.num_envs,
-            params=gains.params,
-            control="drive" if gains.control == "drive" else self.control,
-            **flags.chosen(self, "workers cluster timestep substeps compensate engine physics backend collisions"),
+            params=params,
+            control=control,
+            **flags.chosen(self, "tool workers cluster timestep substeps compensate engine physics backend collisions"),
             randomization=randomization,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
-                rollout, report = hold_setpoint(runner, start, setpoint, seconds)
+                if osc:
+                    rollout, report = hold_pose(runner, start, target, self.setpoint, seconds)
+                else:
+                    rollout, report = hold_setpoint(runner, start, setpoint, seconds)
         if out is not None and not streamed:
             write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.checks.validate import integer, number
+from batchpid.checks.validate import array, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.progress import bar
-from batchpid.sim.cli.report import run_report
+from batchpid.sim.cli.report import run_report, tool_report
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
@@ -46,6 +46,20 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
     began = time.perf_counter()
     rollout, metrics = run_moves(runner, moves, seconds, bar("simulating", unit="tick"))
     return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
+
+
+def hold_pose(
+    runner: Runner, start: NDArray[Any], target: NDArray[Any], given: Any, seconds: float
+) -> tuple[Rollout, str]:
+    """Hold the pose ``given`` (7,), or None for that at ``target`` (dof,), from ``start`` (envs, dof)."""
+    began, names = time.perf_counter(), runner.command.names
+    assert runner.options.tool_pose is not None
+    goal = runner.options.tool_pose(target) if given is None else given
+    goal = array("setpoint", goal, (1, len(names)), names, kind="entry")[0]
+    runner.reset(start, seed=None if runner.options.randomization is None else 0)
+    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
+    rollout = runner.rollout(np.tile(goal, (ticks, 1)), progress=bar("simulating", unit="tick"))
+    return rollout, tool_report(runner, rollout, time.perf_counter() - began)
 
 
 def evaluate_sets(

@@ -103,6 +103,19 @@ def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
     assert "warning" not in err
 
 
+def test_a_tool_is_moved_to_a_pose(batchpid, tmp_path):
+    goal = [0.4, 0.1, 0.5, 0.0, 1.0, 0.0, 0.0]
+    flags = "--control", "osc", "--tool", "panda_hand", "--setpoint", *goal
+    status, said, err = batchpid("rollout", *SHORT, "--force", "--out", tmp_path / "run.npz", *flags)
+    assert status == 0, err
+    assert "Tool: panda_hand" in said
+    with np.load(tmp_path / "run.npz") as file:
+        np.testing.assert_array_equal(file["setpoint"], np.broadcast_to(goal, (5, 3, 7)))
+        error = 1e3 * np.linalg.norm(file["tool_pose"][..., :3] - goal[:3], axis=-1)
+    line = next(line for line in said.splitlines() if line.startswith("position [mm]"))
+    assert line.split()[-1] == f"{error[-1].max():.3g}"
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -117,6 +130,9 @@ def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
         (("--seconds", "-1"), "seconds: out of range"),
         (("--timestep", "0"), "timestep: out of range"),
         (("--substeps", "0"), "substeps: out of range"),
+        (("--control", "osc", "--gains", "tuned"), "gains: are those of joints"),
+        (("--control", "osc", "--setpoint", "1", "2"), "setpoint: has shape (2,)"),
+        (("--tool", "panda_hand"), "tool: is for control 'osc'"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value[:2]),
 )
