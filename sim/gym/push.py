@@ -30,9 +30,10 @@ NEAR_WEIGHT = 0.1
 class PushVectorEnv(ToolVectorEnv):
     """N robots, each with a box to push to a goal on the ground. It needs ``engine="sapien"``, the default.
 
-    The tool moves in a horizontal plane with the fingers closed, behind the box. The box is content of the scene
-    (``build`` of the Runner): its pose is read by ``runner.poses()`` at every step, and is part of the runner's
-    snapshots and of the replay of lost workers. A reset puts it back; its first place is the same in every episode.
+    The tool moves in a horizontal plane, its fingers a little open, so that the box does not turn easily. The box is
+    content of the scene (``build`` of the Runner): its pose is read by ``runner.poses()`` at every step, and is part of
+    the runner's snapshots and of the replay of lost workers. A reset puts it back; its first place is the same in every
+    episode.
 
     - *Observation*: qpos, qvel (joints), pose of the tool (7), pose of the box (7), goal of the box (2): positions
       [m] and quaternions (w, x, y, z).
@@ -60,8 +61,8 @@ class PushVectorEnv(ToolVectorEnv):
         An argument is out of range, ``posture`` is needed, or the engine has no content.
     """
 
-    panda_posture: ClassVar[tuple[float, ...]] = (0.0, 0.298, 0.0, -2.744, 0.0, 3.042, 0.785, 0.0, 0.0)
-    """Default ``posture`` of a panda: the hand down at (0.38, 0, 0.13) m, fingers closed 1.6 cm above the ground."""
+    panda_posture: ClassVar[tuple[float, ...]] = (0.0, 0.298, 0.0, -2.744, 0.0, 3.042, 0.785, 0.01, 0.01)
+    """Default ``posture`` of a panda: the hand down at (0.38, 0, 0.13) m, fingertips 1.6 cm above the ground."""
     spread: ClassVar[float] = 0.0
     center_offset: ClassVar[tuple[float, float, float]] = (0.1, 0.0, 0.0)
 

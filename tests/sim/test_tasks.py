@@ -232,26 +232,65 @@ def test_a_pushed_box_is_the_same_in_workers_and_after_a_lost_one():
     """Both tools go straight ahead; the goal of each is beyond its box."""
     runs = []
     for workers in (0, 1):
-        envs = PushVectorEnv(2, workers=workers, actions="increment", max_episode_steps=26)
+        envs = PushVectorEnv(2, workers=workers, actions="increment", rate_hz=100.0, max_episode_steps=22)
         observation, first = envs.reset(seed=1)
         rows, action = [observation], np.array([[0.35, 0, 0], [0, 0.2, 0]])
-        for step in range(28):
-            if workers and step == 20:
+        for step in range(24):
+            if workers and step == 17:
                 os.kill(envs.runner.pids[0], signal.SIGKILL)
                 with pytest.warns(RecoveryWarning):
                     observation, *_, info = envs.step(action)
             else:
                 observation, *_, info = envs.step(action)
             rows.append(observation)
-            if step == 24:
-                nearer = info["distance"] < first["distance"] - 0.02
+            if step == 21:
+                nearer = info["distance"] < first["distance"] - 0.01
             np.testing.assert_array_equal(observation[:, -9:-2], envs.runner.poses()[:, 0])
         runs.append(rows)
+        if not workers:
+            snapshot, there = envs.runner.snapshot(), envs.runner.poses()
+            envs.step(action)
+            assert (envs.runner.poses() != there).any()
+            envs.runner.restore(snapshot)
+            np.testing.assert_array_equal(envs.runner.poses(), there)
         assert nearer.tolist() == [True, False]
         np.testing.assert_array_equal(rows[-2][:, -9:-2], rows[0][:, -9:-2])  # a new episode: the boxes are back
         assert (rows[-2][:, -2:] != rows[0][:, -2:]).all()  # and have other goals
         envs.close()
     np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.slow
+def test_every_goal_of_a_box_can_be_reached():
+    """A rule pushes along x from behind the box, then along y from its side."""
+    envs = PushVectorEnv(12, actions="increment", max_episode_steps=None)
+    observation, _ = envs.reset(seed=100)
+    reached = np.zeros(12, bool)
+    for _ in range(150):
+        tool, box, goal = (
+            observation[:, part].astype(float) for part in (slice(-16, -14), slice(-9, -7), slice(-2, None))
+        )
+        (x, y), off = (goal - box).T, tool - box
+        side = np.sign(y)
+        behind = (np.abs(off[:, 1]) < 0.008) & (off[:, 0] < -0.03)
+        aside = -side * off[:, 1] > 0.05
+        aligned = aside & (np.abs(off[:, 0]) < 0.008)
+        along_x = box + np.where(behind, -0.02, -0.06)[:, None] * [1, 0]
+        around = np.where(
+            (off[:, 0] < -0.055)[:, None],
+            box - np.stack([np.full(12, 0.07), 0.085 * side], axis=1),
+            np.stack([box[:, 0] - 0.075, tool[:, 1]], axis=1),
+        )
+        from_side = box - np.stack([np.zeros(12), np.where(aligned, 0.035, 0.08) * side], axis=1)
+        along_y = np.where(aside[:, None], from_side, around)
+        target = np.where((x > 0.012)[:, None], along_x, np.where((np.abs(y) > 0.008)[:, None], along_y, tool))
+        move = np.clip((target - envs._setpoint[:, :2]) / 0.02, -0.4, 0.4)
+        observation, *_, info = envs.step(np.concatenate([move, np.zeros((12, 1))], axis=1))
+        reached |= info["success"]
+        if reached.all():
+            break
+    assert reached.all()
+    envs.close()
 
 
 # -- pictures ----------------------------------------------------------------------------------------------------------
