@@ -56,6 +56,17 @@ def test_the_version_has_one_definition_which_the_package_knows():
     assert re.fullmatch(r"\d+\.\d+\.\d+", batchpid.__version__)
 
 
+def test_the_changelog_has_the_sections_of_keep_a_changelog():
+    kinds = ("Added", "Changed", "Deprecated", "Removed", "Fixed", "Security")
+    text = (ROOT / "CHANGELOG.md").read_text()
+    assert "\n## [Unreleased]\n" in text
+    for release in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
+        assert re.match(r"\[(Unreleased\]|\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d)\n", release)
+        found = re.findall(r"^### (.*)$", release, re.MULTILINE)
+        assert set(found) <= set(kinds)
+        assert len(found) == len(set(found))
+
+
 def test_classifiers_name_the_versions_of_python_that_it_runs_on():
     listed = re.findall(r":: Python :: 3\.(\d+)", "\n".join(PROJECT["project"]["classifiers"]))
     assert list(map(int, listed)) == [11, 12, 13]

@@ -91,6 +91,45 @@ def test_it_is_the_implicit_step_where_the_load_is_constant():
     assert np.abs(velocity[:, 0, 0] - exact).max() < 0.02 * np.abs(exact).max()
 
 
+@pytest.mark.parametrize("viscous", [None, 4.0])
+@pytest.mark.parametrize(("damping", "stiffness"), [(0.0, 0.0), (30.0, 0.0), (0.0, 3e4), (30.0, 3e4)])
+def test_it_takes_its_share_of_the_velocity_that_a_joint_would_have_without_a_change_of_effort(
+    viscous, damping, stiffness
+):
+    """Also where the simulator integrates a drive implicitly: the prediction is exact under a constant load."""
+    inertia, load, (q, v) = 0.02, 0.3, (0.01, 0.2)
+    model = Friction(np.full((1, 1), 1e6), None if viscous is None else np.full((1, 1), viscous))
+    b = viscous or 0.0
+    mobility = 1 / (inertia + DT * (b + damping + DT * stiffness))
+
+    def after(effort):
+        return v + DT * mobility * (effort - b * v - load - damping * v - stiffness * (q + DT * v))
+
+    mass, one = np.full((1, 1, 1), inertia), np.ones((1, 1))
+    state = friction.init(model, v * one, load * one, mass, DT, damping * one, stiffness * one)
+    for step in range(6):
+        unchanged = after(state.effort[0, 0])
+        state, total = friction.advance(model, state, 0 * one, v * one)
+        v, before = after(total[0, 0] + b * v), v
+        if step:  # the first step has no velocity of a step before
+            np.testing.assert_allclose(v, (1 - friction.SHARE) * unchanged, rtol=1e-9, atol=1e-12 * abs(before))
+        q += DT * v
+
+
+def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_stopped():
+    model = Friction(np.ones((1, 1)), np.zeros((1, 1)), np.full((1, 1), 2.0))
+    levels, steps = (1.9, 2.1, 1.5, 0.0, 1.9), (100, 100, 100, 300, 100)
+    velocity, total = simulate(np.full((1, 1, 1), 0.01), model, np.repeat(levels, steps)[:, None, None])
+    held, let_go, slides, stops, held_again = np.split(velocity[:, 0, 0], np.cumsum(steps)[:-1])
+    assert (held == 0).all()
+    assert let_go[-1] > 0
+    np.testing.assert_allclose(np.diff(slides), DT * (1.5 - 1.0) / 0.01, rtol=1e-9)  # the friction of motion
+    assert stops[-1] < slides[-1]
+    assert abs(stops[-1]) < 1e-9
+    assert np.abs(held_again).max() < 1e-9
+    np.testing.assert_allclose(total[-1], 0.0, atol=1e-9)
+
+
 def test_envs_do_not_affect_each_other_and_are_reset_alone():
     rng = np.random.default_rng(0)
     mass = np.concatenate([np.eye(3)[None] * scale for scale in (0.1, 1e-4, 3.0)])

@@ -7,7 +7,7 @@ import pytest
 from clusters import FILTERS
 from scripts import ROOT, load_script
 
-TESTED = {"accuracy", "cluster", "contact", "draw", "motions", "scale", "view"}
+TESTED = {"accuracy", "cluster", "contact", "draw", "motions", "newcomer", "scale", "view"}
 
 
 def rows(text):
@@ -37,6 +37,25 @@ def test_contact(capsys):
     assert all(with_prediction == "0" for _, _, _, with_prediction, _ in found)
 
 
+def test_newcomer(tmp_path, capfd):
+    """In place of the README's commands, which take minutes: one that succeeds, one that fails, one without an end."""
+    newcomer = load_script("newcomer")
+    readme = newcomer.commands((ROOT / "README.md").read_text())
+    assert readme[0] == "make demo"
+    assert {line.split()[1] for line in readme if line.startswith("batchpid")} >= {"inspect", "tune", "view"}
+    missing = "echo \"install it with: pip install 'batchpid[tune]'\" >&2; exit 2"
+    for name, does in (("batchpid", f"case $1 in view) sleep 60;; tune) {missing};; esac"), ("pip", "echo $3 > got")):
+        script = tmp_path / ".venv" / "bin" / name
+        script.parent.mkdir(parents=True, exist_ok=True)
+        script.write_text(f"#!/bin/sh\n{does}\n")
+        script.chmod(0o755)
+    steps = list(newcomer.follow(["batchpid demo", "batchpid tune", "batchpid view"], tmp_path, limit=0.5))
+    assert [step.command.split()[1] for step in steps] == ["demo", "tune", "install", "tune", "view"]
+    assert [(step.status, step.stopped, step.extra) for step in steps[:2]] == [(0, False, None), (2, False, "tune")]
+    assert steps[-1].stopped
+    assert (tmp_path / "got").read_text() == ".[tune]\n"
+
+
 def test_motions(tmp_path, capsys):
     motions = load_script("motions")
     path = tmp_path / "motions.json"
@@ -51,7 +70,7 @@ def test_draw(tmp_path):
     """From the figures of the page, as the programs of ``make figures`` write them, comes the page again."""
     docs = tmp_path / "docs"
     (docs / "images").mkdir(parents=True)
-    for name in ("README.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
         shutil.copy(ROOT / name, tmp_path / name)
     draw = load_script("draw")
     figures = json.loads((docs / "performance.json").read_text())
@@ -73,7 +92,7 @@ def test_draw(tmp_path):
     (new / "motions.json").write_text(json.dumps(figures["motions"]))
     (new / "accuracy.json").write_text(json.dumps({"accuracy": figures["accuracy"]}))
     draw.main(draw.Options(new, docs))
-    for name in ("README.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
         assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
     for name in ("performance", "accuracy"):
         assert (docs / "images" / f"{name}.png").stat().st_size > 10_000

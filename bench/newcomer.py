@@ -1,0 +1,122 @@
+"""Follow the README in a clean clone, as a newcomer does, and time each command.
+
+    python bench/newcomer.py --out out/newcomer
+
+Needs network. Every command of the README's shell blocks runs as it stands there, in order, in an environment that
+``make demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of
+batchpid that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. ``make test``
+is left out. Two files of a user are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+LEFT_OUT = ("make test", "pip install .")
+"""Commands that repeat what others have done: the tests, and a second installation."""
+REMEDY = re.compile(r"pip install 'batchpid\[(\w+)\]'")
+FILES = """
+mkdir -p robots
+cp assets/panda.urdf arm.urdf
+cp assets/*.urdf robots/
+"""
+LOG = "python examples/mujoco_log.py arm.urdf --seconds 5 --out log.csv && cp log.params.yaml gains.yaml"
+
+
+class Step(NamedTuple):
+    """A command that has ended."""
+
+    command: str
+    seconds: float
+    status: int
+    stopped: bool
+    """Ended at the limit."""
+    extra: str | None
+    """Extra that the error names."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Follow the README in a clean clone, and time each command."""
+
+    out: Path
+    """Folder of the clone; must not exist."""
+    limit: float = 90.0
+    """Seconds after which a command is ended."""
+
+
+def commands(readme: str) -> list[str]:
+    """Return the commands of the shell blocks of ``readme``, without comments."""
+    lines = "".join(re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)).splitlines()
+    found = [shlex.join(words) for line in lines if (words := shlex.split(line, comments=True))]
+    return [command for command in found if command not in LEFT_OUT]
+
+
+def run(command: str, folder: Path, limit: float | None) -> Step:
+    """Run a command in ``folder``, with the environment that ``make demo`` has made there."""
+    variables = os.environ | {"PATH": f"{folder / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    variables.pop("PYTHONPATH", None)
+    start = time.monotonic()
+    process = subprocess.Popen(
+        ["sh", "-ec", command],
+        cwd=folder,
+        env=variables,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        errors, stopped = process.communicate(timeout=limit)[1], False
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGINT)
+        errors, stopped = process.communicate()[1], True
+    extra = REMEDY.search(errors)
+    if process.returncode and not stopped:
+        print(errors.rstrip(), file=sys.stderr)
+    return Step(command, time.monotonic() - start, process.returncode, stopped, extra[1] if extra else None)
+
+
+def follow(wanted: list[str], folder: Path, limit: float) -> Iterator[Step]:
+    """Run commands in order; after an error that names an extra, install it and repeat the command."""
+    for command in wanted:
+        yield (step := run(command, folder, limit if command.startswith("batchpid") else None))
+        if step.status and step.extra:
+            yield run(f"pip install --quiet '.[{step.extra}]'", folder, None)
+            yield run(command, folder, limit)
+
+
+def main(options: Options) -> int:
+    """Print the seconds of each step and of all; return the number of steps that failed without a remedy."""
+    subprocess.run(["git", "clone", "--quiet", ROOT, options.out], check=True)
+    folder = options.out.resolve()
+    wanted = commands((folder / "README.md").read_text())
+    wanted.insert(1, FILES)
+    identify = next(at for at, command in enumerate(wanted) if command.startswith("batchpid identify"))
+    wanted.insert(identify, LOG)
+    total, failed = 0.0, 0
+    for step in follow(wanted, folder, options.limit):
+        total += step.seconds
+        problem = step.status != 0 and not step.stopped and step.extra is None
+        failed += problem
+        says = "ended" if step.stopped else f"asks for {step.extra}" if step.extra else "failed" if problem else ""
+        print(f"{step.seconds:6.1f} s  {' '.join(step.command.split())[:90]:90}  {says}", flush=True)
+    print(f"{total / 60:.1f} min, {failed} failed")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, description=__doc__)))
