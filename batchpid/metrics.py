@@ -25,12 +25,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary, html_table, span
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import broadcast, number, positive, read_array
 from batchpid.errors import InvalidArgumentError
-
-Float64 = NDArray[np.float64]
 
 
 class StepMetrics(NamedTuple):

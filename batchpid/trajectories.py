@@ -17,13 +17,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-
-Float64 = NDArray[np.float64]
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2

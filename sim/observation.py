@@ -11,15 +11,11 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Bool, Float32, Float64
 from batchpid.arrays.display import html_table, span
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
 from batchpid.sim.command import POSE_UNITS, CommandSpec, joint_command
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-
 
 _load_plot: list[Callable[[], Callable[..., Any]]] = []
 

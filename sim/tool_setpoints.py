@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import array, entries, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.osc_controller import tool_pose
 from batchpid.sim.robot.robot import Robot
-
-Float64 = NDArray[np.float64]
 
 
 class ToolSetpoints:

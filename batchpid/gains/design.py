@@ -21,14 +21,14 @@ import math
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import CHOICES
 from batchpid.checks.validate import choice, number, positive
 from batchpid.gains.stability import stability_bound
 from batchpid.law.params import PIDParams
 
-Float64 = NDArray[np.float64]
 FILTER_STEPS = 4.0
 """Least filter time of the derivative, in sampling steps: against quantisation noise."""
 FILTER_SHARE = 0.3

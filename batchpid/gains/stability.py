@@ -25,12 +25,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import at_least, broadcast, number, positive, read_array
 from batchpid.errors import InvalidArgumentError
 
-Float64 = NDArray[np.float64]
 LONGEST_STEP = 1e6
 """Longest time step [s]; the square of a longer one could overflow."""
 

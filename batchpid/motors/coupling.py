@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
-
-Float64 = NDArray[np.float64]
 
 
 class Follower(NamedTuple):

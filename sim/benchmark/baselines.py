@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from batchpid.sim.benchmark.workload import Case, Workload
 from batchpid.sim.engine.sapien.pack import Pack
@@ -24,7 +24,6 @@ from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.workers.placement import pinned_cores
 
-Float64 = NDArray[np.float64]
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 ENGINES = {
     # case: (scenes to a PhysX system, whether all systems are stepped in turn, with collisions)

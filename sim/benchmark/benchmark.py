@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.benchmark.baselines import ENGINES, make_baselines
 from batchpid.sim.benchmark.peers import make_peers
 from batchpid.sim.benchmark.policy import ResidualPolicy
@@ -29,7 +30,6 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.runner import Runner
 from batchpid.sim.workers.shared_memory import SharedArrays
 
-Float64 = NDArray[np.float64]
 CASES = {
     "tutorial": "the tutorial's loop as written: one robot, one process",
     "tutorial, a process a core": "the tutorial's loop, one robot in each of the processes",

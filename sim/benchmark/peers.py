@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.benchmark.baselines import single_threaded
 from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
 from batchpid.sim.benchmark.workload import TIMESTEP, Case, Workload
-
-Float64 = NDArray[np.float64]
 
 
 class Peer(NamedTuple):

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.reference import SimplePID
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
 from batchpid.sim.robot.parts import Settings
 from batchpid.sim.robot.robot import Robot
-
-Float64 = NDArray[np.float64]
 
 
 def tutorial_settings(robot: Robot) -> Settings:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import BatchPIDError
 from batchpid.sim.benchmark.tutorial import tutorial_settings
 from batchpid.sim.engine.engines import load_engine
@@ -18,7 +19,6 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import EngineName, PhysicsPreset
 
-Float64 = NDArray[np.float64]
 TIMESTEP = 1 / 2000
 """Of simulation and control [s]."""
 DISTANCE = 0.3

@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine import native
 from batchpid.sim.engine.engines import load_engine, scene_dynamics
 from batchpid.sim.engine.native.interface import DYNAMICS, STEP
@@ -40,7 +41,6 @@ from batchpid.sim.engine.protocol import RobotModel
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
 
-Float64 = NDArray[np.float64]
 Models = Callable[[float], RobotModel]
 """Model of a robot with a payload [kg]."""
 _MOST_PAYLOADS = 64
@@ -245,7 +245,7 @@ class NativeMassMatrix:
         bodies = scene_dynamics(self._spec).bodies
         return np.ascontiguousarray(bodies.tree, np.int32), np.ascontiguousarray(bodies.table())
 
-    def __call__(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+    def __call__(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices (M, dof, dof) [kg m^2 or kg] at ``qpos`` (M, dof)."""
         rows = np.ascontiguousarray(qpos, np.float64)
         out = np.empty((*rows.shape, rows.shape[1]))

@@ -20,10 +20,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.motors.coupling import Coupling
-
-Float64 = NDArray[np.float64]
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 """Gains of c' dt and c in units of 1 / dt^2."""

@@ -44,9 +44,6 @@ _URDF = f"""<robot name="test"><link name="base"/><link name="arm">{_BODY}</link
 <limit lower="-1" upper="1" effort="100" velocity="9"/></joint></robot>"""
 
 
-Float64 = NDArray[np.float64]
-
-
 def main() -> None:
     """Compare the results of the extensions with Python's; raise an error if they differ.
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
@@ -23,8 +24,6 @@ from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot import description
 from batchpid.sim.robot.description import RobotDescription
 
-Bool = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "partial_force", "sapien_dissipation"]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.native.task_space_extension import BODY
 from batchpid.sim.engine.native import xla
-
-Float64 = NDArray[np.float64]
 
 
 class RigidBodies(NamedTuple):

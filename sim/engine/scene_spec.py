@@ -6,12 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.parts import Joint
-
-Float64 = NDArray[np.float64]
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds content to the engine's scene of env ``env``; returns the objects whose poses to read.

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.recording.hdf5 import LOG_QUANTITIES as QUANTITIES
 from batchpid.sim.recording.hdf5 import read_hdf5
 from batchpid.sim.recording.recording_files import RecordingError, load_h5py
 
-Float64 = NDArray[np.float64]
 MAX_BYTES = 1 << 30
 """Most that the columns of an HDF5 file may take."""
 

@@ -15,15 +15,14 @@ friction, gravity and strength, high ones inertia and delay.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.moves import motion_effort
 from batchpid.trajectories import Trajectory
 
-Float64 = NDArray[np.float64]
 REACH = {"rad": 0.8, "m": 0.1}
 """Largest amplitude, by the joint's unit."""
 VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7

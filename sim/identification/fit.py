@@ -20,12 +20,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.problem import Evaluation, Problem
 
-Float64 = NDArray[np.float64]
 GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
 """The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
 STEP standard deviations of the unknowns; and if linear residuals promise less than LEAST_GAIN."""

@@ -11,13 +11,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, Solution, Step, fit
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.problem import Problem
 
-Float64 = NDArray[np.float64]
 NEIGHBOURS, NEIGHBOUR_EVALUATIONS = 6, 8
 """Most fits at other delays, and most evaluations of each."""
 

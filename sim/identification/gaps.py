@@ -13,12 +13,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.columns import error
 from batchpid.sim.identification.log import Log, LogWarning
 
-Float64 = NDArray[np.float64]
 MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
 GAP, PERIODS = 0.1, 5.0

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
@@ -37,8 +37,6 @@ from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
-
-Float64 = NDArray[np.float64]
 
 
 def identify(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
+
 CommandKind = Literal["setpoint", "effort"]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
+
 CUTOFF = 60.0
 """Frequency [Hz] above which a measured signal counts as noise."""
 DRAWS = 16

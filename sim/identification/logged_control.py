@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.loop.pid_law import PIDLaw
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

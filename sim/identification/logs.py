@@ -22,8 +22,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
@@ -34,7 +34,6 @@ from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
 from batchpid.trajectories import Trajectory
 
-Float64 = NDArray[np.float64]
 __all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs", "setpoint_csv"]
 
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5)

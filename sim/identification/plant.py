@@ -21,13 +21,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.batch_dynamics import Friction, Passive, batch_dynamics
 from batchpid.sim.identification.logged_control import Drive, Law
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 DIVERGED = 1e6
 """Position beyond which a simulation has diverged [rad or m]."""
 _CREEP = 1 / 9

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.regression import Motion
@@ -38,7 +39,6 @@ from batchpid.sim.identification.wander import spread, whiten
 from batchpid.sim.identification.windows import Subject, Window, cut, project, rows_of, simulate, whole
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 CHUNK = 48
 """Most simulations at once."""
 STRETCH = 0.5

@@ -18,14 +18,13 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.log_noise import Noise, split
 from batchpid.sim.identification.logged_control import Drive, Law
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Motors, Plant
 
-Float64 = NDArray[np.float64]
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 DELAY_STEP = 5e-4

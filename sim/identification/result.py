@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
 from batchpid.sim.robot.robot import Robot
-
-Float64 = NDArray[np.float64]
 
 
 class Fit(NamedTuple):

@@ -8,14 +8,13 @@ evolution strategy: a tutorial", arXiv:1604.00772). Each candidate has the motor
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.plant import Motors
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import DELAYS, STRONG, WEAK, Regression
 from batchpid.sim.identification.unknowns import LIMITS
 
-Float64 = NDArray[np.float64]
 GRID = DELAYS[::4]
 """Delays that are tried first [s]."""
 GENERATIONS, POPULATION = 4, 8

@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import Solution
 from batchpid.sim.identification.problem import NOISES, Problem
 
-Float64 = NDArray[np.float64]
 MEMORY = 1.0
 """Longest lag of the autocovariance [s]."""
 MODEL_ERROR = 2.0

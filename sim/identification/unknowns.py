@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.plant import Motors
 
-Float64 = NDArray[np.float64]
 PER_JOINT = ("armature", "damping", "friction", "strength", "bias")
 LIMITS = {
     "armature": (0.0, np.inf),

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
 
 
 def spread(draws: Float64) -> Float64:

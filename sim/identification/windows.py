@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
@@ -15,7 +16,6 @@ from batchpid.sim.identification.plant import Motors, Plant, Segment
 from batchpid.sim.identification.regression import Motion
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 WINDOW = 0.3
 """Length of a window of a log of efforts [s]."""
 SETTLE = 0.3

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options import RunnerOptions
-
-Float64 = NDArray[np.float64]
 
 
 class OwnController:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
@@ -28,8 +29,6 @@ from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guar
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import Draws
-
-Float64 = NDArray[np.float64]
 
 
 class EnvGroup:

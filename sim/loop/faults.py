@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Bool
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.control_step import Measured
@@ -31,8 +32,6 @@ COMMAND_CAUSES = ("setpoint", "setpoint_rate")
 
 LONGEST = 10_000
 """Largest number of faults in a log."""
-
-Bool = NDArray[np.bool_]
 
 
 class Fault(NamedTuple):

@@ -12,8 +12,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.tracing import Symbol, Trace, trace
@@ -35,8 +35,6 @@ from batchpid.sim.loop.control_step import (
 )
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
 from batchpid.sim.options import RunnerOptions
-
-Float64 = NDArray[np.float64]
 
 LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
 """Bits of the status of a sim step after which an env may have failed."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import ControllerError
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
@@ -23,8 +24,6 @@ from batchpid.sim.loop.law_program import LawProgram
 from batchpid.sim.loop.stage_program import compiled_stages
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
-
-Float64 = NDArray[np.float64]
 
 COUPLING_STEPS = 4
 """Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
@@ -168,7 +167,7 @@ class NoiseBlocks:
         self._first = 0
         self._block: tuple[Any, Any] = (None, None)
 
-    def __call__(self, k: Coefficients, state: ActuatorState, like: NDArray[np.float64]) -> tuple[Any, Any] | None:
+    def __call__(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Any, Any] | None:
         """Return the noise of positions and velocities; None for sensors without noise.
 
         A reset replaces the key. While the key is the same, all envs advance by the same number of steps.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import replace_envs
 from batchpid.law.computed_torque import convert_integral
 from batchpid.motors import ActuatorState
@@ -24,9 +25,6 @@ from batchpid.sim.loop.control_step import (
     mass_matrix,
 )
 from batchpid.sim.loop.pid_law import PIDLaw
-
-Bool = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 
 
 def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack, mask: Bool) -> StepState:

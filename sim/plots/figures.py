@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from PIL import Image
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -265,9 +265,6 @@ def _legend(figure: Figure, handles: list[Any]) -> None:
     if sum(len(handle.get_label()) + 8 for handle in handles) < letters:
         columns = len(handles)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False)
-
-
-Float64 = NDArray[np.float64]
 
 
 def engine_differences(

@@ -10,10 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.plots import drawing
 from batchpid.sim.plots.figures import Picture
-
-Float64 = NDArray[np.float64]
 
 
 class FitErrors(NamedTuple):

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import InvalidArgumentError
 
-Float64 = NDArray[np.float64]
 Operation = Literal["add", "scale", "abs"]
 LEAST_SHARE = 0.01
 """Least share of a normal distribution within its bounds."""

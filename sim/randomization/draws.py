@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
+
 Episodes = NDArray[np.int64]
 
 

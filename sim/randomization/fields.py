@@ -6,15 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
@@ -25,7 +26,6 @@ from batchpid.sim.randomization.fields import GROUPS, PHYSICAL, START, Field, el
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 LARGEST = 2**63 - 1
 OF_JOINTS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
@@ -26,9 +27,6 @@ from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
 
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
 SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome

@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from batchpid.arrays.array_types import Float64
 
 SLENDER = 1e-3  # smallest principal moment over the largest of a tensor that had to be replaced; PhysX divides by it
 DENSITY = 1000.0  # [kg/m^3] of water, with which SAPIEN computes the mass of shapes

@@ -10,13 +10,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.rotations import about, from_rpy, multiply, rotate
-
-Float64 = NDArray[np.float64]
 
 
 class Poses(NamedTuple):

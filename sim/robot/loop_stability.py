@@ -16,17 +16,15 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
-
-Float64 = NDArray[np.float64]
 
 
 class StabilityReport(NamedTuple):

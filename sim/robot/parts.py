@@ -6,14 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.observation import OBSERVED
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.spatial_inertia import SpatialInertia
-
-Float64 = NDArray[np.float64]
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""

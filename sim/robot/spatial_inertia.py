@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.rotations import rotate
-
-Float64 = NDArray[np.float64]
 
 
 class SpatialInertia(NamedTuple):

@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.gains.stability import stability_bound
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -31,7 +31,6 @@ from batchpid.sim.tuning.evaluation import absolute_band, arm_joints, run_moves,
 from batchpid.sim.tuning.moves import Moves, smooth_variation
 from batchpid.sim.tuning.weights import Weights
 
-Float64 = NDArray[np.float64]
 FACTORS = {
     # factor: its standard deviation at first, in units of INITIAL_SPREAD; the last two matter less
     "bandwidth": 1.0,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.observation import Rollout
@@ -19,7 +20,6 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.moves import MAX_OVERSHOOT, Moves, shortest_durations, smooth_variation
 
-Float64 = NDArray[np.float64]
 SUBSTEPS = 5
 """Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in the samples."""
 REVOLUTE_BAND, PRISMATIC_BAND = 1e-3, 1e-4

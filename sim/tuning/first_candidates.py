@@ -16,14 +16,13 @@ The delay T of the loop limits w: the phase margin of L(s) = (kd s^2 + kp s + ki
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.randomization.checks import prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.evaluation import SETTLE_SECONDS
 
-Float64 = NDArray[np.float64]
 PHASE_MARGIN = np.pi / 4
 """Least phase margin of the first candidates [rad]."""
 SPEEDS, SHARES = (7.0, 5.5), (0.65, 1.0, 0.4)

@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot
 
-Float64 = NDArray[np.float64]
 KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
 MAX_OVERSHOOT = 0.05

@@ -27,9 +27,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
@@ -49,7 +49,6 @@ from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutoria
 from batchpid.sim.tuning.randomization_presets import reseeded
 from batchpid.sim.tuning.weights import Weights
 
-Float64 = NDArray[np.float64]
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 VARIED_MOVES = 20

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.rigid_body import RigidBodies
 from batchpid.sim.robot.rotations import from_rpy, rotate
 from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
-
-Float64 = NDArray[np.float64]
 
 
 def bodies_of(robot: Any) -> RigidBodies:

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.building import center_of_mass, merged
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, total
 
-Float64 = NDArray[np.float64]
 NO_MASS = 1e-6
 """Mass [kg] that SAPIEN gives a link without mass."""
 

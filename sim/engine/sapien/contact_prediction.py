@@ -25,9 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
-
-Float64 = NDArray[np.float64]
 
 MAX_ACCELERATION = 3000.0
 """Largest acceleration [m/s^2] of one link towards another that is predicted: a light finger's under full effort."""

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair, SafeRegions
 from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.extents import link_extents, touching_pairs
 from batchpid.sim.engine.scene_spec import SceneSpec
-
-Float64 = NDArray[np.float64]
 
 RETRY_LOOKS = 50
 """Looks at a robot after one that found no region, as it moves too fast, until a region is tried again."""

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.rigid_body import RigidBodies, mass_matrix
 from batchpid.sim.engine.sapien.bodies import bodies_of
 from batchpid.sim.engine.sapien.building import (
@@ -33,7 +34,6 @@ from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
 
-Float64 = NDArray[np.float64]
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -77,7 +77,6 @@ class Dynamics:
 
     @cached_property
     def bodies(self) -> RigidBodies:
-        """Bodies of the robot on a fixed base."""
         return bodies_of(self._robot)
 
     @_one_at_a_time
@@ -122,12 +121,10 @@ class Dynamics:
 
     @_one_at_a_time
     def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
-        """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         return _rowwise(self._model.compute_inverse_dynamics, qpos, qvel, qacc)
 
     @_one_at_a_time
     def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
         still = np.zeros_like(qpos)
         force = self.inverse_dynamics(qpos, qvel if coriolis else still, still)
         return force if gravity else force - self.inverse_dynamics(qpos, still, still)
@@ -173,10 +170,6 @@ class Dynamics:
 
     @_one_at_a_time
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
-        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
-
-        One if the other is the ground; none if no links are near each other.
-        """
         return min(self._near_links(qpos), key=lambda near: near[1], default=((), np.inf))[0]
 
     def _near_links(self, qpos: NDArray[Any]) -> Iterator[tuple[tuple[str, ...], float]]:
@@ -196,10 +189,6 @@ class Dynamics:
 
     @_one_at_a_time
     def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
-        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
-
-        With ``base_too`` the links that are fixed to the base count as well.
-        """
         self._robot.set_qpos(qpos.astype(np.float32))
         base = self._bodies[WORLD]
         links = (link for link, number in self._links.items() if base_too or self._bodies[number] != base)
@@ -208,7 +197,6 @@ class Dynamics:
 
     @_one_at_a_time
     def link_poses(self, qpos: NDArray[Any]) -> Float64:
-        """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
         self._model.compute_forward_kinematics(np.asarray(qpos, np.float64))
         return np.array(
             [self._model.get_link_pose(link).to_transformation_matrix() for link in range(len(self._links))], np.float64

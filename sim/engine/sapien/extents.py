@@ -6,13 +6,11 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import physx
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.collision_groups import may_touch
 from batchpid.sim.engine.sapien.contact_prediction import WORLD, LinkExtent
-
-Float64 = NDArray[np.float64]
 
 MAX_BALLS = 8
 """Largest number of balls that cover one shape."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import physx
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.building import parse, shape_owners
 from batchpid.sim.engine.scene_spec import SceneSpec
-
-Float64 = NDArray[np.float64]
 
 _KINDS: dict[type, Literal["sphere", "box", "capsule", "cylinder"]] = {
     physx.PhysxCollisionShapeSphere: "sphere",

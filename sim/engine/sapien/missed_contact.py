@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.contact_prediction import LISTED_DISTANCE
 from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.scene_spec import SceneSpec
-
-Float64 = NDArray[np.float64]
 
 DEPTH = 1e-3
 """Depth [m] from which an overlap counts as a contact: bodies at rest on each other may overlap by less."""

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float32
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
@@ -40,8 +41,6 @@ from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
-
-Float32 = NDArray[np.float32]
 
 
 class Pack(SingleOwner):
@@ -211,7 +210,6 @@ class Pack(SingleOwner):
             self._bind()
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the joint positions [rad or m], a new array."""
         stepped, self._stepped_qpos = self._stepped_qpos, None
         return stepped if stepped is not None and dtype is np.float64 else self._calls.qpos(dtype)
 
@@ -219,19 +217,15 @@ class Pack(SingleOwner):
         return self._calls.qpos(np.float64)
 
     def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the joint velocities [rad/s or m/s], a new array."""
         return self._calls.qvel(dtype)
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         return scene_dynamics(self.spec).joint_mass_matrix(qpos)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], a new array."""
         return self._calls.passive_force(gravity, coriolis, dtype)
 
     def write_qf(self, effort: NDArray[Any]) -> None:
-        """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
         if self._constraint is None:
             self._calls.write_qf()
@@ -280,7 +274,6 @@ class Pack(SingleOwner):
         return states
 
     def write_state_rows(self, states: NDArray[np.float64]) -> None:
-        """Put the scenes of this new pack into the states that :meth:`read_state` returned."""
         ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, 1])
         qpos, qvel, roots, isolated, contents = np.split(states.astype(np.float32), ends, axis=1)
         self._place(range(self.size), qpos, qvel, roots)
@@ -289,7 +282,6 @@ class Pack(SingleOwner):
         self.isolate(np.flatnonzero(isolated).tolist())
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
-        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the others."""
         if (mask == self._suspended).all():
             return
         for robot, suspended in zip(self.robots, mask, strict=True):
@@ -302,7 +294,6 @@ class Pack(SingleOwner):
         return [content.poses() for content in self._contents]
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
         self.friction = added_friction(self._friction(), actuators)
         armature, viscous = None if actuators is None else actuators.armature, self.friction.viscous
         self.armature = self._motors + (0.0 if armature is None else armature)
@@ -323,7 +314,6 @@ class Pack(SingleOwner):
             joint.set_drive_properties(*map(float, values), "force")
 
     def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
-        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
         for joint, target in zip(self._joints, position.ravel().tolist(), strict=True):
             joint.set_drive_target(target)
         if velocity is not None:
@@ -331,7 +321,6 @@ class Pack(SingleOwner):
                 joint.set_drive_velocity_target(target)
 
     def close(self) -> None:
-        """Free the scenes. The pack cannot be used afterwards."""
         self.robots, self.systems, self._contents, self._scenes, self._shared_systems = [], [], [], [], []
         self._bind()
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sapien import Pose
 
+from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
@@ -23,8 +24,6 @@ from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
-
-Float64 = NDArray[np.float64]
 
 
 class VariedPack(Pack):
@@ -56,10 +55,6 @@ class VariedPack(Pack):
         self.write_joints(None)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Change the robots ``rows`` to ``variation``, one row for each of them.
-
-        Next :meth:`write_joints` has to change their joints, and :meth:`write_state` to place them.
-        """
         for mine, new in zip(self._variation, variation, strict=True):
             if mine is not None:
                 mine[rows] = new
@@ -94,7 +89,6 @@ class VariedPack(Pack):
         return own_friction(self.spec, self._variation)
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         return scene_dynamics(self.spec).joint_mass_matrix(qpos, self._added)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:

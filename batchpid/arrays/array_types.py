@@ -1,0 +1,8 @@
+"""Types of NumPy arrays, for annotations."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bool = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
