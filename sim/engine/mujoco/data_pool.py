@@ -34,7 +34,7 @@ class DataPool:
     """``mujoco.MjData`` of ``robot`` for one pack at a time."""
 
     def __init__(self, robot: RobotMj) -> None:
-        self.robot, self._data = robot, list[Any]()
+        self.robot, self._data, self._taken = robot, list[Any](), list[Any]()
         self._user: User | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         mujoco.mj_getState(robot.model, self._new(1)[0], self._initial, STATE)
@@ -45,18 +45,17 @@ class DataPool:
 
     def take(self, user: User) -> list[Any]:
         """Return the data of the robots of ``user``, in their states; another user's states are kept in its rows."""
-        data = self._new(len(user.rows))
         if self._user is not user:
             if self._user is not None:
-                for model, each, row in zip(self._user.models, self._data, self._user.rows, strict=False):
+                for model, each, row in zip(self._user.models, self._taken, self._user.rows, strict=True):
                     mujoco.mj_getState(model, each, row, STATE)
-            self._user = user
+            self._user, self._taken = user, self._new(len(user.rows))
             sound = np.all(np.abs(user.rows[:, POSITIONS + self.robot.qpos]) <= FARTHEST, axis=1)
-            for model, each, row, finite in zip(user.models, data, user.rows, sound.tolist(), strict=True):
+            for model, each, row, finite in zip(user.models, self._taken, user.rows, sound.tolist(), strict=True):
                 mujoco.mj_setState(model, each, row, STATE)
                 if finite:
                     mujoco.mj_step1(model, each)
-        return data
+        return self._taken
 
     def leave(self, user: User) -> None:
         """Forget the states of ``user``."""

@@ -30,6 +30,8 @@ from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
+from batchpid.sim.tuning.evaluation import arm_joints, run_moves  # noqa: E402
+from batchpid.sim.tuning.moves import random_moves, tutorial_move  # noqa: E402
 
 SCALE = Uniform(0.8, 1.2, operation="scale")
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
@@ -158,6 +160,21 @@ def test_a_robot_moves_as_in_sapien(name, options, tolerance):
     both = [run(engine, name, workers=0, physics="fast", ticks=40, **options) for engine in ("sapien", "mujoco")]
     np.testing.assert_allclose(both[0].qpos, both[1].qpos, atol=tolerance)
     assert all(obs.ok.all() for obs in both)
+
+
+def test_moves_under_tuned_gains_are_those_of_sapien(panda):
+    moves = tutorial_move(panda) + random_moves(panda, 7, seed=1)
+
+    def qpos(**options):
+        with Runner(panda, 8, workers=0, **options) as runner:
+            rollout, metrics = run_moves(runner, moves, 0.9)
+            assert metrics.settling_time[:, arm_joints(panda)].max() < 0.8
+            assert np.maximum(panda.lower - rollout.qpos, rollout.qpos - panda.upper).max() < 2e-3
+            return rollout.qpos
+
+    mine = qpos(engine="mujoco")
+    np.testing.assert_allclose(mine, qpos(physics="fast"), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(mine, qpos(physics="accurate"), rtol=0, atol=5e-4)
 
 
 def test_coupled_joints_move_as_in_sapien(tmp_path):

@@ -42,6 +42,13 @@ def parameters(function):
     return [name for name in inspect.signature(function).parameters if name != "self"] if callable(function) else None
 
 
+def check_members(protocol, kind):
+    members = {name: member for name, member in inspect.getmembers(protocol) if not name.startswith("_")}
+    assert members
+    for name, member in members.items():
+        assert parameters(getattr(kind, name)) == parameters(member), name
+
+
 @pytest.mark.parametrize(
     ("protocol", "kind"),
     [
@@ -55,10 +62,18 @@ def parameters(function):
     ],
 )
 def test_sapien_has_the_members_of_each_protocol(protocol, kind):
-    members = {name: member for name, member in inspect.getmembers(protocol) if not name.startswith("_")}
-    assert members
-    for name, member in members.items():
-        assert parameters(getattr(kind, name)) == parameters(member), name
+    check_members(protocol, kind)
+
+
+def test_mujoco_has_the_members_of_each_protocol():
+    pytest.importorskip("mujoco.batch")
+    from batchpid.sim.engine.mujoco import mujoco_dynamics, mujoco_engine, mujoco_pack, mujoco_step
+
+    for protocol in (EnginePack, DrivenPack, CompiledPack):
+        check_members(protocol, mujoco_pack.MujocoPack)
+    check_members(CompiledStep, mujoco_step.MujocoStep)
+    check_members(RobotModel, mujoco_dynamics.MujocoDynamics)
+    check_members(Engine, mujoco_engine.MujocoEngine)
 
 
 class UnitInertia:
