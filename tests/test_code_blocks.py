@@ -136,11 +136,7 @@ def test_commands_in_the_text_have_flags_that_exist(page):
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=name)
 def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    panda = Robot.load("panda")
-    shutil.copy(panda.path, "arm.urdf")
-    Path("arm.xml").write_text(MJCF)
-    bp.save_params("gains.yaml", panda.params(), panda.joint_names)
-    bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
+    write_files()
     for words in shell_lines(page):
         run(words)
 
@@ -152,11 +148,21 @@ def test_c_blocks_compile_with_the_files_that_the_commands_write(page, tmp_path,
     for match in blocks(page, "sh", "c"):
         if match["language"] == "sh":
             for line in match["code"].splitlines():
-                run(shlex.split(line, comments=True))
+                if "export" in line:
+                    run(shlex.split(line, comments=True))
         else:
             (tmp_path / "block.c").write_text(match["code"])
             flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-fsyntax-only"]
             subprocess.run(["cc", *flags, "block.c"], check=True)
+
+
+def write_files() -> None:
+    """Write the files that the commands of all pages may read."""
+    panda = Robot.load("panda")
+    shutil.copy(panda.path, "arm.urdf")
+    Path("arm.xml").write_text(MJCF)
+    bp.save_params("gains.yaml", panda.params(), panda.joint_names)
+    bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
 
 
 def run(words: list[str]) -> None:

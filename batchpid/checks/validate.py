@@ -106,7 +106,9 @@ def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path
 def identifier(argument: str, value: Any) -> str:
     """Return a name that is an identifier of Python."""
     if not isinstance(value, str) or not value.isidentifier():
-        raise InvalidArgumentError(argument, "is no name in Python", value=value, remedy="use letters, digits and _")
+        raise InvalidArgumentError(
+            argument, "cannot be a name in Python", value=value, remedy="use letters, digits and _"
+        )
     return value
 
 

@@ -100,7 +100,7 @@ def header_of(
         [f"joint {at}" for at in range(joints)] if joint_names is None else names("joint_names", joint_names, joints)
     )
     if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-        raise InvalidArgumentError("prefix", "is no name in C", value=prefix, remedy="use letters, digits and _")
+        raise InvalidArgumentError("prefix", "cannot be a name in C", value=prefix, remedy="use letters, digits and _")
     params.check(1, labels)
     check_gain_units(params)
     if guard is not None:

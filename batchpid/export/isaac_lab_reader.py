@@ -52,7 +52,7 @@ def from_isaac_lab(text: str, joint_names: Sequence[str], *, dt: float | None = 
     Raises
     ------
     InvalidArgumentError
-        Text that is no Python or holds no configuration, a value that is no arithmetic of numbers, a gain that is left
+        Text that is not Python or holds no configuration, a value other than arithmetic of numbers, a gain that is left
         to the USD file, or a joint that no configuration or several match.
     """
     joints = names("joint_names", joint_names)
@@ -111,7 +111,9 @@ class _Figures:
                 remedy = "write the number: without one, Isaac Lab takes it from the USD file"
                 raise InvalidArgumentError("text", f"gives no {key}", joint=joint, remedy=remedy)
             if value is not None and not isinstance(value, int | float):
-                raise InvalidArgumentError("text", f"{key} is no number", joint=joint, value=value, remedy="give one")
+                raise InvalidArgumentError(
+                    "text", f"{key} is not a number", joint=joint, value=value, remedy="give one"
+                )
             column.append(off if value is None else float(value))
         return np.array(column, np.float64)
 
@@ -162,7 +164,7 @@ def _groups(text: str) -> list[tuple[str, dict[str, Any]]]:
     try:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise InvalidArgumentError("text", f"is no Python: {error}", remedy="give the text of a .py file") from None
+        raise InvalidArgumentError("text", f"is not Python: {error}", remedy="give the text of a .py file") from None
     known: dict[str, Any] = {}
     for statement in tree.body:
         if isinstance(statement, ast.Assign) and isinstance(target := statement.targets[0], ast.Name):
@@ -204,7 +206,7 @@ def _value(node: ast.expr, known: dict[str, Any]) -> Any:
             small = not isinstance(op, ast.Pow) or (_is_number(b) and abs(b) <= _MOST_POWER)
             if _is_number(a) and _is_number(b) and small and not (isinstance(op, ast.Div) and b == 0):
                 return _OPERATORS[type(op)](float(a), float(b))
-    problem, where = f"{ast.unparse(node)[:60]} is no number", f"line {node.lineno}"
+    problem, where = f"{ast.unparse(node)[:60]} is not a number", f"line {node.lineno}"
     raise InvalidArgumentError("text", problem, value=where, remedy="write the number")
 
 
@@ -218,4 +220,4 @@ def _matches(patterns: Any, joint: str) -> bool:
         return any(re.fullmatch(each, joint) for each in ([patterns] if isinstance(patterns, str) else patterns or ()))
     except (re.error, TypeError) as error:
         remedy = "give a list of regular expressions"
-        raise InvalidArgumentError("text", f"a name is no regular expression: {error}", remedy=remedy) from None
+        raise InvalidArgumentError("text", f"a name is not a regular expression: {error}", remedy=remedy) from None

@@ -121,11 +121,11 @@ def _gains(name: str, joint: str, gains: Any, two: bool) -> dict[str, Any]:
         raise InvalidArgumentError(where, "has no gains", joint=joint, remedy="give 'JOINT: {p: 1.0}'")
     for key, value in gains.items():
         if key not in _KNOWN:
-            problem, remedy = f"{key} is no gain of control_toolbox 6", f"use one of {', '.join(_KNOWN)}"
+            problem, remedy = f"{key} is unknown to control_toolbox 6", f"use one of {', '.join(_KNOWN)}"
             raise InvalidArgumentError(where, problem, joint=joint, remedy=remedy)
         kind = type(_KNOWN[key])
         if not (documents.is_number(value) if kind is float else isinstance(value, kind)):
-            problem, remedy = f"{key} is no {kind.__name__}", f"give a value as in '{key}: {_KNOWN[key]}'"
+            problem, remedy = f"{key} is not a {kind.__name__}", f"give a value as in '{key}: {_KNOWN[key]}'"
             raise InvalidArgumentError(where, problem, joint=joint, value=value, remedy=remedy)
     own = {**_KNOWN, **gains}
     choice(f"{where}.{joint}.antiwindup_strategy", own["antiwindup_strategy"], _ANTI_WINDUP)

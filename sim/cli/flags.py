@@ -45,8 +45,8 @@ Gains = Annotated[
     str | None,
     _flag(
         "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
-        "`batchpid tune` or batchpid.save_params wrote, or a controller's YAML of ros2_control. Default: tuned where "
-        "the robot has them, else designed.",
+        "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml), Isaac Lab (.py) or MuJoCo "
+        "(.xml). Default: tuned where the robot has them, else designed.",
         metavar="NAME|FILE",
     ),
 ]
@@ -62,8 +62,8 @@ GainSets = Annotated[
     tuple[str, ...],
     _flag(
         "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
-        ".json) "
-        "that `batchpid tune` or batchpid.save_params wrote, or a controller's YAML of ros2_control. Default: tuned, "
+        ".json) that `batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml), Isaac Lab (.py) "
+        "or MuJoCo (.xml). Default: tuned, "
         "tutorial and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),

@@ -284,7 +284,7 @@ def test_what_cannot_be_exported_is_an_error():
     params = bp.make_params(2, kp=1.0)
     cases = {
         r"params: are for 2 envs": lambda: to_c(bp.make_params(2, kp=[[1.0, 2.0], [3.0, 4.0]]), DT),
-        r"prefix.* is no name in C": lambda: to_c(params, DT, prefix="a-b"),
+        r"prefix.* cannot be a name in C": lambda: to_c(params, DT, prefix="a-b"),
         r"inputs.* lack measurement_rate": lambda: to_c(params.replace(measurement_rate="measured"), DT, inputs=()),
         r"dt": lambda: to_c(params, 0.0),
         r"inputs": lambda: to_c(params, DT, inputs=("velocity",)),

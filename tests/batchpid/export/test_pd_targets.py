@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_isaac_lab, to_maniskill
+from batchpid.law.computed_torque import advance_with_mass_matrix
 from batchpid.motors import envelope
 from batchpid.motors.actuators import make_actuators
 
@@ -49,6 +50,54 @@ def test_an_ideal_pd_is_the_law():
     p, d, limit = ([figure(text, key, joint) for joint in JOINTS] for key in ("stiffness", "damping", "effort_limit"))
     expected = np.clip(p * (r - y) + d * (v_d - v) + ff, np.negative(limit), limit)
     np.testing.assert_allclose(effort, expected, rtol=1e-12)
+
+
+def test_a_delayed_pd_is_the_law_with_a_late_setpoint():
+    """Isaac Lab's DelayedPDActuator (isaaclab/actuators/actuator_pd.py): setpoint, its rate and feedforward from the
+    step ``delay`` ago, at first the oldest, then the PD of the present state; stepped beside the law."""
+    motors = make_actuators(3, command_delay=[0.008, 0.0, 0.012])
+    params = bp.make_params(3, [40.0, 20.0, 1 / 3], None, [2.0, 0.3, 0.1], effort_limit=[30.0, 4.0, 1.0], **PD)
+    text = to_isaac_lab(params, JOINTS, DT, actuators=motors).text
+    p, d, limit, steps = (
+        np.array([figure(text, key, joint) for joint in JOINTS])
+        for key in ("stiffness", "damping", "effort_limit", "max_delay")
+    )
+    rng, history, state = np.random.default_rng(0), [], bp.init(params, np.zeros((1, 3)))
+    for at in range(40):
+        history.append(rng.normal(size=(3, 3)))
+        r, v_d, ff = np.stack([history[max(at - each, 0)][:, j] for j, each in enumerate(steps)], axis=1)
+        q, v = rng.normal(size=(2, 3))
+        effort = np.clip(p * (r - q) + d * (v_d - v) + ff, -limit, limit)
+        rates = {"measurement_rate": v[None], "setpoint_rate": v_d[None], "feedforward": ff[None]}
+        state, ours = bp.step(params, state, r[None], q[None], DT, **rates)
+        np.testing.assert_allclose(ours[0], effort, rtol=1e-12)
+
+
+@pytest.mark.parametrize("target", ["implicit", "maniskill"])
+def test_an_implicit_drive_is_the_implicit_law(target):
+    """PhysX's drive acts at the end of the step: m (v+ - v) / dt = k (r - q+) - c v+, q+ = q + dt v+."""
+    options = {"gain_units": "mass_matrix", "discretization": "implicit"}
+    params = bp.make_params(3, [900.0, 400.0, 50.0], None, [60.0, 20.0, 30.0], **options, **PD)
+    m = np.array([2.0, 1.0, 0.05])
+    to = {"implicit": to_isaac_lab, "maniskill": to_maniskill}[target]
+    text, differences = to(params, JOINTS, DT, inertia=m)
+    assert [each.partition(":")[0] for each in differences] == ["gain_units"]
+    ((_, arguments),) = configurations(text)
+    k, c = (
+        np.array(list(figures.values()) if isinstance(figures := arguments[key], dict) else figures)
+        for key in ("stiffness", "damping")
+    )
+    r, coefficients = np.array([1.0, -0.5, 0.2]), bp.discretise(params, DT)
+    q, v, x, w = np.zeros(3), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3))
+    state = bp.init(params, x)
+    for _ in range(100):
+        v = (v + DT * k * (r - q) / m) / (1 + DT * c / m + DT**2 * k / m)
+        q = q + DT * v
+        state, effort = advance_with_mass_matrix(coefficients, state, r[None], x, np.diag(m)[None], w)
+        w = w + DT * effort / m
+        x = x + DT * w
+        np.testing.assert_allclose(x[0], q, rtol=1e-10, atol=1e-12)
+    assert np.abs(q - r).max() < 0.3
 
 
 def test_motors_are_grouped_by_what_a_configuration_has_once():

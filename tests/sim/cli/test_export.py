@@ -73,6 +73,18 @@ def test_controllers_of_ros2_control_are_written_and_read(batchpid, tmp_path):
     assert status == 0
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_gains_of_other_programs_are_compared(batchpid, tmp_path):
+    path = write(tmp_path, robot(link("x"), link("y"), joint("a", "x", "y", "revolute", LIMIT)))
+    files = {"ros2_control": tmp_path / "controllers.yaml", "isaac_lab": tmp_path / "isaac.py"}
+    for target, out in files.items():
+        assert batchpid("export", path, "--to", target, "--out", out)[0] == 0
+    words = ("--moves", 1, "--seconds", 0.05, "--workers", 0)
+    status, said, _ = batchpid("compare", path, "--gains", "designed", *files.values(), *words)
+    assert status == 0
+    assert all(name in said for name in ("designed", "controllers.yaml", "isaac.py"))
+
+
 def test_followers_are_left_out_of_controllers_and_read_from_their_leaders(batchpid, tmp_path):
     names = ("x", "y", "z")
     path = write(
@@ -112,7 +124,7 @@ def test_pd_targets_have_the_motors_and_the_friction_of_the_robot(batchpid, tmp_
     expected = ("DelayedPDActuatorCfg(", "dynamic_friction=0.75", "viscous_friction=0.5", "min_delay=2", "_limit=10.0")
     assert all(each in text for each in expected)
     status, said, _ = batchpid("export", path, "--to", "maniskill", "--out", out, *words)
-    assert (status, "differs: coulomb: friction of PhysX" in said) == (0, True)
+    assert (status, "differs: coulomb: friction of PhysX is a coefficient" in said) == (0, True)
     assert "force_limit=[10.0]" in out.read_text()
     status, said, _ = batchpid("export", path, "--to", "newton", "--out", out, *words)
     assert (status, "differs: command_delay: of the setpoint" in said) == (0, True)
