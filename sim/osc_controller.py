@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from copy import copy
 from typing import Any, NamedTuple
@@ -18,8 +19,10 @@ from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.frames import pose_error
+from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
 
 _OPTIONAL = {
@@ -196,6 +199,25 @@ class OperationalSpace:
         other._k, other._timestep = ts.discretise(self._params, timestep), timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
+
+    def check_stability(self, stacklevel: int = 2) -> None:
+        """Warn, ``stacklevel`` frames up, if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
+        p, dt = self._params, self._timestep
+        if p.discretization is not None or isinstance(p.decoupling, NoDecoupling):
+            return
+        for name, kp, kd, columns in (
+            ("stiffness", p.stiffness, p.damping, AXES),
+            ("posture_stiffness", p.posture_stiffness, p.posture_damping, self._tree.joint_names),
+        ):
+            ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
+            if ratio[worst := int(ratio.argmax())] > 1:
+                warnings.warn(
+                    f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is {ratio[worst]:.3g} "
+                    f"times the stability bound of the sampled loop at a time step of {dt:g} s; use less, a smaller "
+                    f"timestep, or discretization='implicit'",
+                    StabilityWarning,
+                    stacklevel=stacklevel + 1,
+                )
 
     def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
         """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""

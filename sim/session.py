@@ -29,6 +29,7 @@ from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import IDEAL, RunnerOptions
+from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.workers.pool import WorkerPool
@@ -97,6 +98,8 @@ class Session:
         self.reset(seed=None if self.options.randomization is None else 0)
         if self._stability is not None:
             self._stability.check(self.state.params, self.options.actuators, stacklevel=4)
+        if isinstance(self.options.control, OperationalSpace):
+            self.options.control.check_stability(stacklevel=3)
 
     def close(self) -> None:
         """End the workers. May be called again, as after an interrupt."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from robots import load_bundled
@@ -10,6 +12,7 @@ from tiny_urdf import joint, link, robot, write
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.sim.robot.loop_stability import StabilityWarning
 
 HAND = "panda_hand"
 START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
@@ -157,6 +160,20 @@ def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
 def test_arguments_are_checked(panda, options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         OperationalSpace(panda, **{"link": HAND} | options)
+
+
+def test_gains_that_the_time_step_makes_unstable_are_a_warning_unless_implicit(panda):
+    options = {"workers": 0, "timestep": 1 / 100}
+    with (
+        pytest.warns(StabilityWarning, match=r"stiffness, 'x': 10000 .* 1.25 times .*implicit") as seen,
+        Runner(panda, 1, control=OperationalSpace(panda, HAND, stiffness=1e4), **options),
+    ):
+        assert seen[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        control = OperationalSpace(panda, HAND, stiffness=1e4, discretization="implicit")
+        Runner(panda, 1, control=control, **options).close()
+        Runner(panda, 1, control="osc", **options).close()
 
 
 def test_the_robot_is_that_of_the_runner(panda, six_joints):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from quick_jit import quick_jit
 from trees import planar, states, tree_of
 
 import batchpid.task_space as ts
@@ -184,21 +182,6 @@ def test_the_state_is_the_posture_and_rows_of_it_reset():
     np.testing.assert_array_equal(again.posture, [[0, 0], [1, 1], [0, 0]])
     assert "3 envs" in repr(again)
     assert "stiffness 150" in repr(params)
-
-
-def test_jax_computes_the_same(x64):
-    tree, link = planar((1.0, 0.8)), "tip"
-    qpos, qvel = states(tree, 4)
-    params = ts.make_osc_params(tree, axes=[True, True, *[False] * 4], effort_limit=20.0)
-    goal = ts.link_poses(tree, qpos + 0.1, [link])[:, 0]
-    inputs = params, ts.init(params, qpos), goal, qpos, qvel
-
-    def step(params, state, *rest):
-        return ts.step(params, state, *rest, DT, tree=tree, link=link)[1]
-
-    with jax.numpy_rank_promotion("allow"):
-        found = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
-    np.testing.assert_allclose(found, step(*inputs), atol=1e-9)
 
 
 def test_inputs_of_a_step_are_checked():

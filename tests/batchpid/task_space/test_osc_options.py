@@ -189,9 +189,11 @@ def test_native_numpy_and_jax_compute_the_same(x64):
         native = step(*inputs)
         with mock.patch.dict("os.environ", {SWITCH: "0"}):
             plain = step(*inputs)
-        with jax.numpy_rank_promotion("allow"):
-            traced = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
-        for found in (plain, traced):
+        traced = None
+        if how == "implicit":
+            with jax.numpy_rank_promotion("allow"):
+                traced = quick_jit(step)(*jax.tree.map(jax.numpy.asarray, inputs))
+        for found in (plain, traced) if traced else (plain,):
             np.testing.assert_allclose(found[1], native[1], atol=1e-9)
             np.testing.assert_allclose(found[0].integral, native[0].integral, atol=1e-9)
         alone = step(
