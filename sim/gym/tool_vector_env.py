@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-import batchpid.task_space as ts
 from batchpid.checks.validate import array, choice, entries, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.gym.joint_space import JointSpace
@@ -113,12 +112,11 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
         self.tool = kinematics.links[kinematics.tool]
         if self._tool is not None:
             self.tool = choice("tool", self._tool, kinematics.links)
-        control = OperationalSpace(robot, self.tool, posture=self.posture, **self._osc)
-        self._tree = robot.kinematic_tree()
-        self._home = ts.link_poses(self._tree, self.posture, [self.tool])[0]
+        self._control = OperationalSpace(robot, self.tool, posture=self.posture, **self._osc)
+        self._home = np.array(self._control.command.neutral)[:7]
         self.center = self._home[:3] + self.center_offset
         """Center of the workspace (3,) [m]."""
-        return {"control": control}
+        return {"control": self._control}
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
         """Return the spaces: joints, pose of the tool, and further entries with :meth:`task_bounds`."""
@@ -138,13 +136,13 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
 
     def draw(self, env: int, random: np.random.Generator) -> Float64:
         """Draw a start around the posture; joints outside the chain to the tool start in it."""
-        moves = self._tree.chain(self.tool) & self.robot.independent
+        moves = self.robot.kinematic_tree().chain(self.tool) & self.robot.independent
         drawn = self.posture + self.spread * moves * random.uniform(-1.0, 1.0, self.robot.dof)
         return np.clip(drawn, self.robot.lower, self.robot.upper)
 
     def first_setpoint(self, qpos: Float64) -> Float64:
         """Return the poses of the tool."""
-        return self.tool_poses(qpos)
+        return self._near_home(self._control.tool_pose(qpos))
 
     def command(self, action: Float64, setpoint: Float64) -> Float64:
         """Return the poses of the target (envs, 7) for actions in [-1, 1]."""
@@ -168,16 +166,13 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
             wxyz = multiply(about(axis, angle), wxyz)
         return np.concatenate([self.center + place[..., :3], wxyz], axis=-1)
 
-    def tool_poses(self, qpos: Float64 | Float32) -> Float64:
-        """Return the poses of the tool in the world (envs, 7): position [m], quaternion (w, x, y, z).
-
-        Of the two quaternions of an orientation, the one nearer to that of the posture.
-        """
-        poses = ts.link_poses(self._tree, np.asarray(qpos, np.float64), [self.tool])[:, 0].copy()
-        opposite = (poses[:, 3:] * self._home[3:]).sum(1) < 0
-        poses[opposite, 3:] *= -1.0
-        return poses
-
     def observe(self, observed: Observation) -> Float64:
         """Return the joints' positions and velocities, and the pose of the tool."""
-        return np.concatenate([self._joints.observe(observed), self.tool_poses(observed.qpos)], axis=1)
+        assert observed.tool_pose is not None
+        return np.concatenate([self._joints.observe(observed), self._near_home(observed.tool_pose)], axis=1)
+
+    def _near_home(self, poses: Float32) -> Float64:
+        """Return the poses (envs, 7) with the one of two quaternions that is nearer to that in the posture."""
+        near = poses.astype(np.float64)
+        near[:, 3:] *= np.where((near[:, 3:] * self._home[3:]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        return near
