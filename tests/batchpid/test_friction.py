@@ -130,6 +130,17 @@ def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_s
     np.testing.assert_allclose(total[-1], 0.0, atol=1e-9)
 
 
+def test_joints_with_friction_share_the_gain_by_their_correlations():
+    mass, zero = np.array([[[0.02, 0.009], [0.009, 0.01]]]), np.zeros((1, 2))
+    inverse = np.linalg.inv(mass[0])
+    deadbeat = friction.SHARE / (DT * np.diag(inverse))
+    correlation = abs(inverse[0, 1]) / np.sqrt(inverse[0, 0] * inverse[1, 1])
+    both = friction.init(Friction(np.ones((1, 2))), zero, zero, mass, DT)
+    one = friction.init(Friction(np.array([[1.0, 0.0]])), zero, zero, mass, DT)
+    np.testing.assert_allclose(both.memory[0], deadbeat / (1 + correlation))
+    np.testing.assert_allclose(one.memory[0], [deadbeat[0], 0.0])
+
+
 def test_envs_do_not_affect_each_other_and_are_reset_alone():
     rng = np.random.default_rng(0)
     mass = np.concatenate([np.eye(3)[None] * scale for scale in (0.1, 1e-4, 3.0)])
