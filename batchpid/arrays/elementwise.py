@@ -30,6 +30,11 @@ def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
     return x if high is None else xp.minimum(x, high)
 
 
+def multiply(matrix: Any, vector: Any) -> Any:
+    """Return matrix @ vector for each env, with sums in one order for any number of envs."""
+    return (matrix * vector[:, None, :]).sum(-1)
+
+
 def replace_envs(state: Any, fresh: Any, mask: Any) -> Any:
     """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in ``fresh``."""
     xp = namespace(*state, mask)

@@ -45,6 +45,10 @@ class Field(NamedTuple):
 
 FREE = Field(low=-math.inf)
 """A leaf that may hold any number."""
+WHOLE = ("max_delay", "seed")
+"""Leaves for all joints together."""
+TABLES = ("limit_positions", "limit_efforts")
+"""Leaves with a table for each joint (1 | envs, joints, points)."""
 
 
 def check_leaves(
@@ -59,13 +63,11 @@ def check_leaves(
         if leaf is None or isinstance(leaf, tuple) or name in WHOLE:
             continue
         joints = leaves.num_joints if joint_names is None else len(joint_names)
-        if leaf.shape[:2] not in ((1, joints), (num_envs, joints)):
+        shape = leaf.shape[:2] if name in TABLES else leaf.shape
+        if shape not in ((1, joints), (num_envs, joints)):
             remedy = "give one row, or one row per env" + (f", of {', '.join(joint_names)}" if joint_names else "")
             problem = f"has shape {leaf.shape}, not {(1, joints)} or {(num_envs, joints)}"
             raise InvalidArgumentError(f"{owner}.{name}", problem, remedy=remedy)
-        field = fields.get(name, FREE)
-        field.checked(f"{owner}.{name}", leaf if is_traced(leaf) else np.asarray(leaf), joint_names, infinite=True)
-
-
-WHOLE = ("max_delay", "seed")
-"""Leaves for all joints together."""
+        if not is_traced(leaf):
+            least = leaf.min(2) if name in TABLES else np.asarray(leaf)
+            fields.get(name, FREE).checked(f"{owner}.{name}", least, joint_names, infinite=True)

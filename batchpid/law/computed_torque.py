@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, PerMassMatrix
-from batchpid.arrays.elementwise import clip, namespace
+from batchpid.arrays.elementwise import clip, multiply, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
@@ -78,7 +78,7 @@ def advance_terms_with_mass_matrix(
     """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
     new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d = (_multiply(mass_matrix, term) for term in terms[:3])
+    p, i, d = (multiply(mass_matrix, term) for term in terms[:3])
     given = namespace(effort).zeros_like(effort) + (0.0 if feedforward is None else feedforward)
     return new, Terms(p, i, d, given, unsaturated, effort, effort != unsaturated, terms.finite)
 
@@ -117,7 +117,7 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
         return state
     xp = namespace(state.integral, mass_matrix)
     if was:
-        integral = _multiply(mass_matrix, state.integral)
+        integral = multiply(mass_matrix, state.integral)
     else:
         integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
     return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
@@ -132,7 +132,7 @@ def _to_effort(
 ) -> tuple[PIDState, Any, Any]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
     xp, low, high = namespace(*k, a, mass_matrix), k.effort_min, k.effort_max
-    wanted = _multiply(mass_matrix, a)
+    wanted = multiply(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = wanted + passive
     if low is not None or high is not None:
@@ -144,11 +144,6 @@ def _to_effort(
                 deeper = deeper & (k.conditional > 0)
             new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
     return new, effort, unsaturated
-
-
-def _multiply(matrix: Any, vector: Any) -> Any:
-    """Return matrix @ vector for each env, with sums in one order for any number of envs."""
-    return (matrix * vector[:, None, :]).sum(-1)
 
 
 def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:

@@ -40,7 +40,7 @@ FIELDS = {
     "continuous": Field(neutral=False),
 }
 """Options of a joint."""
-_PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"
+PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"
 """Options that become a leaf without regard to others."""
 
 
@@ -263,7 +263,7 @@ def make_params(
     if kp is None:
         raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
     p, i, d = (build.array(name, gain, FIELDS[name]) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
-    options = {name: build.option(name, given[name], FIELDS[name]) for name in _PLAIN}
+    options = {name: build.option(name, given[name], FIELDS[name]) for name in PLAIN}
     chosen = {name: build.choice(name, given[name]) for name in CHOICES}
     if chosen["discretization"] is not None:
         _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
@@ -272,14 +272,10 @@ def make_params(
     integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
     clamp, conditional, back = build.strategies(anti_windup)
     integral_ends = build.clamped(clamp, integral_ends, effort_ends)
+    names = "kp", "ki", "kd", "effort_min", "effort_max", "integral_min", "integral_max"
+    leaves = map(build.freeze, (p, i, d, *effort_ends, *integral_ends))
     return PIDParams(
-        kp=build.freeze(p),
-        ki=build.freeze(i),
-        kd=build.freeze(d),
-        effort_min=build.freeze(effort_ends[0]),
-        effort_max=build.freeze(effort_ends[1]),
-        integral_min=build.freeze(integral_ends[0]),
-        integral_max=build.freeze(integral_ends[1]),
+        **dict(zip(names, leaves, strict=True)),
         tracking_time=build.tracking_time(tracking_time, back, p, i, d),
         conditional=Everywhere() if conditional is not None and conditional.all() else build.freeze(conditional),
         continuous=build.mask("continuous", continuous),

@@ -52,7 +52,7 @@ class CompiledLaw:
         """Return the program for a state of ``size`` leaves and inputs, and the state indices that it returns."""
         key = tuple([leaf is None for leaf in leaves])
         if key not in self._programs:
-            structures = tuple(map(_structure, (self._k, leaves[:size], leaves[size:])))
+            structures = tuple(map(structure, (self._k, leaves[:size], leaves[size:])))
             dtype = self._k.kp.dtype
             traced, kept = _trace(structures, self._terms, dtype)
             constants = [leaf for leaf in self._k if isinstance(leaf, np.ndarray)]
@@ -88,5 +88,6 @@ class CompiledLaw:
         return np.ascontiguousarray(leaf if leaf.shape == self._shape else np.broadcast_to(leaf, self._shape))
 
 
-def _structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:
+def structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the structure of ``leaves`` for :func:`_trace`: ``...`` in place of each array."""
     return tuple([... if isinstance(leaf, np.ndarray) else leaf for leaf in leaves])

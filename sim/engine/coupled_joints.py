@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.elementwise import TURN, multiply
 from batchpid.motors.coupling import Coupling
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
@@ -53,11 +53,6 @@ class ConstraintEfforts:
         error = (qpos - coupling.positions(qpos))[:, followers]
         error = np.where(self._wraps, error - TURN * np.rint(error / TURN), error)
         rate = (qvel - coupling.rates(qvel))[:, followers]
-        wrong = _multiply(self._response, effort - self._passive)
+        wrong = multiply(self._response, effort - self._passive)
         wrong += self._rate_gain * rate + self._position_gain * error
-        return effort - _multiply(self._effort, wrong)
-
-
-def _multiply(matrix: Float64, vector: Float64) -> Float64:
-    """Return matrix @ vector for each robot, with sums in one order for any number of robots."""
-    return (matrix * vector[:, None, :]).sum(-1)
+        return effort - multiply(self._effort, wrong)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.law.coefficients import Coefficients
 from batchpid.native.array_program import ArrayProgram
+from batchpid.native.compiled_law import structure
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.tracing import Symbol, Trace, trace
 from batchpid.sim.engine import native
@@ -48,7 +49,7 @@ class LawProgram:
 
     def __init__(self, law: PIDLaw, k: Coefficients) -> None:
         self._law = law
-        self._k = _structure(k)
+        self._k = structure(k)
         self._constants = [leaf for leaf in k if isinstance(leaf, np.ndarray)]
         self._shape = k.kp.shape
         self._programs: dict[Any, tuple[ArrayProgram, list[int]]] = {}
@@ -79,7 +80,7 @@ class LawProgram:
         leaves = (*state, *inputs)
         key = (observed, *[leaf is None for leaf in leaves])
         if key not in self._programs:
-            structures = (self._k, _structure(state), _structure(inputs))
+            structures = (self._k, structure(state), structure(inputs))
             traced, returned = _trace_law(self._law, structures, observed)
             count = len(leaves) - sum(key[1:])
             self._programs[key] = ArrayProgram(traced, self._constants, count, self._shape), returned
@@ -89,7 +90,3 @@ class LawProgram:
         for at, leaf in zip(returned, outputs, strict=False):
             new[at] = leaf
         return bp.PIDState._make(new), outputs[len(returned)], outputs[-1] if observed else None
-
-
-def _structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:
-    return tuple([... if isinstance(leaf, np.ndarray) else leaf for leaf in leaves])
