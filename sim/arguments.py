@@ -1,4 +1,4 @@
-"""Arguments of a Runner's commands: checked before anything changes, and returned as arrays that the caller has not."""
+"""Arguments of a Runner's commands: checked before anything changes, and returned as copies."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def own_command(control: object) -> CommandSpec | None:
             "control",
             f"has an attribute 'command' whose {error.argument} {error.problem}",
             value=given,
-            remedy="let it be a batchpid.sim.CommandSpec, or names such as ('x', 'y')",
+            remedy="use a batchpid.sim.CommandSpec, or names such as ('x', 'y')",
         ) from None
 
 

@@ -21,7 +21,7 @@ _load_plot: list[Callable[[], Callable[..., Any]]] = []
 
 
 def register_plot(load: Callable[[], Callable[..., Any]]) -> None:
-    """Set the function that returns the drawing of rollouts, which is a floor above: :mod:`batchpid.sim` calls it."""
+    """Set the function that returns the drawing function of rollouts; :mod:`batchpid.sim` calls it."""
     _load_plot[:] = [load]
 
 

@@ -135,7 +135,7 @@ class RunnerKeywords(TypedDict, total=False):
     :func:`batchpid.make_guard`; default none. ``obs.guarded`` tells which setpoints were changed."""
     on_invalid_input: InvalidInputAction
     """``"raise"`` (the default) an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"``
-    it: the env that it is for fails."""
+    it: only the env concerned fails."""
     recover: bool
     """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
     an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""

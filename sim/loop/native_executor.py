@@ -41,7 +41,7 @@ LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
 
 
 class NativeExecutor(NumPyExecutor):
-    """Executor of control steps in native code, for the robots of ``pack``; ``layout`` is complete."""
+    """Executor of control steps in native code, for the robots of ``pack``; ``layout`` has its model functions."""
 
     _pack: CompiledPack
 

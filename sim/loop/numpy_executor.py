@@ -52,7 +52,7 @@ def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
 
 
 class NumPyExecutor:
-    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` is complete."""
+    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` has its model functions."""
 
     def __init__(self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants) -> None:
         self._pack, self._layout, self._constants = pack, layout, constants

@@ -44,7 +44,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
 
 
 def with_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack) -> StepState:
-    """Return ``state`` after a change of the friction of ``pack``: the model goes on, and updates its inertia next."""
+    """Return ``state`` after a change of the friction of ``pack``; the next sim step updates the model's inertia."""
     if constants.friction.coulomb is None or state.age is None:
         return reset_friction(layout, constants, state, pack, np.ones(pack.size, bool))
     return state._replace(age=np.full_like(state.age, REFRESH_STEPS))

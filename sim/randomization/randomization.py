@@ -138,7 +138,7 @@ class Randomization:
         Raises
         ------
         InvalidArgumentError
-            A seed is negative, or no whole number, or there is not one for each env.
+            A seed is negative or not a whole number, or the seeds are not one for each env.
         """
         num_envs = len(mask)
         if seed is None:

@@ -294,7 +294,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
 
 def _numbers(value: NDArray[Any]) -> NDArray[Any]:
     if value.dtype.kind not in "iuf":
-        raise ValueError(f"it has {value.dtype} where numbers belong")
+        raise ValueError(f"it has {value.dtype} in place of numbers")
     return value
 
 

@@ -64,7 +64,7 @@ _load_engine: list[Callable[[], RobotFunctions]] = []
 
 
 def register_engine(load: Callable[[], RobotFunctions]) -> None:
-    """Set the function that returns the engine, which is a floor above, so that :mod:`sim` connects the two."""
+    """Set the function that returns the engine. :mod:`sim` calls it, because robots must not import engines."""
     _load_engine[:] = [load]
 
 

@@ -1,4 +1,4 @@
-"""Preflight: oddities of a robot, and of the way it is to be run, reported before the first step.
+"""Preflight: oddities of a robot, its gains and its setpoint, reported before the first step.
 
 SAPIEN silently accepts most of these oddities. ``Robot.load`` raises an error if SAPIEN cannot run the file at all. A
 :class:`batchpid.sim.Finding` reports a robot that runs, but differently than the URDF or the user intends.

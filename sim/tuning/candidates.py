@@ -150,7 +150,7 @@ class Candidates:
         return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
 
     def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
-        """Return the penalty (count,) of candidates near the stability bound, which these moves may not show."""
+        """Return the penalty (count,) of candidates near the stability bound, whose moves may look stable."""
         leaves = np.stack(np.broadcast_arrays(params.kp, params.kd, params.derivative_filter_time))
         ratios = [
             stability_bound(

@@ -159,7 +159,7 @@ def _in_a_process(
     running: set[subprocess.Popen[str]],
     stop: threading.Event,
 ) -> RobotReport:
-    """Return the report on ``urdf`` that a process makes; a process that crashes is an error of its robot."""
+    """Return the report on ``urdf``, made in a separate process; a crash of the process is an error of its robot."""
     began, report, stage = time.monotonic(), RobotReport(str(urdf)), STAGES[0]
     child = subprocess.Popen(
         [sys.executable, "-P", "-c", _PROGRAM, json.dumps(sys.path), json.dumps([str(urdf), options])],

@@ -159,7 +159,7 @@ def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
 
 @contextmanager
 def _in_memory(text: str) -> Iterator[str]:
-    """Provide ``text`` under a path, as SAPIEN's loader requires; the file is in memory and ends with the process."""
+    """Provide ``text`` under a path, which SAPIEN's loader requires: an in-memory file, gone after the block."""
     with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
         file.write(text)
         file.flush()

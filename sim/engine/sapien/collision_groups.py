@@ -37,7 +37,7 @@ class CollisionGroups(NamedTuple):
 def collision_groups(
     bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair] = frozenset()
 ) -> CollisionGroups:
-    """Return words by which PhysX ignores the pairs ``ignored``, perhaps some of ``free``, and no others.
+    """Return filter words: PhysX then ignores the pairs ``ignored``, perhaps some of ``free``, and no others.
 
     The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """

@@ -222,7 +222,7 @@ class SafeRegions:
         self.sizes = np.full((size, len(arms)), np.inf)
 
     def enter(self, row: int, qpos: NDArray[np.floating], sizes: Float64) -> None:
-        """Give a robot the region around ``qpos`` (dof,) with the ``sizes`` of :meth:`ContactPredictor.region`."""
+        """Set the region of a robot: around ``qpos`` (dof,), with the ``sizes`` of :meth:`ContactPredictor.region`."""
         self.places[row] = qpos
         self.sizes[row] = sizes
         self.known[row] = self.any = True

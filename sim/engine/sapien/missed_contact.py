@@ -36,7 +36,7 @@ class MissedContacts:
         self._sizes[mask] = 0.0
 
     def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into ``first`` (size,), where that is 0, for robots that overlap at ``qpos`` (size, dof)."""
+        """Write ``step`` into the zeros of ``first`` (size,) for robots that overlap at ``qpos`` (size, dof)."""
         closed = np.abs(qpos - self._centers) @ self._predictor.arms.T
         for row in np.flatnonzero((closed >= self._sizes).any(1) & (first == 0)):
             self._sizes[row], touches = self._region(qpos[row])

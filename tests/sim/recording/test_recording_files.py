@@ -225,7 +225,7 @@ DAMAGE = {
     "one dimension": (lambda file: (file.pop("ok"), file.create_dataset("ok", (6,), "?")), "setpoint has shape"),
     "no time": (lambda file: file.pop("time"), "does not hold time"),
     "other start": (lambda file: file.attrs.create("start", np.zeros(9)), r"start has shape \(9,\), not \(3, 9\)"),
-    "text for limits": (lambda file: file.attrs.create("upper", ["a"] * 9), "where numbers belong"),
+    "text for limits": (lambda file: file.attrs.create("upper", ["a"] * 9), "in place of numbers"),
     "no tick": (lambda file: file.attrs.create("tick", np.nan), "times are not finite"),
     "other data": (
         lambda file: file["qpos"].write_direct(np.zeros((6, 3, 9), "f4")),
