@@ -92,7 +92,7 @@ class Drive(Differences):
             self.append("position_limit: no limit by position")
 
     def delays_setpoint(self) -> None:
-        """Add the difference of a target whose delay is that of the setpoint."""
+        """Add the difference of a target that delays the setpoint."""
         if (delay := self.motor("command_delay")).any():
             lag = self.degrees(delay)
             self.append(f"command_delay: of the setpoint, not of the effort: the law is not late{lag}")
