@@ -31,8 +31,7 @@ def to_c_project(
     and ``deliver`` call the driver. With a tree the example computes the mass matrix, and the feedforward: gravity,
     with the measured velocity also Coriolis and centrifugal forces.
 
-    ``header`` is the name of the header file; the other parameters and the errors are those of
-    :func:`batchpid.export.to_c`.
+    ``header`` is the name of the header file; other parameters and errors as in :func:`batchpid.export.to_c`.
     """
     path = Path(file_path("header", header, (".h",)))
     made = header_of(params, dt, joint_names, guard, inputs, prefix, tree)

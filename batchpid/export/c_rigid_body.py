@@ -1,6 +1,6 @@
 """Rigid-body functions of a robot in C: mass matrix, bias and gravity, with the robot's constants as tables.
 
-The algorithms are those of :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies and recursive
+The algorithms are the same as in :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies and recursive
 Newton-Euler, in the axes of the world and about its origin (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
 2008, sections 5.3 and 6.2). The sums of a joint run over its ancestors alone, so the last bits differ from NumPy's.
 """

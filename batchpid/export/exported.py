@@ -17,7 +17,7 @@ class Exported(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """Params, the names of their joints, and the differences of the law from that of the file."""
+    """Params, the names of their joints, and the differences of the law from the file."""
 
     params: PIDParams
     joint_names: list[str]

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 from batchpid.checks.validate import choice, identifier
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Exported
-from batchpid.export.pd_drive import JOINT_SIDE, Drive
+from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams
+from batchpid.motors.actuator_fields import JOINT_SIDE
 from batchpid.motors.actuators import Actuators
 
 CLASSES = {

@@ -99,7 +99,7 @@ class _Figures:
         self.of_joint = of_joint
 
     def given(self, key: str) -> NDArray[np.bool_]:
-        """Return the joints (joints,) that have a value of their own."""
+        """Return the mask (joints,) of joints with a value for an argument."""
         return np.array([self._figure(joint, key) is not None for joint in self.of_joint])
 
     def column(self, key: str, off: float | None = None) -> NDArray[np.float64]:

@@ -13,29 +13,13 @@ from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Differences, strategies
 from batchpid.law.params import PIDParams
+from batchpid.motors.actuator_fields import FIELDS
 from batchpid.motors.actuators import Actuators
 
 Float64 = NDArray[np.float64]
-EFFECTS = {
-    "sensor_delay": ("none in the target", "s"),
-    "lag": ("none in the target", "s"),
-    "strength": ("none in the target", ""),
-    "bias": ("none in the target", "N m or N"),
-    "backlash": ("none in the target", "rad or m"),
-    "position_resolution": ("none in the target", "rad or m"),
-    "velocity_resolution": ("none in the target", "rad/s or m/s"),
-    "position_noise": ("none in the target", "rad or m"),
-    "velocity_noise": ("none in the target", "rad/s or m/s"),
-    "saturation_effort": ("no torque-speed line", "N m or N"),
-    "command_delay": ("none in the target", "s"),
-    "armature": ("none in the target", "kg m^2 or kg"),
-    "viscous": ("none in the target", "N m s/rad or N s/m"),
-    "coulomb": ("none in the target", "N m or N"),
-    "static": ("friction at rest is that of motion", "N m or N"),
-}
-"""Effects of actuators: the sentence where a target lacks one, and the unit."""
-JOINT_SIDE = ("armature", "viscous", "coulomb", "static")
-_OFF = {"strength": 1.0, "saturation_effort": math.inf}
+EFFECTS = {name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")}
+"""Effects of actuators that a target may lack."""
+_PROBLEMS = {"saturation_effort": "no torque-speed line", "static": "friction at rest is that of motion"}
 
 
 class Drive(Differences):
@@ -83,16 +67,17 @@ class Drive(Differences):
 
     def lack_motors(self, has: Collection[str], **problems: str) -> None:
         """Add the effects of the actuators that are on and not in ``has``; ``problems`` are other sentences."""
-        for effect, (problem, unit) in EFFECTS.items():
-            values = self.motor(effect, off := _OFF.get(effect, 0.0))
-            if effect not in has and (on := values != off).any():
-                said = problems.get(effect, problem)
-                self.append(f"{effect}: {said}; here {self.listed(values, on)} {unit}".rstrip())
+        problems = _PROBLEMS | problems
+        for effect, field in EFFECTS.items():
+            values = self.motor(effect, field.neutral)
+            if effect not in has and (on := values != field.neutral).any():
+                unit, problem = field.unit.removeprefix("1"), problems.get(effect, "none in the target")
+                self.append(f"{effect}: {problem}; here {self.listed(values, on)} {unit}".rstrip())
         if self.actuators.limit_positions is not None and "position_limit" not in has:
             self.append("position_limit: no limit by position")
 
     def delays_setpoint(self) -> None:
-        """Add the difference of a target whose delay is that of the setpoint."""
+        """Add the difference of a target that delays the setpoint."""
         if (delay := self.motor("command_delay")).any():
             lag = self.degrees(delay)
             self.append(f"command_delay: of the setpoint, not of the effort: the law is not late{lag}")

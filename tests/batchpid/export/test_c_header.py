@@ -178,7 +178,7 @@ def check_random_settings(folder, data, compiler, steps, *flags):
 
 @pytest.mark.parametrize("compiler", COMPILERS)
 @given(data=st.data())
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_random_settings_are_bit_identical(tmp_path_factory, compiler, data):
     check_random_settings(tmp_path_factory.mktemp("c"), data, compiler, 100)
 

@@ -1,4 +1,4 @@
-"""Actuators of newton: the target's law beside the law, the figures of params and motors, and the list of losses."""
+"""Actuators of newton: the target's law next to the law, the figures of params and motors, and the list of losses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CLASSES = ("DrivePD", "DrivePID", "ClampingMaxEffort", "ClampingDCMotor", "Clamp
 
 
 class Builder:
-    """A ModelBuilder that keeps what it is given; newton's own has these methods and lists."""
+    """Record of the calls of a ModelBuilder, with the methods and lists of newton's."""
 
     def __init__(self):
         self.actuators, self.joint_armature, self.joint_friction, self.joint_damping = (
