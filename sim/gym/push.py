@@ -133,7 +133,7 @@ class _Box:
 
         builder = scene.create_actor_builder()
         builder.add_box_collision(half_size=[BOX] * 3, density=DENSITY)
-        builder.add_box_visual(half_size=[BOX] * 3)
+        builder.add_box_visual(half_size=[BOX] * 3, material=[0.8, 0.3, 0.1])
         builder.set_initial_pose(sapien.Pose([*self.place, BOX]))
         return builder.build(name="box")
 
