@@ -12,6 +12,7 @@ import pytest
 from identical import assert_identical
 from robots import RUBBING, load_bundled
 
+import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner, Snapshot
 from batchpid.sim.options import default_params
@@ -252,3 +253,15 @@ def test_its_repr_is_one_line(panda):
         snapshot = runner.snapshot()
     assert repr(snapshot) == "Snapshot(panda, 2 envs, control 'pid', after 20 sim steps)"
     assert repr(snapshot.states) == "EnvStates(2 envs, 9 joints)"
+
+
+@pytest.mark.parametrize("effect", [{"command_delay": 2e-3}, {"sensor_delay": 2e-3}], ids=str)
+def test_a_file_holds_the_delays_of_motors_alone_and_of_sensors_alone(effect, tmp_path):
+    robot = load_bundled("panda")
+    options = {"workers": 0, "actuators": bp.make_actuators(robot.dof, **effect)}
+    with Runner(robot, 1, **options) as runner:
+        runner.step(robot.settings.target)
+        runner.snapshot().save(tmp_path / "s.npz")
+        expected = runner.step(robot.settings.target)
+        runner.restore(Snapshot.load(tmp_path / "s.npz"))
+        assert_identical(expected, runner.step(robot.settings.target))
