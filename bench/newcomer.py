@@ -19,7 +19,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,7 +78,6 @@ def run(command: str, folder: Path, limit: float | None) -> Step:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
     )
     try:
         errors, stopped = process.communicate(timeout=limit)[1], False
@@ -103,6 +101,7 @@ def follow(wanted: list[str], folder: Path, limit: float) -> Iterator[Step]:
 
 def main(options: Options) -> int:
     """Print the seconds of each step and of all; return the number of steps that failed without a remedy."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it, and so would its children
     subprocess.run(["git", "clone", "--quiet", ROOT, options.out], check=True)
     folder = options.out.resolve()
     wanted = commands((folder / "README.md").read_text())

@@ -10,6 +10,7 @@ import subprocess
 import pytest
 
 from batchpid.export import to_c
+from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 
 MAIN = """#include <stdio.h>
@@ -54,8 +55,8 @@ def test_step(benchmark, most, tmp_path, call, joints):
     if call == "pid":
         params = params.replace(effort_rate_limit=1000.0, derivative_filter_time=0.002, anti_windup="conditional")
     params = params.replace(measurement_rate="measured")
-    (tmp_path / "pid.h").write_text(to_c(params, 1e-3, joint_names=names, tree=tree).text)
-    (tmp_path / "main.c").write_text(MAIN.replace("CALL", CALLS[call]))
+    write_atomically(tmp_path / "pid.h", to_c(params, 1e-3, joint_names=names, tree=tree).text)
+    write_atomically(tmp_path / "main.c", MAIN.replace("CALL", CALLS[call]))
     steps = 500_000 if most.floors else 1000
     words = ["cc", "-std=gnu99", "-O2", "-ffp-contract=off", f"-DSTEPS={steps}", "main.c", "-o", "main", "-lm"]
     subprocess.run(words, cwd=tmp_path, check=True)

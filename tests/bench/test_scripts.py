@@ -3,11 +3,13 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 from clusters import FILTERS
+from robots import load_bundled
 from scripts import ROOT, load_script
 
-TESTED = {"accuracy", "cluster", "contact", "draw", "motions", "newcomer", "scale", "view"}
+TESTED = {"accuracy", "circles", "cluster", "contact", "draw", "motions", "newcomer", "scale", "view"}
 
 
 def rows(text):
@@ -28,6 +30,15 @@ def test_accuracy(tmp_path, capsys):
     assert {row["motion"] for row in figures} == {"free", "contact", "limit"}
     assert all(0 < row["rms"] <= row["max"] < 0.1 and len(row["over_time"]["max"]) == 2 for row in figures)
     assert "equation of motion" in capsys.readouterr().out
+
+
+def test_circles(monkeypatch):
+    circles = load_script("circles")
+    monkeypatch.setattr(circles, "PERIOD", 0.4)
+    panda = load_bundled("panda")
+    tool, wanted, center = circles.measure(panda, "panda_hand", twist=True, acceleration=True)
+    assert np.linalg.norm(tool - wanted, axis=1).max() < 0.05
+    np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
 
 
 def test_contact(capsys):

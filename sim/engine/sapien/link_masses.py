@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.sapien.building import link_inertia, unmerged_links
 from batchpid.sim.engine.sapien.extents import shape_box
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import LinkMass
+from batchpid.sim.robot.spatial_inertia import SpatialInertia
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
@@ -29,7 +31,8 @@ def link_masses(robot: RobotDescription) -> dict[str, LinkMass]:
             masses[link.name] = LinkMass(0.0, "none", 0.0, 0.0)
             continue
         component = builders[link.name].build_physx_component()
-        inertia = link_inertia(component)
+        mass, center, tensor = link_inertia(component)
+        inertia = SpatialInertia(mass, read_only(center), read_only(tensor))
         source = "shapes" if not link.inertial else "repaired" if link.name in repaired else "inertial"
         gyration = float(np.sqrt(np.linalg.eigvalsh(inertia.tensor)[-1] / inertia.mass))
         masses[link.name] = LinkMass(inertia.mass, source, gyration, _size(component.collision_shapes), inertia)
