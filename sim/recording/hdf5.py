@@ -44,7 +44,7 @@ def read_hdf5(
     written yet; a log is read to its end. Raises ValueError if the file is damaged, lies in several files, or holds
     more than ``max_bytes``.
     """
-    request = json.dumps([os.fspath(path), names if names is None else list(names), every, max_bytes])
+    request = json.dumps([os.fspath(path), names if names is None else list(names), every, max_bytes, SECONDS])
     environment = os.environ | {"HDF5_PLUGIN_PRELOAD": "::", "OPENBLAS_NUM_THREADS": "1"}  # "::": no plugins
     with subprocess.Popen(
         [sys.executable, "-P", __file__, request],
@@ -75,9 +75,9 @@ def _receive(stream: IO[bytes], array: NDArray[Any]) -> bool:
 
 def _main() -> None:
     """Answer :func:`read_hdf5`: write a line of JSON with attributes, dtypes and shapes, then the arrays' bytes."""
-    path, names, every, max_bytes = json.loads(sys.argv[1])
+    path, names, every, max_bytes, seconds = json.loads(sys.argv[1])
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends the process, in the midst of HDF5 too
-    signal.setitimer(signal.ITIMER_REAL, SECONDS + os.path.getsize(path) / SPEED)
+    signal.setitimer(signal.ITIMER_REAL, seconds + os.path.getsize(path) / SPEED)
     import h5py
 
     with open("/proc/self/statm", encoding="ascii") as pages:

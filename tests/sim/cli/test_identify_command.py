@@ -39,7 +39,7 @@ def make_log(folder, engine="sapien"):
     return folder / "pendulum.urdf", write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
 
 
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize("engine", ["sapien", pytest.param("mujoco", marks=pytest.mark.slow)])
 def test_motors_are_written_for_other_commands(batchpid, tmp_path, engine):
     """From the motion in either engine, whose model the fit shares."""
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")

@@ -360,7 +360,8 @@ def assert_at_most_a_second_is_lost(recording, ticks):
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+    "number",
+    [signal.SIGKILL, *(pytest.param(each, marks=pytest.mark.slow) for each in (signal.SIGTERM, signal.SIGINT))],
 )
 def test_a_kill_loses_at_most_a_second(number, tmp_path):
     ticks = kill_after(1.7, str(tmp_path / "run.h5"), number)

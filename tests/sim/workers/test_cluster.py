@@ -73,7 +73,8 @@ def assert_same(expected, got):
         assert_identical(first, second)
 
 
-@pytest.mark.parametrize("nodes", [2, *(pytest.param(each, marks=pytest.mark.slow) for each in (1, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [1, 2, 3])
 def test_results_are_bit_identical_for_any_number_of_nodes(nodes, machines, expected):
     with make_runner(cluster=machines.ensure(nodes).options(nodes)) as runner:
         assert len(runner.nodes) == nodes
