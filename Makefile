@@ -26,6 +26,9 @@ NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py b
 	$(foreach room,batchpid/native sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
+# Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak wheel clean
 .DELETE_ON_ERROR:
 

@@ -9,6 +9,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from test_code_blocks import ROOT, SHORTER, SHORTER_CODE, TWO_JOINTS, blocks, shell_lines
 from tiny_urdf import write
@@ -66,6 +67,7 @@ def test_the_base_contains_no_package_of_an_extra():
     assert base.isdisjoint(Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra])
 
 
+@pytest.mark.slow
 def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     lines = [words[1:] for words in shell_lines(README) if words[0] == "batchpid"]
     commands = [[*words, *SIZES.get(words[0], [])] for words in lines if words[0] not in TOO_LONG]

@@ -175,6 +175,7 @@ def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path)
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 
 
+@pytest.mark.slow  # its cells are the blocks of docs/tutorial.md, which tests/test_code_blocks.py runs
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_the_cells_of_a_notebook_run_in_order_and_have_no_stored_output(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

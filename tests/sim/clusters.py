@@ -13,6 +13,7 @@ ROBOT = load_bundled("panda")
 N = 12
 SMALL = {"object_store_memory": 80 << 20, "include_dashboard": False}
 FILTERS = [
+    pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning"),  # of JAX, which other tests may have loaded
     # Ray's own: files and sockets that it leaves to the collector, and calls that its dependencies deprecate.
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:ray"),
