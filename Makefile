@@ -36,10 +36,8 @@ demo: $(VENV)/.base
 	@$(RUN) -m batchpid demo --picture out/demo.png --force $(ARGS)
 	@echo "the command: . $(VENV)/bin/activate, then batchpid --help"
 
-# One more than there are cores, since some tests wait for a timeout or a process; 8 at most.
-PROCESSES = $(shell cores=$$(nproc); echo $$((cores < 7 ? cores + 1 : 8)))
 test: $(VENV)/.dev
-	@$(RUN) -m pytest --numprocesses $(PROCESSES) --dist worksteal --benchmark-disable $(ARGS)
+	@$(RUN) -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal --benchmark-disable $(ARGS)
 
 # Features that NumPy chooses at run time and this processor has, by NumPy's own list (its names change by version).
 numpy_features = $(RUN) -c "from numpy._core._multiarray_umath import __cpu_dispatch__ as d, __cpu_features__ as f; \

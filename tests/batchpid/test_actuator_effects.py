@@ -174,8 +174,12 @@ def test_the_limit_by_position_is_linear_between_its_points(seed):
     points, efforts = np.sort(rng.uniform(-3, 3, (4, 5))), rng.uniform(0, 20, (4, 5))
     at, chosen = rng.uniform(-4, 4, 4), bp.make_actuators(4, position_limit=(points, efforts), effort_limit=15.0)
     expected = [min(np.interp(q, x, y), 15.0) for q, x, y in zip(at, points, efforts, strict=True)]
-    np.testing.assert_allclose(run_motor(chosen, np.full((1, 4), 100.0), qpos=at)[0, 0], expected, rtol=1e-9)
-    np.testing.assert_allclose(run_motor(chosen, np.full((1, 4), -100.0), qpos=at)[0, 0], np.negative(expected))
+    np.testing.assert_allclose(
+        run_motor(chosen, np.full((1, 4), 100.0), qpos=at)[0, 0], expected, rtol=1e-9, atol=1e-10
+    )
+    np.testing.assert_allclose(
+        run_motor(chosen, np.full((1, 4), -100.0), qpos=at)[0, 0], np.negative(expected), atol=1e-10
+    )
 
 
 @given(strength=st.floats(0, 2), bias=st.floats(-5, 5), effort=st.floats(-100, 100))

@@ -133,7 +133,7 @@ def test_view(monkeypatch, capsys):
 
 
 class TestOnRay:
-    pytestmark = FILTERS
+    pytestmark = [*FILTERS, pytest.mark.slow]
 
     def test_cluster_and_the_measured_costs_of_the_page_on_large_clusters(self, capsys):
         pytest.importorskip("ray")

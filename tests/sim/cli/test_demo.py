@@ -16,7 +16,7 @@ from batchpid.sim.cli.run import start_poses
 ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 
 
-@pytest.mark.parametrize("name", list(ROBOTS))
+@pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
     path = tmp_path / "new" / "demo.png"
     flags = ("--num-envs", 3, "--workers", 1 if name == "panda" else 0, "--seconds", 0.05, "--picture", path)

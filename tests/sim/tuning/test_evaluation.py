@@ -37,7 +37,7 @@ def test_arm_joints_leave_out_fingers(panda, jaco2):
     assert arm_joints(jaco2).sum() == 7
 
 
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize("name", ["jaco2", pytest.param("panda", marks=pytest.mark.slow)])
 def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(name, request):
     robot = request.getfixturevalue(name)
     moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)

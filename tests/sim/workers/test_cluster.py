@@ -191,6 +191,7 @@ def odd_machine(machines):
     machines.cluster.remove_node(node, allow_graceful=False)
 
 
+@pytest.mark.slow
 def test_machines_that_round_differently_are_refused(machines, odd_machine):
     with pytest.raises(InvalidArgumentError, match=r"do not round alike.*accept_differences"):
         make_runner(cluster=machines.options(), control=odd_controller())

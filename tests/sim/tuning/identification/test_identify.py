@@ -143,6 +143,7 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     assert found.theta[delay] == pytest.approx(truth.delay, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
     motion = excite(arm, 1.0, rate=2000.0, lowest=1.0).position
