@@ -132,8 +132,9 @@ def test_view(monkeypatch, capsys):
     assert "frames/s served" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 class TestOnRay:
-    pytestmark = [*FILTERS, pytest.mark.slow]
+    pytestmark = FILTERS
 
     def test_cluster_and_the_measured_costs_of_the_page_on_large_clusters(self, capsys):
         pytest.importorskip("ray")
