@@ -20,6 +20,7 @@ from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
 from batchpid.sim import RecoveryWarning, Runner
+from batchpid.sim.processes.fork_server import server_pid
 
 ROBOT = load_bundled("panda")
 N, TICKS = 8, 30
@@ -104,6 +105,16 @@ def test_a_lost_worker_is_replaced(undisturbed):
         assert runner.pids[0] == other
         assert len({*lost, runner.pids[1]}) == 4
         assert not any(map(psutil.pid_exists, lost))
+    assert_identical(undisturbed, rollout)
+
+
+def test_workers_that_end_with_their_fork_server_are_replaced(undisturbed):
+    with make_runner() as runner:
+        lost, acts = runner.pids, {7: lambda: send(server_pid(), signal.SIGKILL)}
+        with pytest.warns(RecoveryWarning):
+            rollout = runner.rollout(setpoints(), progress=at_ticks(acts))
+        assert runner.recoveries == 2
+        assert not {*lost} & {*runner.pids}
     assert_identical(undisturbed, rollout)
 
 
