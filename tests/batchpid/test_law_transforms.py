@@ -154,7 +154,7 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
 @pytest.mark.parametrize(
     ("build", "strategy"),
     [
-        ("make_params", {"anti_windup": "back_calculation"}),
+        pytest.param("make_params", {"anti_windup": "back_calculation"}, marks=pytest.mark.slow),
         ("make_params", {"anti_windup": "conditional", "ki": 0.0}),
         ("replace", {"anti_windup": "back_calculation"}),
         ("replace", {"anti_windup": "clamp"}),

@@ -11,6 +11,7 @@ FREE = {"send": 0.0, "send_rate": 1e30, "receive": 0.0, "receive_rate": 1e30, "r
 EVEN = {"jitter": 0.0, "slow": 0.0, "detection": -20.0, "restart": 0.0}
 
 
+@pytest.mark.slow
 def test_the_page_shows_what_the_script_prints():
     page = (ROOT / "docs/scale.md").read_text()
     shown = page.split("<!-- scale: printed by bench/scale.py -->\n")[1].split("<!-- end -->")[0]

@@ -16,7 +16,8 @@ def workload(panda):
     return Workload(panda, num_envs=4, workers=0, ticks=60, rounds=1)
 
 
-@pytest.mark.parametrize("engine", ["sapien", pytest.param("mujoco", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_every_case_moves_and_has_a_rate(workload, engine):
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     results = measure_rates(dataclasses.replace(workload, engine=engine), names=cases_in(engine))

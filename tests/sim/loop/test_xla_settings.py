@@ -91,7 +91,8 @@ def test_all_of_them_at_once(case):
         assert_identical(motion(case), wanted)
 
 
-@pytest.mark.parametrize("case", ["pid", pytest.param("controller", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["pid", "controller"])
 def test_workers_under_settings_of_their_environment(monkeypatch, case):
     wanted = expected(case)
     for name, value in SETTINGS.items():

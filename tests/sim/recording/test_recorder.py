@@ -371,6 +371,7 @@ def test_a_kill_loses_at_most_a_second(number, tmp_path):
     assert not recording.info.complete
 
 
+@pytest.mark.slow
 def test_a_kill_in_a_pause_loses_nothing(tmp_path):
     assert len(kill_after(60, str(tmp_path / "run.h5"), pause=20)) == 21
     assert len(read_recording(tmp_path / "run.h5.partial").time) == 21

@@ -79,6 +79,7 @@ def test_a_missing_file_and_an_unknown_name_are_not_found():
             Robot.load(path)
 
 
+@pytest.mark.slow
 def test_as_many_links_as_physx_holds_are_simulated(tmp_path):
     chain = (link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}", origin="0 0 0.01") for n in range(254))
     long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))

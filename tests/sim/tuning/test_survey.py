@@ -38,6 +38,7 @@ def test_reports_come_in_order_with_all_that_is_known(folder):
     assert truncated.error.startswith("reading the URDF: ")
 
 
+@pytest.mark.slow
 def test_a_robot_that_takes_too_long_is_ended(folder):
     (report,) = survey([folder / "deep" / "arm.urdf"], moves=1000, seconds=600.0, time_limit=2.0)
     assert report.error.endswith("more than 2 s")

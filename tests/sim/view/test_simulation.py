@@ -72,6 +72,7 @@ def test_gain_sets_in_other_units_are_applied_without_a_bump(panda):
     live.close()
 
 
+@pytest.mark.slow
 def test_the_motors_hold_a_payload(live):
     live.set_setpoint(live.robot.settings.target)
     free_qpos, free_effort = run(live, 4.0)

@@ -229,7 +229,8 @@ while True:
 """
 
 
-@pytest.mark.parametrize("local", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("local", [False, True])
 def test_nothing_is_left_of_a_program_that_is_killed(local, machines):
     shared = shared_memory()
     address = "local" if local else machines.ensure(1).cluster.address
