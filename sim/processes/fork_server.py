@@ -33,6 +33,8 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from batchpid.sim.processes.descriptors import is_open, standard_streams_occupied
+
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
 """Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the caller's thread."""
@@ -130,10 +132,11 @@ def fork(
     OSError
         No process can be started.
     """
-    here = os.open(".", os.O_PATH | os.O_CLOEXEC)
-    reader, writer = Pipe(duplex=False)
+    streams = [number for number in (1, 2) if is_open(number)]
+    with standard_streams_occupied():
+        here = os.open(".", os.O_PATH | os.O_CLOEXEC)
+        reader, writer = Pipe(duplex=False)
     try:
-        streams = [number for number in (1, 2) if _is_open(number)]
         message = {
             "main": main,
             "imports": [*imports],
@@ -191,8 +194,9 @@ atexit.register(_leave)
 def _start(environment: dict[str, str]) -> _Server:
     if not sys.executable:
         raise OSError("sys.executable does not say which Python to run")
-    ours, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
-    quiet = [(os.POSIX_SPAWN_OPEN, each, os.devnull, os.O_RDWR, 0) for each in (0, 1, *(() if _is_open(2) else (2,)))]
+    with standard_streams_occupied():
+        ours, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
+    quiet = [(os.POSIX_SPAWN_OPEN, each, os.devnull, os.O_RDWR, 0) for each in (0, 1, *(() if is_open(2) else (2,)))]
     with theirs:
         pid = os.posix_spawn(
             sys.executable,
@@ -207,14 +211,6 @@ def _start(environment: dict[str, str]) -> _Server:
 def _import_path() -> list[str]:
     paths = [os.fspath(path) for path in sys.path if isinstance(path, str | os.PathLike)]
     return [*paths, str(Path(__file__).parents[3])]  # where "" led to, before the caller changed the folder
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
 
 
 def serve(idle_seconds: float = 20.0) -> None:

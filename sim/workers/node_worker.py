@@ -12,10 +12,11 @@ from typing import Any, Self
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.processes.background import BACKGROUND, Job
+from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.workers.cluster import Cluster
 from batchpid.sim.workers.node import Answer, Node, NodeInfo
 from batchpid.sim.workers.requests import Request, Run, Start
-from batchpid.sim.workers.shared_memory import SharedArrays, above_standard_streams
+from batchpid.sim.workers.shared_memory import SharedArrays
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 START_LIMIT, SILENCE_LIMIT = 60.0, 20.0
@@ -149,7 +150,8 @@ class _Bell(io.FileIO):
     """Event descriptor, readable after :meth:`ring`; closed with its last reference."""
 
     def __init__(self) -> None:
-        super().__init__(above_standard_streams(os.eventfd(0, os.EFD_CLOEXEC)), "r+")
+        with standard_streams_occupied():
+            super().__init__(os.eventfd(0, os.EFD_CLOEXEC), "r+")
 
     def ring(self) -> None:
         """Make the descriptor readable; called by a thread of Ray."""

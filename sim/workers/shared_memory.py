@@ -6,7 +6,6 @@ however that one ends.
 
 from __future__ import annotations
 
-import fcntl
 import io
 import mmap
 import os
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.sim.loop.arrays import Layout
+from batchpid.sim.processes.descriptors import standard_streams_occupied
 
 _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
@@ -38,7 +38,8 @@ class SharedArrays(SingleOwner):
         else:
             self._file = None
         self.fd = fd
-        memory = mmap.mmap(fd, max(size, 1))
+        with standard_streams_occupied():
+            memory = mmap.mmap(fd, max(size, 1))  # it holds a copy of the descriptor
         self.arrays: dict[str, NDArray[Any]] = {
             name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
             for name, (shape, dtype) in layout.items()
@@ -55,20 +56,8 @@ class MemoryFile(io.FileIO):
     """New anonymous file in memory, closed with its last reference."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(above_standard_streams(os.memfd_create(name, os.MFD_CLOEXEC)), "r+")
+        with standard_streams_occupied():
+            super().__init__(os.memfd_create(name, os.MFD_CLOEXEC), "r+")
 
     def __del__(self) -> None:
         self.close()  # without the ResourceWarning of its base
-
-
-def above_standard_streams(descriptor: int) -> int:
-    """Return ``descriptor``, or replace it by a number above the standard streams, if a program has closed these.
-
-    Otherwise a child process would get another file under that number, and printed text would go to ``descriptor``.
-    """
-    if descriptor > 2:
-        return descriptor
-    try:
-        return fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 3)
-    finally:
-        os.close(descriptor)

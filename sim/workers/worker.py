@@ -30,12 +30,13 @@ from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.processes.background import BACKGROUND, Job
+from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
 from batchpid.sim.workers.channel import Channel
 from batchpid.sim.workers.liveness import Liveness
 from batchpid.sim.workers.requests import Request, Start
 from batchpid.sim.workers.serve import DONE
-from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays, above_standard_streams
+from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays
 
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
@@ -162,7 +163,8 @@ class ProcessWorker(Worker):
     def _open(self) -> None:
         with contextlib.ExitStack() as undo:
             self._trace = undo.enter_context(MemoryFile("batchpid-trace"))
-            ours, theirs = map(_above_standard_streams, socket.socketpair())
+            with standard_streams_occupied():
+                ours, theirs = socket.socketpair()
             undo.enter_context(ours)
             with theirs:
                 process = fork(
@@ -263,10 +265,6 @@ def pickled(start: Any) -> bytes:
             f"cannot be sent to a worker process: {error}",
             remedy="let the function use nothing that cannot be pickled, or pass workers=0",
         ) from error
-
-
-def _above_standard_streams(end: socket.socket) -> socket.socket:
-    return socket.socket(fileno=above_standard_streams(end.detach()))
 
 
 def _signal_name(number: int) -> str:

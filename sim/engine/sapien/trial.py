@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from batchpid.errors import RobotError
 from batchpid.sim.processes.background import BACKGROUND
+from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
 
 TIME_LIMIT = 120
@@ -30,7 +31,8 @@ def in_child(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) 
         The child process crashed, or took longer than TIME_LIMIT.
     """
     request = pickle.dumps((function, arguments, options))
-    ours, theirs = map(socket.socket.detach, socket.socketpair())
+    with standard_streams_occupied():
+        ours, theirs = map(socket.socket.detach, socket.socketpair())
     with Connection(ours) as connection:
         child = BACKGROUND.call(lambda: _start(theirs))
         try:

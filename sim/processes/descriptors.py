@@ -1,0 +1,31 @@
+"""The standard streams of a program that may have closed them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def standard_streams_occupied() -> Iterator[None]:
+    """Let files that are opened inside have numbers above those of the standard streams.
+
+    A program may have closed these. Without this, the next file would get such a number: text that is printed would go
+    into that file, and a child process would get another file under it.
+    """
+    with contextlib.ExitStack() as files:
+        number = 0
+        while number <= 2:
+            number = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+            files.callback(os.close, number)
+        yield
+
+
+def is_open(descriptor: int) -> bool:
+    """Return whether this process has a file open under the number ``descriptor``."""
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
