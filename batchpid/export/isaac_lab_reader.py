@@ -7,6 +7,7 @@ arguments may be numbers, names of numbers defined at the top of the text, and a
 from __future__ import annotations
 
 import ast
+import contextlib
 import math
 import operator
 import re
@@ -25,6 +26,8 @@ from batchpid.motors.actuators import make_actuators
 
 _JOINT_SIDE = {"armature": "armature", "friction": "static", "dynamic_friction": "coulomb"}
 _JOINT_SIDE |= {"viscous_friction": "viscous"}
+_FIGURES = {*_JOINT_SIDE, "stiffness", "damping", "effort_limit", "effort_limit_sim", "velocity_limit"}
+_FIGURES |= {"saturation_effort", "min_delay", "max_delay"}
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -67,7 +70,7 @@ def from_isaac_lab(text: str, joint_names: Sequence[str], *, dt: float | None = 
             raise InvalidArgumentError("text", problem, joint=joint, remedy="correct joint_names_expr")
         of_joint[joint] = matching[0]
     found = _Figures(of_joint)
-    differences = found.differences()
+    differences = [*found.differences(), *_changes(text)]
     params = make_params(
         len(joints),
         found.column("stiffness"),
@@ -166,23 +169,46 @@ def _groups(text: str) -> list[tuple[str, dict[str, Any]]]:
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise InvalidArgumentError("text", f"is not Python: {error}", remedy="give the text of a .py file") from None
     known: dict[str, Any] = {}
+    groups: list[tuple[str, dict[str, Any]]] = []
     for statement in tree.body:
-        if isinstance(statement, ast.Assign) and isinstance(target := statement.targets[0], ast.Name):
-            try:
-                known[target.id] = _value(statement.value, known)
-            except InvalidArgumentError:
-                known.pop(target.id, None)  # no number, such as the robot's configuration
-    groups = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and any(each.arg == "joint_names_expr" for each in node.keywords):
-            cls = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-            if cls not in CLASSES.values():
-                problem, remedy = f"has the actuator {cls}", f"the classes known are {', '.join(CLASSES.values())}"
-                raise InvalidArgumentError("text", problem, value=f"line {node.lineno}", remedy=remedy)
-            groups.append((cls, {each.arg: _value(each.value, known) for each in node.keywords if each.arg}))
+        calls = [node for node in ast.walk(statement) if isinstance(node, ast.Call)]
+        of_actuators = [call for call in calls if any(each.arg == "joint_names_expr" for each in call.keywords)]
+        groups += [_group(call, known) for call in of_actuators]
+        given: dict[str, Any] = {}
+        if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
+            targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+            with contextlib.suppress(InvalidArgumentError):  # no number, such as the robot's configuration
+                value = _value(statement.value, known)
+                given = {target.id: value for target in targets if isinstance(target, ast.Name)}
+        nodes = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
+        stored = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
+        known = {name: value for name, value in known.items() if name not in stored} | given
     if not groups:
         raise InvalidArgumentError("text", "holds no actuators of Isaac Lab", remedy="give ImplicitActuatorCfg(...)")
     return groups
+
+
+def _changes(text: str) -> list[str]:
+    """Return the assignments that change a configuration after its call."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Assign | ast.AugAssign):
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            if isinstance(target, ast.Attribute) and target.attr in _FIGURES:
+                found.append(f"line {node.lineno}: not read: {ast.unparse(node)}")
+    return found
+
+
+def _group(node: ast.Call, known: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the class and the arguments of a configuration."""
+    cls, where = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", ""), node.lineno
+    if cls not in CLASSES.values():
+        problem, remedy = f"has the actuator {cls}", f"the classes known are {', '.join(CLASSES.values())}"
+        raise InvalidArgumentError("text", problem, value=f"line {where}", remedy=remedy)
+    if any(each.arg is None for each in node.keywords):
+        problem, remedy = "has arguments that are unpacked from a dict (**)", "write them out"
+        raise InvalidArgumentError("text", problem, value=f"line {where}", remedy=remedy)
+    return cls, {each.arg: _value(each.value, known) for each in node.keywords if each.arg}
 
 
 def _value(node: ast.expr, known: dict[str, Any]) -> Any:

@@ -109,6 +109,7 @@ class _Server(NamedTuple):
 
 
 _server: _Server | None = None
+_left: list[int] = []  # process ids of earlier servers, until their ends are collected
 
 
 def fork(
@@ -183,9 +184,13 @@ def _leave() -> None:
     global _server
     if _server is not None:
         _server.socket.close()
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(_server.pid, os.WNOHANG)
+        _left.append(_server.pid)
     _server = None
+    for pid in [*_left]:
+        with contextlib.suppress(ChildProcessError):  # another process than the one that started it
+            if os.waitpid(pid, os.WNOHANG)[0] == 0:
+                continue
+        _left.remove(pid)
 
 
 atexit.register(_leave)
@@ -221,6 +226,7 @@ def serve(idle_seconds: float = 20.0) -> None:
         end.setblocking(False)
     signal.set_wakeup_fd(waker.fileno())
     signal.signal(signal.SIGCHLD, lambda *_: None)  # handled below: it wakes the poll
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])  # blocked where the caller's main thread blocks it
     poller = select.poll()
     poller.register(wake, select.POLLIN)
     poller.register(caller, select.POLLIN)

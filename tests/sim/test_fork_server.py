@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from processes import have_ended
+from processes import PATIENCE, have_ended
 
 from batchpid.sim.processes import fork_server
 from batchpid.sim.processes.background import BACKGROUND
@@ -80,6 +80,15 @@ def test_another_environment_starts_another_server(monkeypatch):
     assert first.wait() == -signal.SIGKILL
     assert second.wait() == 0
     assert have_ended([before])
+    monkeypatch.setenv("COLOUR", "green")
+    blocked = BACKGROUND.call(lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD]))
+    try:
+        third, _ = start("wait")
+    finally:
+        BACKGROUND.call(lambda: signal.pthread_sigmask(signal.SIG_SETMASK, blocked))
+    third.kill()
+    assert third.wait(PATIENCE) == -signal.SIGKILL  # also where the caller blocks the signal of an ended child
+    assert not psutil.pid_exists(before)  # its end was collected
 
 
 def test_an_error_is_printed_and_is_the_exit_status(capfd):

@@ -290,6 +290,7 @@ class MujocoPack(SingleOwner):
         """
         if self._robot.model.nu == 0:
             states = self.read_state()
+            self._release()
             self._make_data(robot_model(self.spec, drives=True))
             self.write_joints(self._actuators)
             self.write_state_rows(states)
@@ -346,8 +347,13 @@ class MujocoPack(SingleOwner):
 
     def close(self) -> None:
         """Free the robots. The pack cannot be used afterwards."""
+        self._release()
+        self.models = []
+
+    def _release(self) -> None:
+        """Give back all that fits the present kind of model alone: working memory, and data made for its size."""
         self._pool.leave(self)
-        self.models, self._own_step = [], None
+        self._own_step = None
         for name in ("_model", "_varied_model", "_scratch"):
             self.__dict__.pop(name, None)
 

@@ -80,6 +80,7 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     ki: dict[str, float] = defaultdict(float)
     imax: dict[str, float] = {}
     driven: set[str] = set()
+    pull: dict[int, float] = {}  # what limited tendons leave to their further actuators
     for actuator in range(len(model.actuator_trntype)):  # nu counts inputs, of which <pid> has up to three
         arms = _arms(model, actuator, names)
         label = model.actuator(actuator).name or f"number {actuator}"
@@ -87,12 +88,12 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             text = f"actuator {label!r} acts on no joint, or by a spatial tendon: left out"
             findings.append(Finding("warning", "actuator", text, "expect every joint to have a motor of its own"))
             continue
-        for name, arm in arms.items():
-            armature[name] += arm**2 * _field(model, "actuator_armature", actuator)
-            damping[name] += arm**2 * _field(model, "actuator_damping", actuator)
         leading = _leading(arms, couplings)
         if not leading:
             continue  # a gear of 0
+        for name, arm in leading.items():
+            armature[name] += arm**2 * _field(model, "actuator_armature", actuator)
+            damping[name] += arm**2 * _field(model, "actuator_damping", actuator)
         driven |= leading.keys()
         if len(leading) > 1:
             text = f"actuator {label!r} pulls several joints: each has a motor of its own here, as strong as all"
@@ -106,6 +107,12 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             remedy = "give command_delay= to make_actuators"
             findings.append(Finding("warning", "actuator", text, remedy, next(iter(leading)), detail=f"{delay:g} s"))
         force = _force_limit(model, actuator, next(iter(leading)), findings)
+        tendon = int(model.actuator_trnid[actuator, 0])
+        if model.actuator_trntype[actuator] == _TRN.mjTRN_TENDON and model.tendon_actfrclimited[tendon]:
+            if tendon not in pull:
+                pull[tendon] = _magnitude(model.tendon_actfrcrange[tendon], next(iter(leading)), findings)
+            force = min(force, pull[tendon])
+            pull[tendon] -= force
         stiffness, rate = -model.actuator_biasprm[actuator, 1:3]
         for name, arm in leading.items():
             limits[name] += abs(arm) * force
@@ -198,9 +205,11 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
 
 def _tendons(model: Any) -> list[Finding]:
     """Return a finding of tendons that act on the joints by themselves."""
-    passive = [model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited]
+    effects = ("stiffness", "damping", "frictionloss", "armature", "limited")
+    passive = [getattr(model, f"tendon_{name}") for name in effects]
     acting = [model.tendon(tendon).name for tendon in range(model.ntendon) if any(field[tendon] for field in passive)]
     if not acting:
         return []
-    text = f"springs, damping, friction and limits of tendons are not simulated: {', '.join(map(repr, acting))}"
+    names = ", ".join(map(repr, acting))
+    text = f"springs, damping, friction, armature and limits of tendons are not simulated: {names}"
     return [Finding("warning", "tendon", text, "expect their joints to move freely")]

@@ -20,6 +20,8 @@ from batchpid.sim.robot.self_collision import DisabledPair
 GRAVITY = (0.0, 0.0, -9.81)
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
+_FLAGS = ("GRAVITY", "CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT", "ACTUATION", "CLAMPCTRL")
+"""Parts of MuJoCo's physics that a file can disable, and that this package simulates nevertheless."""
 _ERRORS = (ValueError, mujoco.FatalError)
 """Errors of MuJoCo's parser and compiler."""
 
@@ -141,6 +143,9 @@ def _unused(model: Any, names: Names) -> list[Finding]:
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
         found.append(Finding("warning", "option", text, "expect other loads"))
+    if off := [name for name in _FLAGS if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]:
+        text = f"<flag> of the file is not used, which disables: {', '.join(map(str.lower, off))}"
+        found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
     if option.density or option.viscosity:
         text = "drag of the medium (<option density= viscosity=>) is not simulated"
         found.append(Finding("warning", "option", text, "expect less damping"))

@@ -55,6 +55,16 @@ def test_configurations_by_hand_are_read_and_not_executed():
     np.testing.assert_array_equal(unknown.params.kp, params.kp[:, ::-1])
 
 
+def test_a_number_is_the_one_that_was_defined_before():
+    arm = 'ImplicitActuatorCfg(joint_names_expr=["{0}"], stiffness=KP, damping=1.0)'
+    text = f"KP: float = 10\nA = {arm.format('a')}\nKP = 2 * KP\nB = {arm.format('b')}\nB.stiffness = 30\nKP += 1\n"
+    found = from_isaac_lab(text, ["a", "b"])
+    np.testing.assert_array_equal(found.params.kp, [[10, 20]])
+    assert found.differences[-1] == "line 5: not read: B.stiffness = 30"
+    with pytest.raises(InvalidArgumentError, match="KP is not a number"):
+        from_isaac_lab(text + f"C = {arm.format('c')}", ["a", "b", "c"])
+
+
 @given(random_params(), st.sampled_from(["implicit", "ideal_pd", "dc_motor", "delayed_pd"]), st.integers(0, 2**32 - 1))
 @settings(max_examples=60, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(params, model, seed):
@@ -98,6 +108,7 @@ def test_a_round_trip_loses_only_what_is_listed(params, model, seed):
     [
         ("stiffness=5.0", "stiffness=None", "gives no stiffness.*wrist|wrist.*gives no stiffness"),
         ("stiffness=5.0, ", "", "gives no stiffness"),
+        ("max_delay=4", "**LIMITS", "unpacked from a dict"),
         ("stiffness=5.0", "stiffness=read()", r"read\(\) is not a number \(got 'line 2\d'"),
         ("stiffness=5.0", "stiffness=9**9**9", "is not a number"),
         ("stiffness=5.0", "stiffness='5'", "stiffness is not a number"),

@@ -255,6 +255,20 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
         assert_same_env(run_drives(stiffness), both, env)
 
 
+@pytest.mark.parametrize("randomization", [None, Randomization(payload=Uniform(0.1, 0.5))])
+def test_drives_go_on_from_a_snapshot(panda, randomization):
+    """Robots with drives have another model, with data of another size, than robots that have none yet."""
+    options = {"params": panda.params(kp=100.0, ki=0.0, kd=10.0), "control": "drive", "randomization": randomization}
+    with Runner(panda, 2, engine="mujoco", workers=0, **options) as runner:
+        runner.reset(panda.settings.target)
+        before = runner.snapshot()
+        gone_on = runner.step(panda.start)
+        runner.restore(before)
+        again = runner.step(panda.start)
+    for one, other in zip(gone_on[:3], again[:3], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_groups_that_share_their_working_memory_move_as_one_that_does_not(jaco2, monkeypatch):
     """Arms lie on the ground and their fingers touch, where the next step depends on the solver's warm start."""
     efforts = 0.02 * np.random.default_rng(0).normal(size=(60, 6, jaco2.dof)) * jaco2.effort_limit

@@ -336,12 +336,13 @@ def test_couplings(load):
 def test_a_tendon_that_pulls_coupled_fingers(load):
     finger = '<body name="{0}"><joint name="{0}" type="slide" axis="0 {1} 0" range="0 .04"/><geom size=".01"/></body>'
     text = f"""<mujoco><worldbody><body name="hand">{BOX}{finger.format("left", 1)}{finger.format("right", -1)}</body>
-      </worldbody><tendon><fixed name="split"><joint joint="left" coef=".5"/><joint joint="right" coef=".5"/></fixed>
+      </worldbody><tendon><fixed name="split" actuatorfrcrange="-60 60">
+      <joint joint="left" coef=".5"/><joint joint="right" coef=".5"/></fixed>
       </tendon><equality><joint joint1="left" joint2="right"/></equality>
       <actuator><general tendon="split" forcerange="-100 100" ctrlrange="0 255" gainprm=".0157 0 0"
         biastype="affine" biasprm="0 -100 -10"/></actuator></mujoco>"""
     robot = load(text)
-    assert robot.effort_limit[robot.joint_names.index("right")] == 100
+    assert robot.effort_limit[robot.joint_names.index("right")] == 60
     gains = robot.mjcf_gains()
     np.testing.assert_allclose(np.ravel(gains.kp), [0, 100])
     np.testing.assert_allclose(np.ravel(gains.kd), [0, 10])
@@ -387,6 +388,13 @@ def test_armature_and_damping_of_actuators(load):
     robot = load(text)
     np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
     np.testing.assert_allclose(robot.damping, [1.8])
+    tendon = '<tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k" coef="1"/></fixed></tendon>'
+    couple = '<equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality>'
+    both = text.replace('joint="j" a', 'tendon="t" a').replace("</mujoco>", f"{tendon}{couple}</mujoco>")
+    both = both.replace('<joint name="j"/>', '<joint name="j"/><joint name="k"/>')
+    robot = load(both)  # the moment arm on the leader is 3 (2 + 3 1)
+    np.testing.assert_allclose(robot.actuators.armature, [[0.3 * 15**2, 0]])
+    np.testing.assert_allclose(robot.damping, [0.2 * 15**2, 0])
 
 
 def test_floating_base(load):
@@ -403,6 +411,7 @@ def test_floating_base(load):
 FINDINGS = {
     "spring": (two_links('<joint name="j" stiffness="3"/>'), "spring", "j"),
     "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", None),
+    "flag": (two_links(rest='<option><flag contact="disable"/></option>'), "option", None),
     "medium": (two_links(rest='<option density="1.2"/>'), "option", None),
     "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "gravcomp", None),
     "site": (two_links().replace(BOX, f'{BOX}<site name="s"/>', 1), "unknown-element", None),
@@ -424,6 +433,11 @@ FINDINGS = {
     "thruster": (
         two_links(rest='<actuator><motor site="s"/></actuator>').replace(BOX, f'{BOX}<site name="s"/>', 1),
         "actuator",
+        None,
+    ),
+    "inert tendon": (
+        two_links(rest='<tendon><fixed armature="2"><joint joint="j" coef="1"/></fixed></tendon>'),
+        "tendon",
         None,
     ),
     "stiff tendon": (
