@@ -22,17 +22,25 @@ from batchpid.sim.engine.native.interface import Group, Mujoco
 
 FUNCTIONS = {"step1": "mj_step1", "step2": "mj_step2", "set_log_handler": "mju_setLogHandler"}
 """Functions of MuJoCo's library, by field of :class:`batchpid.sim.engine.native.interface.Mujoco`."""
+CLOCK = "mjcb_time"
+"""Variable of the library that holds its clock."""
 FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias"}
 """Arrays of ``mujoco.MjData``, by field."""
 
 
+def mujoco_library() -> Path:
+    """Return the path of MuJoCo's shared library; ValueError without exactly one."""
+    (path,) = Path(mujoco.__file__).parent.glob("libmujoco.so*")
+    return path
+
+
 @cache
 def functions() -> dict[str, int] | None:
-    """Return the addresses of the functions by field; None if this version of MuJoCo lacks one of them."""
+    """Return the addresses of functions and clock by field; None if this version of MuJoCo lacks one of them."""
     try:
-        (path,) = Path(mujoco.__file__).parent.glob("libmujoco.so*")
-        library = ctypes.CDLL(str(path))
+        library = ctypes.CDLL(str(mujoco_library()))
         found = {field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for field, name in FUNCTIONS.items()}
+        found["clock"] = ctypes.addressof(ctypes.c_void_p.in_dll(library, CLOCK))
         data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
         has_addresses = bool(data._address and data.model._address)
     except (ValueError, OSError, AttributeError):

@@ -55,7 +55,8 @@ class Mujoco(ctypes.Structure):
     """Robots in MuJoCo, as Mujoco in mujoco_step.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "models", "data")),
+        *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
+        *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
     ]
 

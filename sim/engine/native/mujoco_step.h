@@ -7,6 +7,7 @@
 #include <csetjmp>
 #include <cstdint>
 #include <cstring>
+#include <mutex>
 
 #pragma GCC visibility push(hidden)
 
@@ -21,11 +22,13 @@ constexpr int LOG_ERROR = 3;
 
 using LogHandler = void (*)(LogMessage const *);
 using MujocoStage = void (*)(void const *model, void *data);
+using Clock = double (*)();
 
 // Robots in MuJoCo; Python fills in the fields (Mujoco in interface.py) and owns what they point to.
 struct Mujoco {
   MujocoStage step1, step2;                 // mj_step1, mj_step2
   LogHandler (*set_log_handler)(LogHandler);  // mju_setLogHandler
+  Clock *clock;                             // mjcb_time
   void const *const *models;                // (robots,)
   void *const *data;                        // (robots,)
   double *const *qpos, *const *qvel;        // (robots,): arrays of their mjData
@@ -52,6 +55,31 @@ struct Messages {
     text[size] = '\0';
     std::longjmp(*frame, 1);
   }
+};
+
+// Stop MuJoCo's clock while any thread steps: a step would read it forty times, a tenth of its cost, for the durations in
+// mjData, which nothing here uses. A constant takes the clock's place, since another thread may be about to call it.
+class StoppedClock {
+ public:
+  explicit StoppedClock(Clock *clock) : clock_(clock) {
+    std::lock_guard const lock(mutex_);
+    if (threads_++ == 0) {
+      before_ = *clock_;
+      *clock_ = [] { return 0.0; };
+    }
+  }
+  ~StoppedClock() {
+    std::lock_guard const lock(mutex_);
+    if (--threads_ == 0) *clock_ = before_;
+  }
+  StoppedClock(StoppedClock const &) = delete;
+  StoppedClock &operator=(StoppedClock const &) = delete;
+
+ private:
+  Clock *clock_;
+  static inline std::mutex mutex_;
+  static inline int threads_ = 0;
+  static inline Clock before_ = nullptr;
 };
 
 // Advance one robot: from velocities to the next velocities. The state of a robot that diverges stays as it is then.

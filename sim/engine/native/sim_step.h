@@ -139,6 +139,7 @@ std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qp
   Mujoco const &mujoco = *group.mujoco;
   std::int64_t const dof = group.dof;
   std::int32_t status = 0;
+  StoppedClock const stopped(mujoco.clock);
   LogHandler const before = mujoco.set_log_handler(Messages::handle);
   if (before != Messages::handle) Messages::previous = before;
   for (std::int64_t row = 0; row < group.robots && status != FAILED; ++row) {

@@ -1,7 +1,9 @@
 """MuJoCo as an engine: the model that is built, the same motion as in SAPIEN, and the promises of a runner."""
 
+import ctypes
 import dataclasses
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from batchpid.sim.engine import engines  # noqa: E402
 from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_step import CLOCK, mujoco_library  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
 from batchpid.sim.tuning.evaluation import arm_joints, run_moves  # noqa: E402
@@ -281,6 +284,25 @@ def test_groups_that_share_their_working_memory_move_as_one_that_does_not(jaco2,
     for one, other in zip(*runs, strict=True):
         assert_identical(one, other)
     assert runs[0][-1].ok.all()
+
+
+def test_mujocos_clock_goes_on_after_native_steps(panda):
+    """They stop it while they run, in any thread."""
+
+    def clock():
+        return ctypes.c_void_p.in_dll(ctypes.CDLL(str(mujoco_library())), CLOCK).value
+
+    before = clock()
+    with (
+        Runner(panda, 3, engine="mujoco", workers=0, substeps=50) as first,
+        Runner(panda, 3, engine="mujoco", workers=0, substeps=50) as second,
+        ThreadPoolExecutor() as pool,
+    ):
+        for runner in (first, second):
+            runner.reset()
+        for done in [pool.submit(runner.step, panda.settings.target) for runner in (first, second)]:
+            done.result()
+    assert clock() == before
 
 
 def test_a_snapshot_of_the_other_engine_is_refused(panda):
