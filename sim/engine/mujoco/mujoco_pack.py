@@ -290,6 +290,8 @@ class MujocoPack(SingleOwner):
         """
         if self._robot.model.nu == 0:
             states = self.read_state()
+            self._pool.leave(self)
+            self.__dict__.pop("_scratch", None)  # of a model without drives
             self._make_data(robot_model(self.spec, drives=True))
             self.write_joints(self._actuators)
             self.write_state_rows(states)
