@@ -42,7 +42,9 @@ class Coefficients(NamedTuple):
     """:class:`Actuators` at one time step, in the symbols of :mod:`batchpid.motors.actuator_dynamics`; None is off."""
 
     command: delay.Delay | None = None
-    sensor: delay.Delay | None = None
+    position_delay: delay.Delay | None = None
+    """Delay of the sensor's positions, in its history of positions and velocities."""
+    velocity_delay: delay.Delay | None = None
     envelope: Any = Envelope()
     commands: Any = Envelope()
     """Envelope of the commands that the motor delivers unclipped."""
@@ -58,11 +60,10 @@ class Coefficients(NamedTuple):
     velocity_noise: Any = None
     turns: Any = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
-    sensor_turns: Any = None
-    """The same for positions and velocities (1 | envs, 2 joints)."""
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(command=None, sensor=None, envelope=None, commands=None), "envs", "joints")
+        delays = {"command": None, "position_delay": None, "velocity_delay": None}
+        return array_summary(self._replace(**delays, envelope=None, commands=None), "envs", "joints")
 
 
 def init(
@@ -125,10 +126,14 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster.
     """
     a, xp = actuators, namespace(*actuators)
-    turns = None if a.continuous is None else a.continuous / TURN
+    position = velocity = None
+    if a.sensor_delay is not None:
+        begins = 0, a.sensor_delay.shape[1]
+        position, velocity = (delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins)
     k = Coefficients(
         command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
-        sensor=None if a.sensor_delay is None else delay.discretise(_twice(a.sensor_delay, xp), dt, state.sensor),
+        position_delay=position,
+        velocity_delay=velocity,
         envelope=envelope(a),
         commands=command_envelope(a),
         intake=None if a.lag is None else -xp.expm1(-dt / xp.maximum(a.lag, 1e-3 * dt)),
@@ -139,8 +144,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         velocity_resolution=_step(a.velocity_resolution, xp),
         position_noise=a.position_noise,
         velocity_noise=a.velocity_noise,
-        turns=turns,
-        sensor_turns=None if turns is None else xp.concatenate((turns, 0 * turns), axis=1),
+        turns=None if a.continuous is None else a.continuous / TURN,
     )
     if num_envs is None:
         return k
@@ -268,15 +272,13 @@ def advance_measurement(
     if k.play is not None:
         encoder, qvel = stages.play(k, encoder, qpos, qvel)
         qpos = encoder
-    if k.sensor is not None:
+    if k.position_delay is not None:
         sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
-        seen, joints = delay.read(sensor, k.sensor, k.sensor_turns, xp), qpos.shape[1]
-        qpos, qvel = seen[:, :joints], seen[:, joints:]
-    more: tuple[Any, Any] = (None, None)
+        qpos, qvel = delay.read(sensor, k.position_delay, k.turns, xp), delay.read(sensor, k.velocity_delay, None, xp)
     if key is not None:
-        more = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
+        drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
         step = step + _ONE
-    qpos, qvel = stages.encode(k, qpos, qvel, *more)
+    qpos, qvel = stages.encode(k, qpos, qvel, *(drawn or (None, None)))
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 
@@ -289,10 +291,6 @@ def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) 
     deviations = k.position_noise, k.velocity_noise
     position, velocity = (None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True))
     return position, velocity
-
-
-def _twice(delay: Any, xp: Any) -> Any:
-    return xp.concatenate((delay, delay), axis=1)
 
 
 def _step(resolution: Any, xp: Any) -> Any:

@@ -23,7 +23,7 @@ _NEAR = 1e-5  # steps: a delay that is a whole number of steps but for rounding 
 
 
 class Delay(NamedTuple):
-    """A delay at one time step, for histories (envs, samples, joints)."""
+    """A delay at one time step, for histories (envs, samples, numbers)."""
 
     index: Any
     """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
@@ -45,21 +45,24 @@ def samples_of(longest: Any, dt: float) -> int:
     return count
 
 
-def discretise(delay: Any, dt: Any, history: Any) -> Delay:
-    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, joints), its longest."""
+def discretise(delay: Any, dt: Any, history: Any, begin: int = 0) -> Delay:
+    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, numbers), its longest.
+
+    The joints' values are those from number ``begin`` of a sample on.
+    """
     xp = namespace(delay, history)
-    envs, samples, joints = history.shape
+    envs, samples, numbers = history.shape
     steps = delay / dt
     whole = xp.rint(steps)
     steps = xp.where(xp.abs(steps - whole) < _NEAR, whole, steps)
     steps = xp.minimum(steps, samples - 1) + xp.zeros((envs, 1), steps.dtype)
     floor = xp.minimum(xp.floor(steps), samples - 2)
     fraction = steps - floor
-    first = xp.arange(envs)[:, None] * (samples * joints) + xp.arange(joints)[None]
-    later = first + floor.astype(int) * joints
+    first = xp.arange(envs)[:, None] * (samples * numbers) + begin + xp.arange(delay.shape[1])[None]
+    later = first + floor.astype(int) * numbers
     if not is_traced(fraction) and not fraction.any():
         return Delay(later[None], None)
-    return Delay(xp.stack((later, later + joints)), fraction)
+    return Delay(xp.stack((later, later + numbers)), fraction)
 
 
 def start(value: Any, samples: int) -> Any:
@@ -69,7 +72,7 @@ def start(value: Any, samples: int) -> Any:
 
 
 def push(history: Any, value: Any, xp: Any) -> Any:
-    """Return ``history`` (envs, samples, joints) with ``value`` (envs, joints) as its latest sample."""
+    """Return ``history`` (envs, samples, numbers) with ``value`` (envs, numbers) as its latest sample."""
     return xp.concatenate((value[:, None], history[:, :-1]), axis=1)
 
 

@@ -72,7 +72,8 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
   auto const known = [&](std::int32_t number) { return number >= 0 && number < program->registers; };
   bool fits = program->inputs >= 0 && given <= program->registers;
   for (Operation const &each : program->operations) {
-    fits = fits && known(each.out) && each.out >= given && each.code >= ADD && each.code <= CLIP &&
+    bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
+    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= TAKE &&
            std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
@@ -100,6 +101,30 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
     program->last_use.push_back(last);
   }
   return program;
+}
+
+// Return whether operations find tables where they take them, of a size that fits, and nowhere else.
+inline bool tables_fit(Program const &program, Index rows, std::vector<Input> const &inputs) {
+  auto const constants = static_cast<Index>(program.constants.size());
+  auto const size_of = [&](Index number) {  // 0: no table
+    Index const i = number - constants;
+    if (i < 0 || i >= program.inputs || inputs[static_cast<std::size_t>(i)].shape != Shape::TABLE) return Index{0};
+    return inputs[static_cast<std::size_t>(i)].size;
+  };
+  for (auto const &[code, out, operands] : program.operations) {
+    Index const size = size_of(operands[0]), columns = program.columns;
+    bool const is_alone = operands[2] == operands[0];  // operands that are not there are copies of the first
+    if ((size > 0) != (code == MATRIX_VECTOR || code == PUSH || code == TAKE)) return false;
+    if (size_of(operands[1]) || (!is_alone && size_of(operands[2]))) return false;
+    if (code == MATRIX_VECTOR && size != columns * columns) return false;
+    if (code == PUSH && size % ((is_alone ? 1 : 2) * columns) != 0) return false;
+    if (code != TAKE) continue;
+    if (program.single || operands[1] >= constants) return false;
+    for (double const place : program.constants[static_cast<std::size_t>(operands[1])]) {
+      if (!(place >= 0 && place < static_cast<double>(rows * size))) return false;
+    }
+  }
+  return std::none_of(program.results.begin(), program.results.end(), size_of);
 }
 
 }  // namespace batchpid

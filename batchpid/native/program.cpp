@@ -68,15 +68,15 @@ bool read_input(Program const &program, Index rows, PyObject *object, Input &inp
   if (array == nullptr) return false;
   Index const columns = program.columns, dimensions = array->dimensions;
   auto const *shape = array->shape;
-  input.data = array->data;
-  if (dimensions == 2 && shape[0] == rows && shape[1] == columns) {
-    input.shape = Shape::FULL;
-  } else if ((dimensions == 1 && shape[0] == columns) || (dimensions == 2 && shape[0] == 1 && shape[1] == columns)) {
+  input = {array->data, Shape::FULL, 0, (array->flags & WRITEABLE) != 0};
+  if (dimensions == 2 && shape[0] == rows && shape[1] == columns) return true;
+  if ((dimensions == 1 && shape[0] == columns) || (dimensions == 2 && shape[0] == 1 && shape[1] == columns)) {
     input.shape = Shape::ROW;
   } else if (dimensions == 2 && shape[0] == rows && shape[1] == 1) {
     input.shape = Shape::COLUMN;
-  } else if (dimensions == 3 && shape[0] == rows && shape[1] == columns && shape[2] == columns) {
-    input.shape = Shape::MATRIX;
+  } else if (dimensions == 3 && shape[0] == rows) {
+    input.shape = Shape::TABLE;
+    input.size = shape[1] * shape[2];
   } else {
     input.shape = Shape::NUMBER;
     return dimensions == 0 || (dimensions <= 2 && shape[0] == 1 && shape[dimensions - 1] == 1);
@@ -92,32 +92,37 @@ bool read_output(Program const &program, Index rows, PyObject *object, Output &o
   return array->shape[0] == rows && array->shape[1] == program.columns;
 }
 
+// Bytes of an input.
+Index size_of(Program const &program, Index rows, Input const &input) {
+  Index const columns = program.columns, sizes[] = {1, columns, rows, rows * columns, rows * input.size};
+  return sizes[static_cast<int>(input.shape)] * program.itemsize();
+}
+
+bool meet(void const *first, Index first_size, void const *second, Index second_size) {
+  auto const *a = static_cast<char const *>(first), *b = static_cast<char const *>(second);
+  return a < b + second_size && b < a + first_size;
+}
+
 // Return whether an output overlaps an input. An input of the output's shape at the same address is allowed.
 bool overlaps(Program const &program, Index rows, Output const &output, Input const &input) {
-  Index const columns = program.columns, itemsize = program.itemsize();
-  Index const sizes[] = {1, columns, rows, rows * columns, rows * columns * columns};
-  auto const *read = static_cast<char const *>(input.data), *written = static_cast<char const *>(output.data);
-  Index const read_size = sizes[static_cast<int>(input.shape)] * itemsize;
-  Index const written_size = rows * columns * (output.is_mask ? 1 : itemsize);
-  if (read + read_size <= written || written + written_size <= read) return false;
-  return read != written || input.shape != Shape::FULL || output.is_mask;
+  Index const written = rows * program.columns * (output.is_mask ? 1 : program.itemsize());
+  if (!meet(input.data, size_of(program, rows, input), output.data, written)) return false;
+  return input.data != output.data || input.shape != Shape::FULL || output.is_mask;
 }
 
 bool fits(Program const &program, Index rows, std::vector<Input> const &inputs, std::vector<Output> const &outputs) {
   bool good = static_cast<Index>(inputs.size()) == program.inputs && outputs.size() == program.results.size() &&
               (rows == program.rows || std::count(program.shapes.begin(), program.shapes.end(), Shape::FULL) == 0);
-  auto const constants = static_cast<Index>(program.constants.size());
-  auto const is_matrix = [&](Index number) {
-    Index const i = number - constants;
-    return i >= 0 && i < program.inputs && inputs[static_cast<std::size_t>(i)].shape == Shape::MATRIX;
-  };
+  if (!good || !tables_fit(program, rows, inputs)) return false;
   for (Operation const &each : program.operations) {
-    if (!good) return false;
-    bool const takes_matrix = each.code == MATRIX_VECTOR;  // whose third operand is a copy of the first
-    good = is_matrix(each.operands[0]) == takes_matrix && !is_matrix(each.operands[1]) &&
-           is_matrix(each.operands[2]) == takes_matrix;
+    if (each.code != PUSH) continue;
+    Input const &history = inputs[static_cast<std::size_t>(each.out) - program.constants.size()];
+    good = good && history.is_writeable;
+    for (Input const &input : inputs) {
+      good = good && (&input == &history || !meet(history.data, size_of(program, rows, history), input.data,
+                                                  size_of(program, rows, input)));
+    }
   }
-  for (std::int32_t result : program.results) good = good && !is_matrix(result);
   for (Output const &output : outputs) {
     for (Output const &other : outputs) good = good && (&other == &output || other.data != output.data);
     for (Input const &input : inputs) good = good && !overlaps(program, rows, output, input);
@@ -241,7 +246,7 @@ PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
     if (arguments[i] == Py_None) continue;
     given |= bit;
     good = (bound->given & bit) && read_input(program, bound->rows, arguments[i], inputs[read]) &&
-           (inputs[read].shape == Shape::FULL || (!(bound->full & bit) && inputs[read].shape != Shape::MATRIX));
+           (inputs[read].shape == Shape::FULL || (!(bound->full & bit) && inputs[read].shape != Shape::TABLE));
     ++read;
   }
   PyObject *out = arguments[1];

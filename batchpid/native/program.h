@@ -3,8 +3,8 @@
 // run. Every operation is rounded as in NumPy, in float or double.
 //
 // Rows are processed in blocks that stay in the cache. In a block, an input is read before an output at its address is
-// written. An output may therefore be the same array as an input of its shape (state in place). No other overlap is
-// allowed.
+// written. An output may therefore be the same array as an input of its shape (state in place). A history is an input
+// that the program itself writes to. No other overlap is allowed.
 //
 // Flags: -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math, and no other part of -ffast-math.
 
@@ -41,18 +41,23 @@ enum Code : std::int32_t {
   ADD_SUBTRACT,       // (a + b) - c
   SUBTRACT_MULTIPLY,  // (a - b) c
   CLIP,               // min(max(a, b), c)
+  PUSH,               // history, in place: b, or b and c, as its latest sample; the oldest one is lost
+  TAKE,               // numbers of a table, at the places b in the whole of it
 };
 
 struct Operation {
   std::int32_t code, out, operands[3];  // numbers of registers
 };
 
-// Shapes of constants and inputs: (), (1, columns), (rows, 1), (rows, columns), (rows, columns, columns).
-enum class Shape : std::int32_t { NUMBER, ROW, COLUMN, FULL, MATRIX };
+// Shapes of constants and inputs: (), (1, columns), (rows, 1), (rows, columns), (rows, numbers of a table).
+// A table is a matrix (columns, columns), or a history (samples, columns or 2 columns) with the latest sample first.
+enum class Shape : std::int32_t { NUMBER, ROW, COLUMN, FULL, TABLE };
 
 struct Input {
   void const *data;  // of row 0
   Shape shape;
+  Index size = 0;             // numbers in each row of a table
+  bool is_writeable = false;  // a history has to be
 };
 struct Output {
   void *data;    // of row 0 of (rows, columns)
@@ -83,7 +88,7 @@ namespace detail {
 template <class T>
 struct Operand {
   T const *data;
-  Index step;  // numbers to the next chunk; 0 if all chunks are the same
+  Index step;  // numbers to the next chunk, 0 if all chunks are the same; to the next row of a table
 };
 
 // 0 plus the sum of n products, in NumPy's order for n <= 128: sequential below eight terms, else eight partial sums.
@@ -103,9 +108,9 @@ BATCHPID_INLINE T sum_of_products(T const *a, T const *b, Index n) {
   return T(0) + sum;
 }
 
-// Apply an operation to n numbers, whole rows.
+// Apply an operation to n numbers, whole rows, from number `first` of the arrays on. A table begins with row 0.
 template <class T>
-BATCHPID_INLINE void apply(Program const &program, Code code, Index n, T *out, Operand<T> x, Operand<T> y,
+BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index n, T *out, Operand<T> x, Operand<T> y,
                            Operand<T> z) {
   Index const columns = program.columns, chunk = x.step && y.step && z.step ? n : program.chunk;
 #define EACH(expression)                                                             \
@@ -158,8 +163,20 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index n, T *out, O
     case MATRIX_VECTOR:  // x (rows, columns, columns)
       for (Index row = 0; row < n; row += columns) {
         T const *b = y.data + (y.step ? row : row % program.chunk);
-        for (Index i = row; i < row + columns; ++i) out[i] = sum_of_products(x.data + i * columns, b, columns);
+        for (Index i = row; i < row + columns; ++i) out[i] = sum_of_products(x.data + (first + i) * columns, b, columns);
       }
+      break;
+    case PUSH:
+      for (Index row = 0; row < n; row += columns) {
+        T *latest = const_cast<T *>(x.data) + (first + row) / columns * x.step, *end = latest + x.step;
+        bool const is_pair = z.data != x.data;
+        std::copy_backward(latest, end - (is_pair ? 2 : 1) * columns, end);
+        std::copy_n(y.data + (y.step ? row : row % program.chunk), columns, latest);
+        if (is_pair) std::copy_n(z.data + (z.step ? row : row % program.chunk), columns, latest + columns);
+      }
+      break;
+    case TAKE:
+      for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
       break;
   }
 #undef EACH
@@ -222,6 +239,7 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
     T *repeated = slots + i * slot;
     auto const *from = static_cast<T const *>(inputs[i].data);
     at[constants + i] = {repeated, inputs[i].shape == Shape::COLUMN ? chunk : 0};
+    if (inputs[i].shape == Shape::TABLE) at[constants + i] = {from, inputs[i].size};
     if (inputs[i].shape == Shape::NUMBER) std::fill_n(repeated, chunk, from[0]);
     if (inputs[i].shape != Shape::ROW) continue;
     for (Index row = 0; row < chunk; row += columns) std::copy_n(from, columns, repeated + row);
@@ -240,7 +258,6 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
     for (Index i = 0; i < program.inputs; ++i) {
       auto const *from = static_cast<T const *>(inputs[i].data);
       if (inputs[i].shape == Shape::FULL) at[constants + i] = {from + start, chunk};
-      if (inputs[i].shape == Shape::MATRIX) at[constants + i] = {from + start * columns, chunk};
       if (inputs[i].shape != Shape::COLUMN) continue;
       T *repeated = slots + i * slot;
       for (Index j = 0; j * columns < n; ++j) std::fill_n(repeated + j * columns, columns, from[row + j]);
@@ -250,7 +267,7 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
     }
     for (Operation const &each : program.operations) {
       auto const *operands = each.operands;
-      apply(program, static_cast<Code>(each.code), n, const_cast<T *>(at[each.out].data), at[operands[0]],
+      apply(program, static_cast<Code>(each.code), start, n, const_cast<T *>(at[each.out].data), at[operands[0]],
             at[operands[1]], at[operands[2]]);
     }
     for (std::size_t i = 0; i < program.results.size(); ++i) {
@@ -271,7 +288,7 @@ BATCHPID_CLONES static void run_double(Program const &program, Input const *inpu
 
 }  // namespace detail
 
-// Run a program on some rows; inputs and outputs have its type and number. MATRIX_VECTOR needs a matrix.
+// Run a program on some rows; inputs and outputs have its type and number. Tables have to fit: make_program.h.
 inline void run(Program const &program, Input const *inputs, Output const *outputs, Index first_row, Index rows) {
   (program.single ? detail::run_single : detail::run_double)(program, inputs, outputs, first_row, rows);
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -37,8 +37,13 @@ class Namespace:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
-    def apply(self, name: str, *values: Any) -> Symbol:
-        """Record an operation; return its result."""
+    def apply(self, name: str, *values: Any) -> Any:
+        """Record an operation; return its result. Stacks take part entry by entry."""
+        if stacks := [value for value in values if isinstance(value, Stack)]:
+            size = max(map(len, stacks))
+            each = (value if isinstance(value, Stack) else Stack([value]) for value in values)
+            spread = [stack * size if len(stack) == 1 else stack for stack in map(tuple, each)]
+            return Stack(self.apply(name, *entries) for entries in zip(*spread, strict=True))
         result = Symbol(self, name in MASKS)
         self.noted.append((name, tuple(map(self.symbol, values)), result))
         return result
@@ -48,6 +53,15 @@ class Namespace:
         if name not in OPERATIONS:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
+
+    def concatenate(self, arrays: tuple[Any, Any], axis: int) -> Any:
+        """Return positions and velocities side by side, or a history with a later sample in front."""
+        assert axis == 1
+        first, second = arrays
+        if isinstance(first, _AsRows) and isinstance(second, _WithoutOldest):
+            samples = first.vector if isinstance(first.vector, _Pair) else (first.vector,)
+            return self.apply("push", second.history, *samples)
+        return _Pair(first, second)
 
     def atleast_2d(self, value: Any) -> Any:
         """Return ``value``, which already has rows and columns."""
@@ -62,8 +76,28 @@ class Namespace:
         return self.symbol(1.0)
 
 
+class Stack(tuple[Any, ...]):
+    """Array (n, rows, columns) in a trace, as n symbols."""
+
+    __slots__ = ()
+
+    def __mul__(self, other: Any) -> Any:
+        return self[0].__array_namespace__().apply("multiply", self, other)
+
+    def sum(self, axis: int) -> Symbol:
+        """Return 0 plus all entries in order, as NumPy sums them."""
+        assert axis == 0
+        total = self[0].__array_namespace__().symbol(0.0)
+        for entry in self:
+            total = total + entry
+        return total
+
+
 class Symbol:
-    """Array (rows, columns) in a trace; a mask holds 1.0 and 0.0."""
+    """Array (rows, columns) in a trace; a mask holds 1.0 and 0.0.
+
+    It may also stand for a matrix in each row, or for a history of samples. A program changes a history in place.
+    """
 
     def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:
         self._namespace = namespace
@@ -94,9 +128,16 @@ class Symbol:
     def __bool__(self) -> NoReturn:
         raise TypeError("a function that is traced cannot depend on the entries of an array")
 
-    def __getitem__(self, index: Any) -> _AsRows:
-        assert index == (slice(None), None, slice(None))
-        return _AsRows(self)
+    def take(self, places: Stack) -> Stack:
+        """Return the numbers of a history at places in the whole of it, which are constants."""
+        return Stack(self._namespace.apply("take", self, each) for each in places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if index is None:
+            return Stack([self])
+        if index == (slice(None), slice(None, -1)):
+            return _WithoutOldest(self)
+        return _as_rows(self, index)
 
     def __abs__(self) -> Symbol:
         return self._namespace.apply("absolute", self)
@@ -159,7 +200,31 @@ class Symbol:
 class _AsRows(NamedTuple):
     """vector[:, None, :]"""
 
-    vector: Symbol
+    vector: Any
+
+
+class _WithoutOldest(NamedTuple):
+    """history[:, :-1]"""
+
+    history: Symbol
+
+
+class _Pair:
+    """concatenate((first, second), axis=1)"""
+
+    def __init__(self, *both: Symbol) -> None:
+        self._both = both
+
+    def __iter__(self) -> Iterator[Symbol]:
+        return iter(self._both)
+
+    def __getitem__(self, index: Any) -> _AsRows:
+        return _as_rows(self, index)
+
+
+def _as_rows(vector: Any, index: Any) -> _AsRows:
+    assert index in ((slice(None), None), (slice(None), None, slice(None)))
+    return _AsRows(vector)
 
 
 class _Products(NamedTuple):
@@ -265,15 +330,20 @@ def _assembled(
     """Return a trace of ``operations`` on the symbols ``order``.
 
     A register is reused after the last use of its value. Each result has a separate register, and may be made in place.
+    A history keeps its register.
     """
     places = {symbol: place for place, symbol in enumerate(order)}
     last_use = {operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands}
     registers, free, rows, kept = len(order), list[int](), list[list[int]](), {*order, *results}
     for at, (name, operands, result) in enumerate(operations):
-        if not free or result in kept:
-            free.append(registers)
-            registers += 1
-        places[result] = free.pop()
+        if name == "push":
+            places[result] = places[operands[0]]
+            kept.add(result)
+        else:
+            if not free or result in kept:
+                free.append(registers)
+                registers += 1
+            places[result] = free.pop()
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
         free += {places[one] for one in operands if last_use[one] == at and one not in kept}

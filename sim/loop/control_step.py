@@ -162,6 +162,8 @@ class Model(NamedTuple):
     noise: Any = None
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
     stages: Stages = STAGES
+    measure: Callable[..., Any] = advance_measurement
+    """:func:`batchpid.motors.advance_measurement`, or its known results."""
 
 
 class Layout(NamedTuple):
@@ -189,7 +191,7 @@ def control_step(
     if motors is not None:
         noise = None if layout.model.noise is None else layout.model.noise(constants.motors, motors, qpos)
         stages = layout.model.stages
-        motors, seen, seen_rate = advance_measurement(constants.motors, motors, qpos, qvel, noise, stages)
+        motors, seen, seen_rate = layout.model.measure(constants.motors, motors, qpos, qvel, noise, stages)
         limits = stages.limits(constants.motors, seen, seen_rate)
         if layout.measures and layout.model.passive_force is not None:
             passive = layout.model.passive_force(seen, seen_rate)

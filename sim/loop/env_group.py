@@ -76,9 +76,9 @@ class EnvGroup:
         self._layout, self._constants = layout, constants
         self._executor: NumPyExecutor | XLAExecutor
         steps = isinstance(pack, CompiledPack) and pack.steps_natively and layout.coupling is None
-        if not isinstance(pack, CompiledPack) or not steps or layout.control == "drive":
+        if not isinstance(pack, CompiledPack) or not steps:
             self._executor = NumPyExecutor(options, pack, layout, constants)
-        elif options.backend == "jax" and not obstacle(options, self._actuators):
+        elif options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators):
             self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
         else:
             self._executor = NativeExecutor(options, pack, layout, constants)

@@ -1,26 +1,29 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Where it cannot be traced (sensors and motors, a caller's own controller),
-it runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the
-friction model updates its mass matrix runs in the same way.
+arrays that hold the state from step to step. Sensors are a program of their own, since their noise, and the passive
+force at the measured state, are computed in Python: then each sim step is a call, and so it is where the passive force
+of the joints' state is (masses that vary). Where the control step cannot be traced (a caller's own controller, drives
+whose targets move within a tick), it runs in NumPy, and one native call applies the efforts, steps the engine and reads
+it. A sim step in which the friction model updates its mass matrix runs in the same way.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.operations import MOST_SUMMED
-from batchpid.native.tracing import Symbol, Trace, trace
+from batchpid.native.tracing import Stack, Symbol, Trace, trace
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.native.native_tick import NativeTick
-from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import (
     REFRESH_STEPS,
@@ -51,8 +54,10 @@ class NativeExecutor(NumPyExecutor):
         self._bound: object = None
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
-        reads_all = self._steps_read_force or not self._reads_force
-        self._compiles = reads_all and is_compiled(layout, constants, pack.dof)
+        self._calls_force = self._reads_force and not self._steps_read_force
+        self._compiles = is_compiled(layout, constants, pack.dof)
+        if options.backend == "jax" and layout.law is not None:  # the law is XLA's
+            self._compiles &= constants.motors is None and not self._calls_force
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
@@ -60,21 +65,35 @@ class NativeExecutor(NumPyExecutor):
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
         program.load(state, measured, command)
-        done, status = begin, 0
+        if self._layout.control == "drive" and isinstance(self._pack, DrivenPack):
+            rate = command.setpoint_rate
+            self._pack.write_drive_target(command.setpoint, np.zeros_like(command.setpoint) if rate is None else rate)
+        by_step, done, status = self._layout.measures or self._calls_force, begin, 0
         while done < end and not status:
             due = end if state.age is None else done + REFRESH_STEPS - int(program.state.age.max())
             if due > done:
-                done, status = program.run(self._prepared(), done, min(due, end), end)
-                continue
-            step = Step(done, end, done + 1 == end)
-            new, outputs = control_step(self._layout, self._constants, program.state, command, program.measured, step)
-            program.take(new, outputs)
-            status = self._native_step(program.outputs.qf, *program.reading)
-            done += 1
+                if self._layout.measures:
+                    self._measure(program)
+                done, status = program.run(self._prepared(), done, done + 1 if by_step else min(due, end), end)
+            else:
+                step, now = Step(done, end, done + 1 == end), (program.state, command, program.measured)
+                program.take(*control_step(self._layout, self._constants, *now, step))
+                status = self._native_step(program.outputs.qf, *program.reading)
+                done += 1
+            if self._calls_force:
+                program.reading.passive[...] = self._pack.passive_force(self._gravity, self._coriolis)
         failed, measured = bool(status & LOOK), program.measured
         if status:
             measured = self._look(status, measured)
         return Ran(program.state, program.outputs, measured, program.before, done, failed)
+
+    def _measure(self, program: TickProgram) -> None:
+        """Advance the sensors, and compute the passive force at the measured state, if it is compensated."""
+        model, motors = self._layout.model, program.state.motors
+        noise = model.noise(self._constants.motors, motors, program.reading.qpos)
+        seen = program.measure(*((None, None) if noise is None else noise))
+        if model.passive_force is not None:
+            program.reading.passive[...] = model.passive_force(*seen)
 
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
@@ -116,18 +135,24 @@ class NativeExecutor(NumPyExecutor):
         """Return the program for commands with or without rate and feedforward."""
         key = command.setpoint_rate is None, command.feedforward is None
         if key not in self._ticks:
-            self._ticks[key] = TickProgram(self._pack, self._layout, self._constants, state, command, self._reads_force)
+            self._ticks[key] = TickProgram(self._pack, self._layout, self._constants, state, command, self._gravity)
         return self._ticks[key]
 
 
 def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: PID or efforts, ideal motors, no coupling, float64."""
-    fits = layout.control in ("pid", "effort") and constants.motors is None and layout.coupling is None
-    return fits and dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))
+    """Return whether the control step can be a program: no own controller, targets of drives that rest, float64."""
+    rests = constants.driven is None and constants.guard is None
+    fits = layout.control in ("pid", "effort") or (layout.control == "drive" and rests)
+    return (
+        fits
+        and layout.coupling is None
+        and dof <= MOST_SUMMED
+        and all(leaf.dtype != np.float32 for leaf in leaves(constants))
+    )
 
 
 class TickProgram:
-    """Control step of a group of envs as a program, and its arrays.
+    """Control step of a group of envs as a program, and its arrays; ``gravity``: it takes a passive force.
 
     Attributes
     ----------
@@ -146,30 +171,34 @@ class TickProgram:
         constants: Constants,
         state: StepState,
         command: Command,
-        reads_force: bool,
+        gravity: bool,
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
             matrix = np.zeros((*shape, pack.dof) if law.whole else shape)
-        self.state = mapped(np.array, state._replace(matrix=matrix))
+        self.state = mapped(partial(np.array, order="C"), state._replace(matrix=matrix))
         self.reading = Measured(*np.zeros((3, *shape)))
-        self.measured = self.reading if reads_force else self.reading._replace(passive=None)
+        self.measured = self.reading if gravity else self.reading._replace(passive=None)
+        self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
+        self._constants = mapped(stacked, constants)
+        self._sensors: dict[tuple[bool, bool], ArrayProgram] = {}
         self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
-        self.outputs = Outputs(np.zeros(shape), np.zeros(shape), np.zeros(shape, bool), guarded)
+        saturated = None if layout.control == "drive" else np.zeros(shape, bool)
+        self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
         self.before = np.zeros(shape)
-        fixed = self.state._replace(age=None)
-        inputs = (fixed, self._command, self.measured)
-        traced = _trace(layout._replace(model=Model()), *map(structure, (constants, *inputs)))
+        fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
+        inputs = (fixed, self._command, self.measured, self._seen)
+        traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
         given = leaves(inputs)
-        program = ArrayProgram(traced, leaves(constants), len(given), shape)
-        results = [*leaves(fixed._replace(matrix=None)), self.outputs.qf, self.outputs.motor, self.outputs.saturated]
-        results += [] if guarded is None else [guarded]
+        program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
+        results = [*leaves(_returned(fixed)), *leaves(self.outputs)]
         arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
         if matrix is not None:
             bodies = scene_dynamics(pack.spec).bodies
             tree = np.ascontiguousarray(bodies.tree, np.int32)
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
+            arrays |= {} if self._seen is None else dict(zip(("pose", "rate"), self._seen, strict=True))
             arrays |= {"armature": constants.armature, "damping": constants.damping}
         whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
         self._tick = NativeTick(
@@ -193,7 +222,24 @@ class TickProgram:
         done, status = self._tick.run(step.prepare(), begin, until, end)
         if self.state.age is not None:
             self.state.age[...] += done - begin
+        if self.state.motors is not None and self.state.motors.step is not None:
+            self.state.motors.step[...] += done - begin
         return done, status
+
+    def measure(self, *noise: Float64 | None) -> Any:
+        """Advance the sensors with the noise of positions and velocities; return both as measured, but for a step.
+
+        Only :meth:`run` counts the step.
+        """
+        side, (qpos, qvel, _) = _sensor_side(self.state.motors), self.reading
+        inputs, k = (side, qpos, qvel, noise), self._constants.motors
+        key = noise[0] is None, noise[1] is None
+        given = leaves(inputs)
+        if key not in self._sensors:
+            traced = _trace_sensors(structure(k), *map(structure, inputs))
+            self._sensors[key] = ArrayProgram(traced, leaves(k), len(given), qpos.shape)
+        self._sensors[key](*given, out=[*leaves(side.encoder), *leaves(self._seen)])
+        return self._seen
 
     def take(self, state: StepState, outputs: Outputs) -> None:
         """Copy the results of a control step in NumPy."""
@@ -204,32 +250,74 @@ class TickProgram:
                 getattr(self.outputs, name)[...] = array
 
     def _copy(self, state: StepState) -> None:
-        _write(self.state._replace(matrix=None), state._replace(matrix=None))
+        _write(_copied(self.state), _copied(state))
         if state.matrix is not None:
             self.state.matrix[...] = state.matrix
+        if state.motors is not None:  # the same object, by which the executor knows its noise
+            self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
 
 
 @lru_cache(maxsize=64)
 def _trace(layout: Layout, *structures: Any) -> Trace:
     """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
 
-    ``structures`` describe constants, state, command and reading. No update of mass matrix or friction is due.
+    ``structures`` describe constants, state, command, reading, and what the sensors measure. No update of mass matrix
+    or friction is due.
     """
 
     def function(*symbols: Symbol) -> list[Any]:
         given = iter(symbols)
-        k, before, command, measured = (filled(each, given) for each in structures)
+        k, before, command, measured, seen = (filled(each, given) for each in structures)
         model = Model(when=lambda due, function, otherwise: otherwise)
+        if seen is not None:
+            model = model._replace(measure=lambda k, motors, *_: (motors, *seen))
         rubs = k.friction.coulomb is not None
         start = before._replace(age=symbols[0] if rubs else None)
         new, outputs = control_step(layout._replace(model=model), k, start, command, measured, Step(0, 1))
-        results = leaves(new._replace(age=None, matrix=None))
-        assert len(results) == len(leaves(before._replace(matrix=None)))
-        shown = (outputs.qf, outputs.motor, outputs.saturated, outputs.guarded)
-        return [*results, *(each for each in shown if each is not None)]
+        results = leaves(_returned(new._replace(age=None)))
+        assert len(results) == len(leaves(_returned(before)))
+        return [*results, *leaves(outputs._replace(returned=None, target=None, target_rate=None))]
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+@lru_cache(maxsize=64)
+def _trace_sensors(*structures: Any) -> Trace:
+    """Return the trace of the sensors: position of the encoder, and measured positions and velocities.
+
+    ``structures`` describe coefficients, state, positions, velocities and noise.
+    """
+
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        new, *seen = advance_measurement(*(filled(each, given) for each in structures))
+        return [*leaves(new.encoder), *seen]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+def _motor_side(motors: ActuatorState | None) -> ActuatorState | None:
+    """Return the state of the motors without the sensors' state."""
+    return None if motors is None else ActuatorState(motors.command, motors.effort)
+
+
+def _sensor_side(motors: ActuatorState) -> ActuatorState:
+    """Return the part of the sensors' state that their program has: without key and step."""
+    return ActuatorState(sensor=motors.sensor, encoder=motors.encoder)
+
+
+def _returned(state: StepState) -> StepState:
+    """Return the part of a state that programs return: without matrices, and histories, which they change in place."""
+    motors = None if state.motors is None else state.motors._replace(command=None)
+    return state._replace(matrix=None, motors=motors)
+
+
+def _copied(state: StepState) -> StepState:
+    """Return the part of a state whose arrays keep their structure: without matrices and the key of the noise."""
+    motors = None if state.motors is None else state.motors._replace(key=None)
+    return state._replace(matrix=None, motors=motors)
 
 
 # -- nested named tuples of arrays -------------------------------------------------------------------------------------
@@ -238,6 +326,11 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 def is_leaf(tree: Any) -> bool:
     """Return whether ``tree`` is an array, a symbol, or the place of one (``...``)."""
     return isinstance(tree, np.ndarray | Symbol) or tree is ...
+
+
+def stacked(array: Any) -> Any:
+    """Return an array (n, envs, dof) as a stack of n arrays, and other arrays unchanged."""
+    return Stack(array) if array.ndim == 3 else array
 
 
 def leaves(tree: Any) -> list[Any]:
@@ -254,7 +347,7 @@ def mapped(function: Any, tree: Any) -> Any:
     if not isinstance(tree, tuple) or not tree:
         return tree
     parts = [mapped(function, part) for part in tree]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
 
 
 def structure(tree: Any) -> Any:

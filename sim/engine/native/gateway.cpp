@@ -161,7 +161,7 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 constexpr char BOUND[] = "batchpid.bound_program";
 
 // bind(arguments of make_program, inputs, outputs): pairs of an array (contiguous, kept alive by the caller) and the
-// number of its Shape, and arrays.
+// numbers in each row of a table (0: it is (rows, columns)), and arrays.
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundProgram>();
   bound->program = make_program(arguments[0]);
@@ -174,22 +174,18 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   }
   for (Py_ssize_t i = 0; i < program.inputs; ++i) {
     PyObject *pair = PyTuple_GetItem(arguments[1], i);
-    auto const shape = static_cast<Shape>(PyLong_AsLong(PyTuple_GetItem(pair, 1)));
+    Index const size = PyLong_AsSsize_t(PyTuple_GetItem(pair, 1)), count = size ? program.rows * size : numbers;
     Buffer array;
-    Index const count = shape == Shape::MATRIX ? numbers * program.columns : numbers;
-    if (!array.open(PyTuple_GetItem(pair, 0), count, sizeof(double), PyBUF_C_CONTIGUOUS)) return nullptr;
-    bound->inputs.push_back({array.as<void>(), shape});
+    int const flags = PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE;
+    if (!array.open(PyTuple_GetItem(pair, 0), count, sizeof(double), flags)) return nullptr;
+    bound->inputs.push_back({array.as<void>(), size ? Shape::TABLE : Shape::FULL, size, true});
   }
   for (Py_ssize_t i = 0; i < PyTuple_Size(arguments[2]); ++i) {
     Buffer array;
     if (!array.open(PyTuple_GetItem(arguments[2], i), numbers, 0, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) return nullptr;
     bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
   }
-  for (Operation const &each : program.operations) {  // products need a matrix
-    Index const from = each.operands[0] - static_cast<Index>(program.constants.size());
-    bool const is_matrix = from >= 0 && from < program.inputs && bound->inputs[from].shape == Shape::MATRIX;
-    if (each.code == MATRIX_VECTOR && !is_matrix) return misfit();
-  }
+  if (!tables_fit(program, program.rows, bound->inputs)) return misfit();
   return PyCapsule_New(bound.release(), BOUND, [](PyObject *capsule) {
     delete static_cast<BoundProgram *>(PyCapsule_GetPointer(capsule, BOUND));
   });

@@ -65,7 +65,7 @@ class Tick(ctypes.Structure):
     """Arrays of the sim steps of a tick, as Tick in tick.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "qf")),
+        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping", "matrix")),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),

@@ -13,9 +13,6 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import Tick
 
-FULL, MATRIX = 3, 4
-"""Numbers of shapes in program.h: (rows, columns), and a matrix for each row."""
-
 
 class NativeTick:
     """Sim steps of a pack under a program, on fixed arrays.
@@ -25,7 +22,7 @@ class NativeTick:
     program
         Program of the control step for the pack's envs.
     inputs, outputs
-        Arrays that it reads and writes, (envs, dof), or (envs, dof, dof) for a matrix.
+        Arrays that it reads and writes, (envs, dof), or (envs, ...) for the matrices and histories among its inputs.
     timestep
         [s]
     matrix_steps
@@ -36,7 +33,7 @@ class NativeTick:
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
         ``tree`` and ``bodies`` (:class:`batchpid.sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping``
-        (dof,).
+        (dof,), and ``pose`` and ``rate`` if sensors measure others than the reading.
     """
 
     def __init__(
@@ -50,13 +47,14 @@ class NativeTick:
         whole: bool = False,
         **arrays: NDArray[Any] | None,
     ) -> None:
+        arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
         given = {name: array for name, array in arrays.items() if array is not None}
         types = {name: np.int32 if name == "tree" else np.float64 for name in given}
         for name, array in given.items():
             if array.dtype != types[name] or not array.flags.c_contiguous:
                 raise ValueError(f"{name} is not a contiguous array of {np.dtype(types[name])}")
         self._native = native.extension("_gateway")
-        pairs = tuple([(array, FULL if array.ndim == 2 else MATRIX) for array in inputs])
+        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size) for array in inputs])
         self._program = self._native.bind(program.arguments, pairs, tuple(outputs))
         addresses = {name: array.ctypes.data for name, array in given.items()}
         dof = program.shape[1]

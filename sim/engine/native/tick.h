@@ -17,6 +17,7 @@ namespace batchpid {
 struct Tick {
   double *qpos, *qvel, *passive;  // reading, before and after each sim step
   double *before;                 // positions before the last sim step
+  double const *pose, *rate;      // state for the mass matrix: the reading, or as the sensors measure it
   double const *qf;               // an output of the program
   std::int32_t const *tree;       // (dof, 2), of the description
   double const *bodies;           // (dof, 25)
@@ -47,7 +48,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
   for (std::int64_t row = 0; row < robots; ++row) {
     for (std::size_t j = 0; j < n; ++j) {
       std::size_t const at = static_cast<std::size_t>(row) * n + j;
-      pose[j] = tick.qpos[at] + ahead * tick.qvel[at];
+      pose[j] = tick.pose[at] + ahead * tick.rate[at];
     }
     auto const *rows = reinterpret_cast<BodyRow<double> const *>(tick.bodies);
     mass_matrix(tick.dof, tick.tree, rows, pose.data(), found.data(), bodies);

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
 import batchpid as bp
-from batchpid.motors import STAGES, friction, guard
+from batchpid.motors import STAGES, delay, friction, guard
 from batchpid.motors import Coefficients as ActuatorCoefficients
 from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import every_operation, program_status
-from batchpid.native.tracing import trace
+from batchpid.native.tracing import Stack, trace
 
 pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])
@@ -113,6 +113,54 @@ def test_the_guard_can_be_traced(options, dtype):
     program = ArrayProgram(trace(function, len(given), 3, dtype), given, 3, shape, dtype)
     with np.errstate(all="ignore"):
         assert_identical(program(*inputs), function(*given, *inputs))
+
+
+@given(SHAPES, st.integers(2, 40), st.booleans(), st.integers(0, 2**32), st.integers(1, 4))
+def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
+    rng, (rows, columns) = np.random.default_rng(seed), shape
+    history = rng.normal(size=(rows, samples, (1 + is_pair) * columns))
+    late = [delay.discretise(rng.uniform(0, samples, shape), 1.0, history, at) for at in (0, columns)[: 1 + is_pair]]
+    constants = [leaf for each in late for leaf in (*each.index, each.fraction)]
+
+    def function(*arrays):
+        k, (held, *values) = iter(arrays[: len(constants)]), arrays[len(constants) :]
+        xp = values[0].__array_namespace__()
+        sample = xp.concatenate(tuple(values), axis=1) if is_pair else values[0]
+        held = delay.push(held, sample, xp)
+        given = [delay.Delay(Stack([next(k), next(k)]), next(k)) for _ in late]
+        return held, [delay.read(held, each, None, xp) for each in given]
+
+    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
+        traced = trace(lambda *arrays: function(*arrays)[1], len(constants), 2 + is_pair)
+        program = ArrayProgram(traced, constants, 2 + is_pair, shape, threads=threads)
+    ours, theirs = history.copy(), history
+    for _ in range(3):
+        values = rng.normal(size=(1 + is_pair, *shape))
+        theirs = delay.push(theirs, np.concatenate(values, axis=1), np)
+        assert_identical(program(ours, *values), [delay.read(theirs, each, None, np) for each in late])
+        assert_identical([ours], [theirs])
+
+
+def test_histories_that_do_not_fit_are_refused():
+    def function(place, history, value):
+        later = delay.push(history, value, value.__array_namespace__())
+        return [*later.take(Stack([place]))]
+
+    places, history, value = np.arange(12.0).reshape(4, 3), np.zeros((4, 5, 3)), np.ones((4, 3))
+    traced = trace(function, 1, 2)
+    ArrayProgram(traced, [places], 2, value.shape)(history, value)
+    assert (history[:, 0] == 1).all()
+    assert not history[:, 1:].any()
+    fixed = history.copy()
+    fixed.setflags(write=False)
+    for wrong in (fixed, history[:, :, :2].copy(), history[:3].copy(), value):
+        with pytest.raises(ValueError, match="do not fit"):
+            ArrayProgram(traced, [places], 2, value.shape)(wrong, value)
+    for wrong in (places - 1, places + 50):
+        with pytest.raises(ValueError, match="do not fit"):
+            ArrayProgram(traced, [wrong], 2, value.shape)(history, value)
+    with pytest.raises(ValueError, match="do not fit"):
+        ArrayProgram(traced, [places], 2, value.shape)(history, history.ravel()[:12].reshape(4, 3))
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

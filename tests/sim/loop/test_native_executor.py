@@ -10,7 +10,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.sim import Runner
+from batchpid.sim import Randomization, Runner, Uniform
 from batchpid.sim.engine import native
 from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
 from batchpid.sim.engine.sapien.physics import PHYSICS
@@ -18,6 +18,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop import native_executor
 from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
+from batchpid.sim.loop.numpy_executor import NumPyExecutor
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
 N = 3
@@ -96,7 +97,89 @@ def test_the_program_is_a_trace_of_the_control_step(panda, monkeypatch):
     assert calls == ["pid"], "traced once; friction is not due within 64 sim steps"
 
 
-def test_python_calls_of_a_sim_step(panda):
+EFFECTS = {
+    "command_delay": 0.004,
+    "lag": 0.004,
+    "strength": 1.0,
+    "bias": 0.2,
+    "effort_limit": 60.0,
+    "saturation_effort": 90.0,
+    "coulomb": 0.5,
+    "armature": 0.05,
+    "sensor_delay": 0.003,
+    "backlash": 0.001,
+    "position_resolution": 1e-4,
+    "velocity_resolution": 1e-3,
+    "position_noise": 1e-4,
+    "velocity_noise": 1e-3,
+}
+
+
+def random_options(robot, rng):
+    """Return options with about half of the effects, controls and variations, each number drawn per env and joint."""
+    control = str(rng.choice(["pid", "pid", "effort", "drive"]))
+    names = [name for name in EFFECTS if rng.random() < 0.5 and (control != "drive" or name in ("coulomb", "armature"))]
+    effects = {name: EFFECTS[name] * rng.uniform(0.2, 1.0, (N, robot.dof)) for name in names}
+    if "saturation_effort" in effects:
+        effects["no_load_speed"] = 4.0
+    if control != "drive" and rng.random() < 0.5:
+        effects["position_limit"] = np.array([-1.0, 0.0, 1.0]), np.array([40.0, 80.0, 60.0])
+    options = {"control": control, "actuators": bp.make_actuators(robot.dof, **effects, seed=7)}
+    options["compensate"] = str(rng.choice(["gravity+coriolis+friction", "gravity", "none"]))
+    if control == "drive":
+        options["params"] = robot.params(gain_units="effort", kp=300.0, ki=0.0, kd=30.0)
+    else:
+        options["guard"] = bool(control == "pid" and rng.random() < 0.5)
+        options["params"] = params_of(robot, rng.choice(list(CASES))) if control == "pid" else None
+    if rng.random() < 0.5:
+        options["randomization"] = Randomization(payload=Uniform(0.0, 2.0), friction=Uniform(0.0, 0.5))
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def leaves(tree):
+    """Yield the arrays of nested named tuples, dicts and dataclasses."""
+    if isinstance(tree, np.ndarray):
+        yield tree
+    elif isinstance(tree, dict):
+        yield from (leaf for each in tree.values() for leaf in leaves(each))
+    elif hasattr(tree, "__dict__") or hasattr(tree, "_asdict"):
+        yield from leaves(tree._asdict() if hasattr(tree, "_asdict") else vars(tree))
+
+
+def check_against_numpy(robot, engine, seed):
+    """Check rollouts, a reset of one env between them, and a snapshot."""
+    options, found = random_options(robot, np.random.default_rng(seed)), []
+    rng = np.random.default_rng(seed)
+    path = np.clip(robot.start + np.cumsum(0.02 * rng.normal(size=(6, N, robot.dof)), 0), robot.lower, robot.upper)
+    if options["control"] == "effort":
+        path = 5.0 * rng.normal(size=path.shape)
+    for executor in (NativeExecutor, NumPyExecutor):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", executor)
+            with Runner(robot, N, workers=0, substeps=23, engine=engine, **options) as runner:
+                rollouts = [runner.rollout(path[:4])]
+                runner.reset(mask=np.arange(N) == 1)
+                rollouts.append(runner.rollout(path[4:]))
+                found.append((rollouts, runner.snapshot().states))
+    for ours, theirs in zip(found[0][0], found[1][0], strict=True):
+        assert_identical(ours, theirs)
+    for mine, other in zip(leaves(found[0][1]), leaves(found[1][1]), strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_settings_give_the_bytes_of_numpy(panda, engine, seed):
+    check_against_numpy(panda, engine, seed)
+
+
+@pytest.mark.slow
+def test_many_random_settings_give_the_bytes_of_numpy(panda, engine):
+    for seed in range(100, 200):
+        check_against_numpy(panda, engine, seed)
+
+
+@pytest.mark.parametrize("actuators", [{}, {"command_delay": 0.002, "strength": 0.95, "effort_limit": 60.0}], ids=str)
+def test_python_calls_of_a_sim_step(panda, actuators):
     """At most two for each group of envs and sim step; 64 pandas are four groups."""
     calls = 0
 
@@ -104,7 +187,8 @@ def test_python_calls_of_a_sim_step(panda):
         nonlocal calls
         calls += event == "call" and "/workers/" not in frame.f_code.co_filename
 
-    with Runner(panda, 64, workers=0, substeps=20) as runner:
+    motors = bp.make_actuators(panda.dof, **actuators)
+    with Runner(panda, 64, workers=0, substeps=20, actuators=motors) as runner:
         target = np.tile(panda.settings.target, (64, 1))
         for _ in range(4):
             runner.step(target)
@@ -116,9 +200,29 @@ def test_python_calls_of_a_sim_step(panda):
     assert calls <= 2 * 4 * 20 + 60, "60 for the runner itself"
 
 
-def test_what_cannot_be_a_program_takes_one_native_call_a_sim_step(panda):
-    actuators = bp.make_actuators(panda.dof, command_delay=0.002, strength=0.95)
-    executors = []
+class Rest:
+    """A controller that only compensates the passive force."""
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, passive
+
+
+def test_control_steps_that_are_a_program(panda):
+    """Not those of an own controller, nor of drives whose targets move within a tick."""
+    effects = {"command_delay": 0.002, "strength": 0.95, "position_noise": 1e-4}
+    gains = {"gain_units": "effort", "kp": 300.0, "kd": 30.0}
+    cases = {
+        "ideal": {},
+        "actuators": {"actuators": bp.make_actuators(panda.dof, **effects)},
+        "payload": {"randomization": Randomization(payload=Uniform(0.0, 1.0))},
+        "drive": {"control": "drive", "params": panda.params(**gains, ki=0.0)},
+        "integral": {"control": "drive", "params": panda.params(**gains, ki=50.0)},
+        "controller": {"control": Rest()},
+    }
+    executors, programs = [], set()
 
     class Seen(NativeExecutor):
         def run(self, *arguments):
@@ -127,7 +231,8 @@ def test_what_cannot_be_a_program_takes_one_native_call_a_sim_step(panda):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", Seen)
-        for options in ({}, {"actuators": actuators}):
+        for case, options in cases.items():
             with Runner(panda, 2, workers=0, **options) as runner:
                 runner.step(panda.settings.target)
-    assert executors == [True, False]
+            programs |= {case} if executors[-1] else set()
+    assert programs == cases.keys() - {"integral", "controller"}
