@@ -91,7 +91,7 @@ accuracy: $(VENV)/.dev
 	@$(RUN) bench/draw.py $(MEASURED)
 
 soak: $(VENV)/.dev
-	@$(RUN) -u -m pytest -m slow -vv --durations 20 $(ARGS)
+	@$(RUN) -u -m pytest -m slow -vv --durations 20 --numprocesses 2 --dist worksteal $(ARGS)
 
 # The wheel is built from the sdist, so that a file which the sdist lacks is an error; so is a missing extension.
 WHEEL := out/wheel

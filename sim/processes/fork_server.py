@@ -4,9 +4,9 @@ A new Python process spends half a second of processor time on its imports. The 
 asked for. A fork of the server is safe, unlike one of the caller: it is a fresh Python, without the caller's
 ``__main__``, and with one thread.
 
-Children inherit from the caller what a new process would: the environment at the server's start (another environment
-starts another server), and, at each fork, the import path, working folder, cores, resource limits, and the standard
-output and error. The kernel ends them when the server ends, and the server when the caller ends. For the kernel, the
+Children inherit from the caller, at each fork, the environment (another one starts another server), the import path,
+working folder, cores, resource limits, and the standard output and error; and the umask and priority that it had when
+the server started. The kernel ends them when the server ends, and the server when the caller ends. For the kernel, the
 parent is the thread that started the server; that is :data:`BACKGROUND`, which lives as long as the caller.
 """
 

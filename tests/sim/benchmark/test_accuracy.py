@@ -91,10 +91,10 @@ def test_errors_are_of_the_documented_order_of_magnitude(name):
         "contact": (1.0, 5e-2),
         "limit": (2e-2, 1e-3),
     }
+    errors = {motion: accuracy.measure_errors(robot, motion) for motion in bounds}
     for motion, (largest, rms) in bounds.items():
-        for case, error in accuracy.measure_errors(robot, motion).items():
+        for case, error in errors[motion].items():
             assert 1e-6 < error.rms < rms, (motion, case)
             assert error.largest < largest, (motion, case)
-    free = accuracy.measure_errors(robot, "free")
-    fast, accurate = (free[physics, "equation of motion"].rms for physics in ("fast", "accurate"))
+    fast, accurate = (errors["free"][physics, "equation of motion"].rms for physics in ("fast", "accurate"))
     assert fast == pytest.approx(accurate, rel=0.1)
