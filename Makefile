@@ -22,8 +22,8 @@ ARGS :=
 
 # Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py batchpid/native/task_space_extension.py \
-	sim/engine/native/interface.py \
-	$(foreach room,batchpid/native sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
+	batchpid/sim/engine/native/interface.py \
+	$(foreach room,batchpid/native batchpid/sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
 # Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.

@@ -26,7 +26,7 @@ import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 LEFT_OUT = ("make test", "pip install .")
-"""Commands that repeat what others have done: the tests, and a second installation."""
+"""Commands that are not run: ``make demo`` has installed batchpid already, and a newcomer need not run the tests."""
 REMEDY = re.compile(r"pip install 'batchpid\[(\w+)\]'")
 FILES = """
 mkdir -p robots

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -19,6 +21,7 @@ import batchpid
 
 ROOT = Path(__file__).parents[1]
 LIMITED_API = "cp311"
+REQUIRED = "BATCHPID_REQUIRE_NATIVE"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -77,6 +80,7 @@ def test_the_command_checks_the_packages_before_it_imports_them():
     assert PROJECT["project"]["scripts"] == {"batchpid": "batchpid.__main__:main"}
 
 
+@pytest.mark.skipif(not (ROOT / "sim").exists(), reason="an sdist has the package in batchpid/ alone")
 def test_the_folder_of_a_checkout_still_imports_as_sim_with_a_warning():
     code = """
 import warnings
@@ -108,7 +112,7 @@ else:
 def test_a_failed_extension_ends_a_build_that_requires_it(required, status, message, tmp_path):
     folders = ["--build-lib", str(tmp_path / "lib"), "--build-temp", str(tmp_path / "temp")]
     build = [sys.executable, "-W", "ignore", "setup.py", "--quiet", "build_ext", *folders]
-    compilers = {"CC": "/bin/false", "CXX": "/bin/false", "BATCHPID_REQUIRE_NATIVE": required}
+    compilers = {"CC": "/bin/false", "CXX": "/bin/false", REQUIRED: required}
     done = subprocess.run(build, cwd=ROOT, env=os.environ | compilers, capture_output=True, text=True)
     assert done.returncode == status
     assert message in done.stderr
@@ -123,6 +127,30 @@ def test_published_wheels_have_native_code_and_the_tag_of_the_limited_api():
     assert f'"py_limited_api": "{LIMITED_API}"' in (ROOT / "setup.py").read_text()
     oldest = PROJECT["project"]["requires-python"].removeprefix(">=3.")
     assert f"cp3{oldest}" == LIMITED_API
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="the files of a checkout are those that git knows")
+def test_the_sdist_has_every_file_builds_and_passes_tests(tmp_path):
+    """The tests of the distribution, of its native code and of a run."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    files = {name for name in listed.split("\0") if name}
+    for name in files:
+        (copy := tmp_path / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, copy, follow_symlinks=False)
+    setup = [sys.executable, "-W", "ignore", "setup.py", "--quiet"]
+    subprocess.run([*setup, "sdist", "--dist-dir", tmp_path], cwd=tmp_path / "checkout", check=True)
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (sdist,) = tmp_path.glob("batchpid-*/")
+    links = {"batchpid/sim", "batchpid/assets"}
+    own = {".gitignore", ".pre-commit-config.yaml"}
+    lacking = {name for name in files - links - own if not (sdist / name).exists()}
+    assert {name for name in lacking if not (sdist / "batchpid" / name).exists()} == set()
+    subprocess.run([*setup, "build_ext", "--inplace"], cwd=sdist, env=os.environ | {REQUIRED: "1"}, check=True)
+    tests = ("tests/test_packaging.py", "tests/assets", "tests/batchpid/native", "tests/sim/test_identity.py")
+    environment = os.environ | {"PYTHONPATH": str(sdist)}
+    subprocess.run([sys.executable, "-m", "pytest", *tests], cwd=sdist, env=environment, check=True)
 
 
 @pytest.mark.slow

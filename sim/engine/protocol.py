@@ -278,8 +278,8 @@ class Engine(description.RobotFunctions, Protocol):
         carrier, links
             Link of the URDF that carries the payload, and links whose mass or center of mass varies.
         workspace
-            Working memory that packs share which are never at work at the same time, such as those of a loop. Only the
-            engine knows its content. None for a pack of its own.
+            Working memory, shared by packs that never step at the same time, as the packs of a loop. Only the engine
+            knows its content. None: the pack allocates its memory.
 
         Raises
         ------
