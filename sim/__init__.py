@@ -32,7 +32,6 @@ from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray
@@ -44,6 +43,7 @@ from batchpid.sim.robot.limits import SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Controller, RunnerKeywords
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver

@@ -28,12 +28,10 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import Capability, Engine, require
-from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -49,7 +47,8 @@ from batchpid.sim.runner_keywords import (
     RunnerKeywords,
     SetpointSpace,
 )
-from batchpid.sim.tool_setpoints import ToolSetpoints
+from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
+from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver
@@ -264,7 +263,9 @@ class RunnerOptions:
     @cached_property
     def tool_setpoints(self) -> ToolSetpoints | None:
         """Inverse kinematics of ``setpoint_space`` "tool"."""
-        return None if self.setpoint_space == "joints" else ToolSetpoints(self.robot, _tool(self.robot, self.tool))
+        if self.setpoint_space == "joints":
+            return None
+        return ToolSetpoints(self.robot, default_tool(self.robot) if self.tool is None else self.tool)
 
     @property
     def scenes_per_system(self) -> int:
@@ -397,12 +398,6 @@ def keyword_parameters() -> list[Parameter]:
     return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
-def _tool(robot: Robot, tool: str | None) -> str:
-    """Return the link ``tool``, by default the last one of the longest chain."""
-    kinematics = Kinematics(robot)
-    return kinematics.links[kinematics.tool] if tool is None else tool
-
-
 def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
     if space == "tool" and value not in ("pid", "drive"):
@@ -412,7 +407,7 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
         problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
         raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
     if value == "osc":
-        return OperationalSpace(robot, _tool(robot, tool))
+        return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
     if callable(value) and callable(getattr(value, "init", None)):
         own_command(value)  # raises for an invalid command
         return value

@@ -83,8 +83,8 @@ class RunnerKeywords(TypedDict, total=False):
     setpoint_space: SetpointSpace
     """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
     ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
-    Inverse kinematics makes joint setpoints of them (:class:`batchpid.sim.tool_setpoints.ToolSetpoints`), which
-    rollouts and recordings hold."""
+    Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
+    which rollouts and recordings hold."""
     backend: Backend
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
     of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,

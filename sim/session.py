@@ -29,9 +29,9 @@ from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import IDEAL, RunnerOptions
-from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.loop_stability import StabilityCheck
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.pool import WorkerPool
 from batchpid.sim.workers.requests import (
     ReadPoses,

@@ -7,8 +7,9 @@ twists, wrenches and Jacobians have linear parts first. NumPy computes in float6
 from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
 from batchpid.task_space.kinematic_tree import KinematicTree
-from batchpid.task_space.operational_space import advance, init, reset, step
+from batchpid.task_space.operational_space import advance, advance_terms, init, reset, step, step_terms
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
+from batchpid.task_space.osc_files import load_osc_options, save_osc_options
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, task_dynamics
 from batchpid.task_space.osc_transfer import track
@@ -25,6 +26,7 @@ __all__ = [
     "OSCTerms",
     "TaskDynamics",
     "advance",
+    "advance_terms",
     "bias",
     "discretise",
     "forward_dynamics",
@@ -35,11 +37,14 @@ __all__ = [
     "jacobian",
     "jacobian_rate",
     "link_poses",
+    "load_osc_options",
     "make_osc_params",
     "mass_matrix",
     "presets",
     "reset",
+    "save_osc_options",
     "step",
+    "step_terms",
     "task_dynamics",
     "track",
 ]

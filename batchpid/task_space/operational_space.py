@@ -50,7 +50,7 @@ from batchpid.task_space.native_rows import elementwise
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
-from batchpid.task_space.projections import projections
+from batchpid.task_space.projections import Projections, projections
 from batchpid.task_space.symmetric import product, quiet
 
 
@@ -86,9 +86,8 @@ def step(
     acceleration: Any = None,
     wrench: Any = None,
     feedforward: Any = None,
-    terms: bool = False,
-) -> Any:
-    """Advance the law by ``dt`` [s]; return ``(state, effort)``, with ``terms`` also :class:`OSCTerms`.
+) -> tuple[OSCState, Any]:
+    """Advance the law by ``dt`` [s]; return the state and the effort.
 
     Efforts are (envs, dof) [N m or N]. A row does not depend on the others, to the last bit under NumPy; NaN stays in
     its env.
@@ -113,16 +112,29 @@ def step(
     InvalidArgumentError
         The link is unknown, an array has a wrong shape, or dt is not positive.
     """
-    setpoints = {
-        "setpoint": (setpoint, 7),
-        "twist": (twist, 6),
-        "acceleration": (acceleration, 6),
-        "wrench": (wrench, 6),
-    }
-    _check_shapes(params, setpoints | {"feedforward": (feedforward, tree.dof)}, qpos)
+    inputs = {"twist": twist, "acceleration": acceleration, "wrench": wrench, "feedforward": feedforward}
+    _check_shapes(params, tree, setpoint, qpos, **inputs)
     dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
-    optional = twist, acceleration, wrench, feedforward
-    return advance(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, *optional, terms=terms)
+    return advance(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, **inputs)
+
+
+def step_terms(
+    params: OSCParams,
+    state: OSCState,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    dt: Any,
+    *,
+    tree: KinematicTree,
+    link: str,
+    point: Any = None,
+    **inputs: Any,
+) -> tuple[OSCState, OSCTerms]:
+    """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
+    _check_shapes(params, tree, setpoint, qpos, **inputs)
+    dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
+    return advance_terms(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, **inputs)
 
 
 def advance(
@@ -136,28 +148,36 @@ def advance(
     acceleration: Any = None,
     wrench: Any = None,
     feedforward: Any = None,
-    *,
-    terms: bool = False,
-) -> Any:
+) -> tuple[OSCState, Any]:
     """Advance the law with given coefficients and dynamics, such as an engine's; otherwise as :func:`step`."""
     with quiet():
-        xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
-        task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
-        (a,) = elementwise(_accelerations, k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
-        a_n = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
-        p = projections(k, task.dynamics, a, a_n, wrench, feedforward)
-        parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
-        if not terms and state.integral is None:
-            return state, elementwise(_effort, *parts)[0]
-        effort, whole, s1, s2 = elementwise(_saturated, *parts)
-        if state.integral is not None:
-            held = p.near_singular | (effort != whole).any(-1)
-            state = state._replace(integral=_integrated(k, state.integral, task.motion, a, held[:, None], xp))
-    if not terms:
-        return state, effort
+        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
+        if state.integral is None:
+            return state, elementwise(_effort, *sums.parts)[0]
+        effort, whole, *_ = elementwise(_saturated, *sums.parts)
+        return _integrated(k, state, sums, effort != whole), effort
+
+
+def advance_terms(
+    k: OSCCoefficients,
+    state: OSCState,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    dynamics: TaskDynamics,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+) -> tuple[OSCState, OSCTerms]:
+    """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
+    with quiet():
+        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
+        effort, whole, s1, s2 = elementwise(_saturated, *sums.parts)
+        state = _integrated(k, state, sums, effort != whole)
+    p = sums.projections
     shares = s1[..., 0], s2[..., 0]
-    near = p.near_singular
-    return state, effort, OSCTerms(task.error, p.force, p.task, p.posture, whole, effort.copy(), *shares, near)
+    return state, OSCTerms(sums.task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular)
 
 
 class _Motion(NamedTuple):
@@ -193,18 +213,71 @@ def in_frame(
     return Task(d, vectors[0], _Motion(*vectors[1:]))
 
 
-def _integrated(k: OSCCoefficients, integral: Any, motion: _Motion, a: Any, held: Any, xp: Any) -> Any:
-    """Return the integral after the step; one that is ``held`` (envs, 1) does not grow."""
-    new = integral + k.ki_dt * motion.near
+class _Sums(NamedTuple):
+    """Efforts before saturation."""
+
+    task: Task
+    a: Any
+    """Acceleration of the task (envs, 6)."""
+    projections: Projections
+    parts: tuple[Any, ...]
+    """Arguments of :func:`_saturated`."""
+
+
+def _sums(
+    k: OSCCoefficients,
+    state: OSCState,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    dynamics: TaskDynamics,
+    twist: Any,
+    acceleration: Any,
+    wrench: Any,
+    feedforward: Any,
+) -> _Sums:
+    """Return the efforts of task and posture before saturation."""
+    xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
+    task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
+    (a,) = elementwise(_accelerations, k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
+    a_n = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
+    p = projections(k, task.dynamics, a, a_n, wrench, feedforward)
+    parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
+    return _Sums(task, a, p, parts)
+
+
+def _integrated(k: OSCCoefficients, state: OSCState, sums: _Sums, clipped: Any) -> OSCState:
+    """Return the state after the step; the integral of an env with ``clipped`` efforts (envs, dof) does not grow."""
+    if state.integral is None:
+        return state
+    motion, held = sums.task.motion, (sums.projections.near_singular | clipped.any(-1))[:, None]
+    xp = namespace(state.integral, motion.near)
+    new = state.integral + k.ki_dt * motion.near
     if k.ki_dt2 is not None and motion.twist is not None:
         new = new - k.ki_dt2 * motion.twist
     new = clip(new, -k.integral_limit, k.integral_limit, xp)
-    return xp.where(held & (a * motion.near > 0), integral, new)
+    return state._replace(integral=xp.where(held & (sums.a * motion.near > 0), state.integral, new))
 
 
-def _check_shapes(params: OSCParams, arrays: dict[str, tuple[Any, int]], qpos: Any) -> None:
+def _check_shapes(
+    params: OSCParams,
+    tree: KinematicTree,
+    setpoint: Any,
+    qpos: Any,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+) -> None:
     """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
     envs = np.shape(qpos)[0]
+    arrays = {
+        "setpoint": (setpoint, 7),
+        "twist": (twist, 6),
+        "acceleration": (acceleration, 6),
+        "wrench": (wrench, 6),
+        "feedforward": (feedforward, tree.dof),
+    }
     for name, (value, size) in arrays.items():
         if value is None:
             continue

@@ -1,7 +1,8 @@
-r"""Coefficients of operational-space control at one time step: with constant params, a loop computes them once.
+r"""Coefficients of operational-space control at one time step.
 
-The law is that of :mod:`batchpid.task_space.operational_space`, with the error e of the pose, the twist v of the tool,
-the setpoint's twist V and acceleration V', and the integral I::
+A loop with constant params computes them once. They are marked with an asterisk in the acceleration of the task
+(:mod:`batchpid.task_space.operational_space`), where e is the error of the pose, v the twist of the tool, V and V' the
+twist and acceleration of the setpoint, and I the integral::
 
     a = kp* e - kd* v + c* V + g* V' + I        I <- I + ki* dt e - ki2* V
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.choices import CHOICES, Choice
 from batchpid.arrays.display import array_summary
+from batchpid.arrays.field_tables import Field
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
@@ -18,6 +19,27 @@ from batchpid.task_space.tree_dynamics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
+
+FIELDS = {
+    "stiffness": Field("1/s^2"),
+    "damping_ratio": Field("1", 1.0),
+    "damping": Field("1/s"),
+    "integral_gain": Field("1/s^3"),
+    "integral_limit": Field("m/s^2 or rad/s^2", math.inf),
+    "axes": Field(neutral=1.0),
+    "force_axes": Field(),
+    "posture_stiffness": Field("1/s^2"),
+    "posture_damping_ratio": Field("1", 1.0),
+    "limit_margin": Field("rad or m"),
+    "limit_stiffness": Field("1/s^2"),
+    "position_error_limit": Field("m", math.inf, above=True),
+    "rotation_error_limit": Field("rad", math.inf, above=True),
+    "smallest_eigenvalue": Field("1/kg or 1/(kg m^2)", above=True),
+    "effort_limit": Field("N m or N", math.inf),
+    "effort_min": Field("N m or N", -math.inf, low=-math.inf),
+    "effort_max": Field("N m or N", math.inf, low=-math.inf),
+}
+"""Options that are numbers; units are those with full decoupling."""
 
 
 class PartialDecoupling(Choice):
@@ -177,16 +199,15 @@ def make_osc_params(
         if effort_min is not None or effort_max is not None:
             problem = "is given together with effort_min or effort_max"
             raise InvalidArgumentError("effort_limit", problem, remedy="give the symmetric limit, or the two ends")
-        effort_max = _rows("effort_limit", effort_limit, joints, infinite=True)
+        effort_max = _rows("effort_limit", effort_limit, joints)
         effort_min = -effort_max
     low, high = (
-        None if end is None else _rows(name, end, joints, -math.inf, infinite=True)
+        None if end is None else _rows(name, end, joints)
         for name, end in (("effort_min", effort_min), ("effort_max", effort_max))
     )
     if low is not None and high is not None:
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
-    above = {"above": True, "infinite": True}
     limits = np.array([tree.lower, tree.upper])
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
     integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
@@ -195,9 +216,9 @@ def make_osc_params(
         damping=kd if damping is None else _rows("damping", damping, AXES),
         posture_stiffness=posture,
         posture_damping=2 * _rows("posture_damping_ratio", posture_damping_ratio, joints) * np.sqrt(posture),
-        position_error_limit=_rows("position_error_limit", position_error_limit, ("norm",), **above),
-        rotation_error_limit=_rows("rotation_error_limit", rotation_error_limit, ("norm",), **above),
-        smallest_eigenvalue=_rows("smallest_eigenvalue", smallest_eigenvalue, ("s0",), above=True),
+        position_error_limit=_rows("position_error_limit", position_error_limit, ("norm",)),
+        rotation_error_limit=_rows("rotation_error_limit", rotation_error_limit, ("norm",)),
+        smallest_eigenvalue=_rows("smallest_eigenvalue", smallest_eigenvalue, ("s0",)),
         axes=motion,
         force_axes=force,
         effort_min=low,
@@ -205,7 +226,7 @@ def make_osc_params(
         decoupling=TASK_CHOICES["decoupling"][decoupling],
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
         integral_gain=integral,
-        integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES, infinite=True),
+        integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
         limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints),
         limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
         lower=None if margin is None else limits[:1],
@@ -216,24 +237,15 @@ def make_osc_params(
     return params
 
 
-def _rows(
-    name: str,
-    value: ArrayLike,
-    columns: tuple[str, ...],
-    low: float = 0.0,
-    *,
-    above: bool = False,
-    infinite: bool = False,
-) -> NDArray[np.float64]:
-    """Return ``value`` as read-only rows (1 | envs, columns), each entry >= ``low``, or > it."""
+def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return ``value`` as read-only rows (1 | envs, columns) within the bounds of its field."""
     given = read_array(name, value)
     shape = (len(given) if given.ndim == 2 else 1, len(columns))
     if len(columns) == 1 and given.ndim == 1:  # one number per env
         given = given[:, None]
         shape = given.shape
     rows = array(name, given, shape, columns, finite=False, kind="entry").copy()
-    good = ((rows > low) if above else (rows >= low)) & (infinite | np.isfinite(rows))
-    entries(name, rows, good, f"must be {'>' if above else '>='} {low:g}{'' if infinite else ' and finite'}", columns)
+    FIELDS[name].checked(name, rows, columns)
     rows.setflags(write=False)
     return rows
 

@@ -28,13 +28,16 @@ def track(
     acceleration: Any = None,
     feedforward: Any = None,
 ) -> OSCState:
-    """Return the state whose next step, on these same inputs, gives ``effort`` (envs, dof) [N m or N].
+    """Return a state with which the next step, on the same inputs, gives ``effort`` (envs, dof) [N m or N].
 
-    The effort is that of other control, such as a joint PID, or of other gains. It accelerates the joints of the model
-    by M^-1 (effort - h - feedforward): the integral makes up the part of the task, the posture that of the null space
-    and of the joints outside the chain. Under a load that the model does not know, this is the posture in which the
-    robot rests. Effort limits, the limit of the integral, joints without posture stiffness, axes that are not selected
-    and poses near a singularity leave a difference. The way back is :func:`batchpid.track` with the last effort.
+    ``effort`` is the last one of another controller, such as a joint PID, or of other gains. In the model it gives the
+    joints the acceleration q'' = M^-1 (effort - h - feedforward). The integral is chosen so that the task asks for the
+    tool's share of q''; the posture is chosen so that the joints ask for the rest, in the null space and outside the
+    chain. A load that the model does not know is thus held by the integral and the posture.
+
+    The next effort differs from ``effort`` where the integral or an effort is at its limit, a joint has no posture
+    stiffness, an axis is not selected, or the pose is near a singularity. For a transfer back to a joint PID, call
+    :func:`batchpid.track` with the last effort.
 
     Raises
     ------

@@ -35,12 +35,12 @@ FRAMES = ("world", "tool")
 
 
 class Motions(NamedTuple):
-    """Frames of the bodies and motions of the joints at some positions, in the world."""
+    """Frames of the bodies, and motions per rate of each joint, in the world, at given joint positions."""
 
     frames: Any
     """(..., dof, 3, 4)."""
     linear: Any
-    """Velocity of the point of the body at the origin, per rate of its joint (..., dof, 3)."""
+    """Velocity per rate of the joint, of the body's point that is at the origin of the world (..., dof, 3)."""
     angular: Any
     """Angular velocity per rate of the joint (..., dof, 3)."""
 

@@ -16,10 +16,10 @@ from batchpid.sim.gym.joint_space import JointSpace
 from batchpid.sim.gym.reach import ACTIONS
 from batchpid.sim.gym.robot_vector_env import Float32, Float64, RobotVectorEnv
 from batchpid.sim.observation import Observation
-from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.rotations import about, multiply
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.task_space.frames import rotation_error
 
 STIFFNESS = 400.0

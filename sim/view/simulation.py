@@ -19,11 +19,11 @@ from batchpid.checks.validate import array, choice, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.osc_controller import OperationalSpace
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import ControlMode
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS

@@ -39,7 +39,7 @@ def test_reachable_poses_are_reached(name, rows):
     pose, qpos = reachable(name, rows)
     found = ts.inverse_kinematics(tree, TOOLS[name], pose, start, on_failure="return")
     check(tree, TOOLS[name], pose, found)
-    assert found.success.mean() >= 0.99
+    assert found.success.mean() >= 0.995
     others = ~tree.chain(TOOLS[name])
     np.testing.assert_array_equal(found.qpos[:, others], np.tile(start[others], (rows, 1)))
     way = np.random.default_rng(0).normal(size=qpos.shape)
@@ -47,7 +47,7 @@ def test_reachable_poses_are_reached(name, rows):
     found = ts.inverse_kinematics(tree, TOOLS[name], pose, near, starts=1, on_failure="return")
     check(tree, TOOLS[name], pose, found)
     assert found.success.mean() >= 0.99
-    assert found.iterations[found.success].mean() < 6
+    assert found.iterations[found.success].mean() <= 5
 
 
 def test_a_point_of_a_link_is_a_tool():

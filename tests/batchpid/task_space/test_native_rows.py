@@ -88,9 +88,7 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
         if extras >> bit & 1
     }
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
-    found, wanted = both(
-        lambda: ts.step(params, state, goal, qpos, qvel, 1e-3, tree=tree, link=tool, terms=True, **given)[2]
-    )
+    found, wanted = both(lambda: ts.step_terms(params, state, goal, qpos, qvel, 1e-3, tree=tree, link=tool, **given)[1])
     np.testing.assert_array_equal(found.near_singular, wanted.near_singular)
     # The inverse amplifies the rounding of A, which is relative to its norm, by 1/s0 at most.
     d = ts.task_dynamics(tree, qpos, qvel, tool)
@@ -111,7 +109,8 @@ def test_a_row_is_the_same_in_any_company():
     qpos[7, 2] = np.nan
     params = ts.make_osc_params(tree, effort_limit=80.0, smallest_eigenvalue=0.05)
     goal = ts.link_poses(tree, 0.9 * np.nan_to_num(qpos), [tool])[:, 0]
-    _, effort, terms = ts.step(params, ts.init(params, qpos), goal, qpos, qvel, 1e-3, tree=tree, link=tool, terms=True)
+    _, terms = ts.step_terms(params, ts.init(params, qpos), goal, qpos, qvel, 1e-3, tree=tree, link=tool)
+    effort = terms.effort
     assert 0.2 < terms.near_singular.mean() < 0.9
     assert np.flatnonzero(~np.isfinite(effort).all(1)).tolist() == [7]
     for chosen in (slice(0, 1), slice(4, 9), slice(8, 9), slice(9998, 10_000)):

@@ -17,8 +17,8 @@ START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
 HAND = "panda_hand"
 
 
-def advance(params, *inputs, dt=DT, **options):
-    return ts.advance(ts.discretise(params, dt), *inputs, **options)
+def terms_of(params, *inputs, dt=DT, **options):
+    return ts.advance_terms(ts.discretise(params, dt), *inputs, **options)[1]
 
 
 def accelerations(d, effort):
@@ -50,9 +50,9 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
     params = ts.make_osc_params(tree, posture_stiffness=30.0, **options)
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, qvel, link)
-    inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5), "terms": True}
-    _, effort, terms = advance(params, state, goal, qpos, qvel, d, **inputs)
-    qacc, tool = accelerations(d, effort - 0.5)
+    inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5)}
+    terms = terms_of(params, state, goal, qpos, qvel, d, **inputs)
+    qacc, tool = accelerations(d, terms.effort - 0.5)
     error = frames.pose_error(goal, d.pose)
     for part, most in ((error[:, :3], 0.1), (error[:, 3:], 0.5)):
         part *= np.minimum(1, most / np.linalg.norm(part, axis=1, keepdims=True))
@@ -79,7 +79,7 @@ def test_the_posture_does_not_move_the_tool():
         for decoupling in ("full", "partial", "none"):
             chosen = params._replace(decoupling=ts.osc_params.TASK_CHOICES["decoupling"][decoupling])
             state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
-            terms = advance(chosen, state, goal, qpos, qvel, d, terms=True)[2]
+            terms = terms_of(chosen, state, goal, qpos, qvel, d)
             moved = moved_by(d, tree.chain(HAND), terms.posture)
             moved = moved if axes is None else moved[:, axes]
             assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
@@ -96,10 +96,10 @@ def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
     d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
     limit = np.abs(d.bias).max() * tight * rng.uniform(0.5, 2, (rows, tree.dof))
     params = ts.make_osc_params(tree, effort_limit=limit)
-    _, effort, terms = advance(params, state, goal, qpos, 0.1 * qvel, d, terms=True)
+    terms = terms_of(params, state, goal, qpos, 0.1 * qvel, d)
     chain = tree.chain(HAND)
     base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
-    task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, effort, limit))
+    task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, terms.effort, limit))
     s1, s2 = terms.task_share[:, None], terms.posture_share[:, None]
     able = (np.abs(base) <= limit).all(1)
     assert (np.abs(effort) <= limit * (1 + 1e-12)).all()
@@ -123,22 +123,19 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
     for options in ({}, {"decoupling": "partial", "frame": "tool"}, {"axes": [True] * 3 + [False] * 3}):
         params = ts.make_osc_params(tree, effort_limit=60.0, smallest_eigenvalue=0.05, **options)
 
-        def efforts(chosen, params=params):
+        def terms_for(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
-            return ts.step(
-                params, part, goal[chosen], qpos[chosen], qvel[chosen], DT, tree=tree, link=HAND, terms=True
-            )[1:]
+            return ts.step_terms(params, part, goal[chosen], qpos[chosen], qvel[chosen], DT, tree=tree, link=HAND)[1]
 
-        effort, terms = efforts(slice(None))
+        terms = terms_for(slice(None))
+        effort = terms.effort
         bad = [2, 3, 5]
         assert np.isnan(effort[bad]).any(1).all()
         assert np.isfinite(np.delete(effort, bad, 0)).all()
         assert terms.near_singular[6:].any()
         assert not terms.near_singular[6:].all()
         for chosen in (slice(0, 1), slice(4, 5), slice(6, 7), slice(6, 23)):
-            alone, of_alone = efforts(chosen)
-            np.testing.assert_array_equal(alone, effort[chosen])
-            for part, whole in zip(of_alone, terms, strict=True):
+            for part, whole in zip(terms_for(chosen), terms, strict=True):
                 np.testing.assert_array_equal(part, whole[chosen])
 
 
@@ -152,7 +149,7 @@ def test_a_selected_force_is_that_of_the_wrench():
     for frame in ("world", "tool"):
         params = ts.make_osc_params(tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame)
         inputs = params, ts.OSCState(qpos + 0.3 * chain), d.pose, qpos, 0 * qpos, d
-        _, _, terms = advance(*inputs, wrench=np.tile(wrench, (rows, 1)), terms=True)
+        terms = terms_of(*inputs, wrench=np.tile(wrench, (rows, 1)))
         np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)
         tool = moved_by(d, chain, terms.posture)
         turn = frames.matrix_of(d.pose[:, 3:])
@@ -213,7 +210,7 @@ def test_inputs_of_a_step_are_checked():
         ({"posture_stiffness": [1.0] * 3}, "posture_stiffness: has shape .*joint1"),
         ({"effort_min": 1.0, "effort_max": 0.0}, "effort_min, joint 'joint1': exceeds effort_max"),
         ({"effort_limit": 1.0, "effort_max": 2.0}, "given together"),
-        ({"smallest_eigenvalue": 0.0}, "smallest_eigenvalue, .*must be > 0"),
+        ({"smallest_eigenvalue": 0.0}, "smallest_eigenvalue, .*must be finite and > 0"),
         ({"position_error_limit": -1.0}, "position_error_limit"),
         ({"decoupling": "half"}, "decoupling: unknown option"),
         ({"decoupling": "none"}, "damping: is missing"),

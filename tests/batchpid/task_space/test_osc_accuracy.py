@@ -33,9 +33,8 @@ def run(tree, link, params, qpos, goal, steps, dt, *, known=lambda d, q: d, chan
     for n in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
         target = goal(n * dt) if callable(goal) else goal
-        state, effort, terms = ts.advance(k, state, target, q, v, known(d, q), terms=True, **given)
-        if change is not None:
-            effort = change(effort, terms, d, q, v)
+        state, terms = ts.advance_terms(k, state, target, q, v, known(d, q), **given)
+        effort = terms.effort if change is None else change(terms.effort, terms, d, q, v)
         errors.append(frames.pose_error(target, d.pose))
         efforts.append(effort)
         force = effort - d.bias

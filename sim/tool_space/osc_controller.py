@@ -19,6 +19,7 @@ from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.frames import pose_error
@@ -104,10 +105,12 @@ class OperationalSpace:
     ) -> None:
         robot = instance("robot", robot, Robot, "pass Robot.load(...)")
         tree = robot.kinematic_tree() if tree is None else tree
-        self._tree = instance("tree", tree, ts.KinematicTree, "pass robot.kinematic_tree()")
+        self.tree = instance("tree", tree, ts.KinematicTree, "pass robot.kinematic_tree()")
+        """Model of the robot."""
         self.link = link
         """Link that carries the tool."""
-        self._point = None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
+        self.point = None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
+        """Tool in the link's frame (3,) [m]; None for its origin."""
         self._posture = array("posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names)
         if params is None:
             if not {"effort_limit", "effort_min", "effort_max"} & set(options):
@@ -116,7 +119,8 @@ class OperationalSpace:
         elif options:
             problem, remedy = "are given together with params", "give them to the function that makes the params"
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
-        self._params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        self.params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        """Params of the law."""
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
         self._friction: Friction | None = None
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
@@ -142,7 +146,7 @@ class OperationalSpace:
             self._columns[joint] = column
         units = dict(zip(robot.joint_names, robot.units, strict=True)) if joints else {}
         entries |= {name: units[name] for name in joints}
-        pose = ts.link_poses(tree, self._posture, [link], point=self._point)[0, 0]
+        pose = ts.link_poses(tree, self._posture, [link], point=self.point)[0, 0]
         others = [self._posture[0, tree.joint_names.index(name)] for name in joints]
         neutral = np.concatenate([pose, np.zeros(size - len(POSE_UNITS)), others])
         self.command = CommandSpec(tuple(entries), tuple(entries.values()), neutral=neutral)
@@ -159,10 +163,10 @@ class OperationalSpace:
         InvalidArgumentError
             The robot has other joints than the one of this controller.
         """
-        if robot.joint_names != self._tree.joint_names:
-            problem = f"was made for the joints {', '.join(self._tree.joint_names)}, but the runner's robot has others"
+        if robot.joint_names != self.tree.joint_names:
+            problem = f"was made for the joints {', '.join(self.tree.joint_names)}, but the runner's robot has others"
             raise InvalidArgumentError("control", problem, remedy="make it for the robot of the runner")
-        return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
+        return ts.init(self.params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any]:
         """Return the state and the efforts (envs, dof) [N m or N]."""
@@ -170,7 +174,7 @@ class OperationalSpace:
         aimed = state
         if self._columns.any():
             aimed = state._replace(posture=xp.where(self._columns > 0, setpoint[:, self._columns], state.posture))
-        dynamics = ts.task_dynamics(self._tree, qpos, qvel, self.link, point=self._point, bias=passive)
+        dynamics = ts.task_dynamics(self.tree, qpos, qvel, self.link, point=self.point, bias=passive)
         parts, feedforward = {name: setpoint[:, part] for name, part in self._parts.items()}, None
         if self._damping is not None:
             feedforward = self._damping * qvel
@@ -180,8 +184,12 @@ class OperationalSpace:
             friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture - qpos, dynamics)
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
-        new, effort = ts.advance(self._k, *inputs, **parts, feedforward=feedforward)
+        new, effort = ts.advance(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
         return new._replace(posture=state.posture), effort
+
+    def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
+        """Return the coefficients of the law for setpoints (envs, size)."""
+        return self._k
 
     def _friction_to(self, setpoint: Any, twist: Any, others: Any, dynamics: ts.TaskDynamics) -> Any:
         """Return the friction (envs, dof) on the way to the setpoint; ``others`` is the way of the other joints."""
@@ -196,18 +204,18 @@ class OperationalSpace:
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
         """Return this controller for the time step [s] and the option ``compensate`` of a runner."""
         other = copy(self)
-        other._k, other._timestep = ts.discretise(self._params, timestep), timestep
+        other._k, other._timestep = ts.discretise(self.params, timestep), timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
 
     def check_stability(self, stacklevel: int = 2) -> None:
         """Warn, ``stacklevel`` frames up, if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
-        p, dt = self._params, self._timestep
+        p, dt = self.params, self._timestep
         if p.discretization is not None or isinstance(p.decoupling, NoDecoupling):
             return
         for name, kp, kd, columns in (
             ("stiffness", p.stiffness, p.damping, AXES),
-            ("posture_stiffness", p.posture_stiffness, p.posture_damping, self._tree.joint_names),
+            ("posture_stiffness", p.posture_stiffness, p.posture_damping, self.tree.joint_names),
         ):
             ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
             if ratio[worst := int(ratio.argmax())] > 1:
@@ -221,7 +229,13 @@ class OperationalSpace:
 
     def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
         """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""
-        return tool_pose(self._tree, self.link, self._point, qpos)
+        return tool_pose(self.tree, self.link, self.point, qpos)
+
+
+def default_tool(robot: Robot) -> str:
+    """Return the last link of the robot's longest chain, or the hand if that chain ends in fingers."""
+    kinematics = Kinematics(robot)
+    return kinematics.links[kinematics.tool]
 
 
 def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:

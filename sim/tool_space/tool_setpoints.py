@@ -14,8 +14,8 @@ from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import array, entries, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, CommandSpec
-from batchpid.sim.osc_controller import tool_pose
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.tool_space.osc_controller import tool_pose
 
 
 class ToolSetpoints:
