@@ -400,18 +400,21 @@ def keyword_parameters() -> list[Parameter]:
 
 def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
-    if space == "tool" and value not in ("pid", "drive"):
+    own = callable(value) and callable(getattr(value, "init", None))
+    name = None if own else choice("control", value, (*get_args(ControlMode), "osc"))
+    if own:
+        own_command(value)  # raises for an invalid command
+    if tool is not None:
+        tool = instance("tool", tool, str, "name a link of the robot")
+    if space == "tool" and name not in ("pid", "drive"):
         problem = "'tool' makes joint setpoints, which this control does not take"
         raise InvalidArgumentError("setpoint_space", problem, remedy="use control 'pid' or 'drive', or leave it out")
-    if tool is not None and value != "osc" and space == "joints" and tool != getattr(value, "link", None):
+    if tool is not None and name != "osc" and space == "joints" and tool != getattr(value, "link", None):
         problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
         raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
-    if value == "osc":
+    if name == "osc":
         return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
-    if callable(value) and callable(getattr(value, "init", None)):
-        own_command(value)  # raises for an invalid command
-        return value
-    return choice("control", value, (*get_args(ControlMode), "osc"))
+    return value
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterable
@@ -19,6 +20,12 @@ def children() -> set[psutil.Process]:
     server = server_pid()
     direct = {child for child in psutil.Process().children() if child.pid != server}
     return direct if server is None else direct | set(psutil.Process(server).children())
+
+
+def send(pid: int, number: int) -> None:
+    """Send a signal to a process, if it still runs."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)
 
 
 def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:

@@ -23,6 +23,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from processes import send
 from twin import ROBOT, CtrlC, N, Twin, nothing_left, undisturbed, warnings_raised
 
 EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "20"))
@@ -55,11 +56,11 @@ class DisturbedRunner(RuleBasedStateMachine):
             if kind == "ctrl-c":
                 return CTRL_C.after(random.Random(seed).uniform(0, 0.02))(act)
             if "kill" in kind:
-                os.kill(pid, signal.SIGKILL)
+                send(pid, signal.SIGKILL)
             if "stop" in kind:
-                os.kill(pid, signal.SIGSTOP)
+                send(pid, signal.SIGSTOP)
             if "go" in kind:
-                with later(0.05, lambda: os.kill(pid, signal.SIGCONT)):
+                with later(0.05, lambda: send(pid, signal.SIGCONT)):
                     return run(act)
             return run(act)
 

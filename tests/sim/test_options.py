@@ -110,3 +110,10 @@ def test_no_actuators_are_those_of_the_robot_at_construction_and_when_assigned(c
         runner.restore(ideal)
         assert runner.actuators is None, "as in the snapshot"
         runner.step(PANDA.start)
+
+
+@pytest.mark.parametrize("value", [np.array([]), np.array(["pid", "osc"]), ["pid"], 0])
+@pytest.mark.parametrize("name", ["control", "tool"])
+def test_a_control_or_tool_of_another_type_is_refused_by_name(name, value):
+    with pytest.raises(InvalidArgumentError, match=name):
+        Runner(PANDA, 1, workers=0, **{"control": "osc", name: value})

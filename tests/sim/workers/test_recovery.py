@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from identical import assert_identical
-from processes import children, have_ended
+from processes import children, have_ended, send
 from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
@@ -66,11 +66,6 @@ def later(seconds, act):
     finally:
         timer.cancel()
         timer.join()
-
-
-def send(pid, number):
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, number)
 
 
 def replace_run(act, in_env=None):
