@@ -272,7 +272,7 @@ def advance_measurement(
     if k.play is not None:
         encoder, qvel = stages.play(k, encoder, qpos, qvel)
         qpos = encoder
-    if k.position_delay is not None:
+    if k.position_delay is not None and k.velocity_delay is not None:
         sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
         qpos, qvel = delay.read(sensor, k.position_delay, k.turns, xp), delay.read(sensor, k.velocity_delay, None, xp)
     if key is not None:

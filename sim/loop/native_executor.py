@@ -181,7 +181,7 @@ class TickProgram:
         self.measured = self.reading if gravity else self.reading._replace(passive=None)
         self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
         self._constants = mapped(stacked, constants)
-        self._sensors: dict[tuple[bool, bool], ArrayProgram] = {}
+        self._sensors: tuple[ArrayProgram, list[Float64], list[Float64]] | None = None
         self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
@@ -231,14 +231,16 @@ class TickProgram:
 
         Only :meth:`run` counts the step.
         """
-        side, (qpos, qvel, _) = _sensor_side(self.state.motors), self.reading
-        inputs, k = (side, qpos, qvel, noise), self._constants.motors
-        key = noise[0] is None, noise[1] is None
-        given = leaves(inputs)
-        if key not in self._sensors:
-            traced = _trace_sensors(structure(k), *map(structure, inputs))
-            self._sensors[key] = ArrayProgram(traced, leaves(k), len(given), qpos.shape)
-        self._sensors[key](*given, out=[*leaves(side.encoder), *leaves(self._seen)])
+        drawn = [each for each in noise if each is not None]
+        if self._sensors is None:
+            side, k = _sensor_side(self.state.motors), self._constants.motors
+            inputs = (side, *self.reading[:2])
+            traced = _trace_sensors(*map(structure, (k, *inputs, noise)))
+            fixed, shape = leaves(inputs), self.before.shape
+            program = ArrayProgram(traced, leaves(k), len(fixed) + len(drawn), shape)
+            self._sensors = program, fixed, [*leaves(side.encoder), *leaves(self._seen)]
+        program, fixed, out = self._sensors
+        program(*fixed, *drawn, out=out)
         return self._seen
 
     def take(self, state: StepState, outputs: Outputs) -> None:

@@ -125,7 +125,8 @@ def with_model(
     if motors is not None:
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if gravity:
-        force = lambda qpos, qvel: scene_dynamics(pack.spec).passive_force(qpos, qvel, gravity, coriolis)  # noqa: E731
+        dynamics = cache(lambda: scene_dynamics(pack.spec))  # looked up once: the hash of a spec takes many calls
+        force = lambda qpos, qvel: dynamics().passive_force(qpos, qvel, gravity, coriolis)  # noqa: E731
         model = model._replace(passive_force=force)
     return layout._replace(model=model)
 

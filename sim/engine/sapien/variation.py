@@ -9,6 +9,7 @@ with one exception: a new center of mass moves the frames of the joints by round
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
-from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
@@ -88,8 +89,12 @@ class VariedPack(Pack):
         """Return the friction and damping of the joints."""
         return own_friction(self.spec, self._variation)
 
+    @cached_property
+    def _dynamics(self) -> Dynamics:
+        return scene_dynamics(self.spec)
+
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        return scene_dynamics(self.spec).joint_mass_matrix(qpos, self._added)
+        return self._dynamics.joint_mass_matrix(qpos, self._added)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether compiled steps read the force of the model: not where a mass differs from it."""
@@ -99,5 +104,5 @@ class VariedPack(Pack):
         """Return the passive force of the model at the measured positions."""
         if not self._bodies:
             return super().passive_force(gravity, coriolis, dtype)
-        force = scene_dynamics(self.spec).passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis)
+        force = self._dynamics.passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis)
         return force.astype(dtype)
