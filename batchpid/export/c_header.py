@@ -77,69 +77,57 @@ def to_c(
         Params for several envs, options that exclude each other, names that C does not allow, or a tree with other
         joints.
     """
-    return Exported(header_of(params, dt, joint_names, guard, inputs, prefix, tree).text())
-
-
-def header_of(
-    params: PIDParams,
-    dt: float,
-    joint_names: Sequence[str] | None = None,
-    guard: Guard | None = None,
-    inputs: Sequence[str] | None = None,
-    prefix: str = "batchpid",
-    tree: KinematicTree | None = None,
-) -> Header:
-    """Return the header of :func:`to_c`, whose arguments and errors these are."""
-    instance("params", params, PIDParams, "build them with make_params()")
-    positive("dt", dt, "s")
-    joints = params.num_joints
-    if params.num_envs > 1:
-        remedy = "choose one env: params.for_envs(slice(k, k + 1))"
-        raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
-    labels = (
-        [f"joint {at}" for at in range(joints)] if joint_names is None else names("joint_names", joint_names, joints)
-    )
-    if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-        raise InvalidArgumentError("prefix", "cannot be a name in C", value=prefix, remedy="use letters, digits and _")
-    params.check(1, labels)
-    check_gain_units(params)
-    if guard is not None:
-        check_guard(guard, 1, labels)
-    measures = isinstance(params.measurement_rate, MeasuredRate)
-    if inputs is None:
-        inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)
-    chosen = {choice("inputs", each, RATES) for each in inputs}
-    if measures and "measurement_rate" not in chosen:
-        remedy = "add it, or use params.replace(measurement_rate='difference')"
-        raise InvalidArgumentError("inputs", "lack measurement_rate, which the params use", remedy=remedy)
-    if tree is not None:
-        instance("tree", tree, KinematicTree, "use robot.kinematic_tree()")
-        if list(tree.joint_names) != list(labels):
-            problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
-            raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")
-    return Header(params, float(dt), guard, [each for each in RATES if each in chosen], prefix, labels, tree)
+    return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree).text())
 
 
 class Header:
-    """Text of a header, from the trace of one step."""
+    """Text of a header, from the trace of one step. Parameters and errors are as in :func:`to_c`."""
 
     def __init__(
         self,
         params: PIDParams,
         dt: float,
+        joint_names: Sequence[str] | None,
         guard: Guard | None,
-        inputs: list[str],
+        inputs: Sequence[str] | None,
         prefix: str,
-        labels: list[str],
         tree: KinematicTree | None,
     ) -> None:
-        self.params, self.dt, self.guard, self.inputs, self.labels = params, dt, guard, inputs, labels
-        self.tree, self.names = tree, Dialect(prefix, np.dtype(params.dtype), params.num_joints)
+        instance("params", params, PIDParams, "build them with make_params()")
+        positive("dt", dt, "s")
+        joints = params.num_joints
+        if params.num_envs > 1:
+            remedy = "choose one env: params.for_envs(slice(k, k + 1))"
+            raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
+        unnamed = [f"joint {at}" for at in range(joints)]
+        labels = unnamed if joint_names is None else names("joint_names", joint_names, joints)
+        if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
+            remedy = "use letters, digits and _"
+            raise InvalidArgumentError("prefix", "cannot be a name in C", value=prefix, remedy=remedy)
+        params.check(1, labels)
+        check_gain_units(params)
+        if guard is not None:
+            check_guard(guard, 1, labels)
+        measures = isinstance(params.measurement_rate, MeasuredRate)
+        if inputs is None:
+            inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)
+        chosen = {choice("inputs", each, RATES) for each in inputs}
+        if measures and "measurement_rate" not in chosen:
+            remedy = "add it, or use params.replace(measurement_rate='difference')"
+            raise InvalidArgumentError("inputs", "lack measurement_rate, which the params use", remedy=remedy)
+        if tree is not None:
+            instance("tree", tree, KinematicTree, "use robot.kinematic_tree()")
+            if list(tree.joint_names) != list(labels):
+                problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
+                raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")
+        self.params, self.dt, self.guard, self.tree, self.labels = params, float(dt), guard, tree, labels
+        self.names = Dialect(prefix, np.dtype(params.dtype), joints)
         whole, diagonal = (isinstance(params.gain_units, kind) for kind in (PerMassMatrix, PerInertia))
         self.matrix = "mass_matrix" if whole else "inertia" if diagonal else None
-        self.given = ["setpoint", "measurement", *inputs, *([self.matrix] if self.matrix else [])]
+        rates = [each for each in RATES if each in chosen]
+        self.given = ["setpoint", "measurement", *rates, *([self.matrix] if self.matrix else [])]
         """Inputs of a step, in their order."""
-        nan = np.full((1, params.num_joints), math.nan, params.dtype)
+        nan = np.full((1, joints), math.nan, params.dtype)
         started: dict[str, Any] = pid.init(params, nan).leaves()
         if guard is not None:
             started |= {"guarded_setpoint": nan, "guarded_rate": 0 * np.ones_like(nan)}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from batchpid.checks.validate import file_path
-from batchpid.export.c_header import Header, header_of
+from batchpid.export.c_header import Header
 from batchpid.law.params import PIDParams
 from batchpid.motors.guard import Guard
 from batchpid.task_space.kinematic_tree import KinematicTree
@@ -34,7 +34,7 @@ def to_c_project(
     ``header`` is the name of the header file; other parameters and errors as in :func:`batchpid.export.to_c`.
     """
     path = Path(file_path("header", header, (".h",)))
-    made = header_of(params, dt, joint_names, guard, inputs, prefix, tree)
+    made = Header(params, dt, joint_names, guard, inputs, prefix, tree)
     return {path.name: made.text(), "CMakeLists.txt": _cmake(path.stem), "example.c": _example(made, path.name)}
 
 

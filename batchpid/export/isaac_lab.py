@@ -24,6 +24,8 @@ CLASSES = {
     "dc_motor": "DCMotorCfg",
     "delayed_pd": "DelayedPDActuatorCfg",
 }
+NO_LIMIT = 1e9
+"""No limit, as in Isaac Lab. Without a number it takes the USD file's limit; in a dict, 0 for a joint without a key."""
 
 
 def to_isaac_lab(
@@ -73,7 +75,7 @@ def to_isaac_lab(
         remedy = "give actuators with saturation_effort and no_load_speed, or choose another model"
         raise InvalidArgumentError("model", "needs the motors' torque-speed line", value=model, remedy=remedy)
     fields: dict[str, Any] = {"stiffness": found.value("kp"), "damping": found.value("kd")}
-    fields["effort_limit_sim" if model == "implicit" else "effort_limit"] = found.effort_limit
+    fields["effort_limit_sim" if model == "implicit" else "effort_limit"] = np.minimum(found.effort_limit, NO_LIMIT)
     coulomb = found.motor("coulomb")
     joint_side = {
         "armature": found.motor("armature"),
@@ -85,7 +87,7 @@ def to_isaac_lab(
     whole: dict[str, Any] = {}
     if model == "dc_motor":
         whole["saturation_effort"] = found.motor("saturation_effort", math.inf)
-        fields["velocity_limit"] = found.motor("no_load_speed", math.inf)
+        fields["velocity_limit"] = np.minimum(found.motor("no_load_speed", math.inf), NO_LIMIT)
     if model == "delayed_pd":
         whole |= dict.fromkeys(("min_delay", "max_delay"), found.delay_steps())
     has = {"dc_motor": ("saturation_effort",), "delayed_pd": ("command_delay",)}.get(model, ())
@@ -111,10 +113,11 @@ def _group(found: Drive, joints: list[int], fields: dict[str, Any], whole: dict[
     names = [re.escape(found.joints[at]) for at in joints]
     lines = [f"joint_names_expr={names!r}"]
     for key, values in fields.items():
-        own = {name: float(values[at]) for name, at in zip(names, joints, strict=True) if math.isfinite(values[at])}
-        if own:
-            same = len(own) == len(joints) and len({*own.values()}) == 1
-            lines.append(f"{key}={next(iter(own.values())) if same else own!r}")
+        if key == "velocity_limit" and cls != CLASSES["dc_motor"]:
+            continue  # of the torque-speed line
+        own = {name: float(values[at]) for name, at in zip(names, joints, strict=True)}
+        same = len({*own.values()}) == 1
+        lines.append(f"{key}={next(iter(own.values())) if same else own!r}")
     figures = {key: value if isinstance(value, int) else float(value) for key, value in whole.items()}
     lines += [f"{key}={value!r}" for key, value in figures.items() if math.isfinite(value)]
     return f"{cls}(\n" + "".join(f"        {line},\n" for line in lines) + "    )"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from batchpid.checks.validate import names, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import ImportedMotors
-from batchpid.export.isaac_lab import CLASSES
+from batchpid.export.isaac_lab import CLASSES, NO_LIMIT
 from batchpid.law.params import make_params
 from batchpid.motors.actuators import make_actuators
 
@@ -106,10 +106,16 @@ class _Figures:
         return np.array([self._figure(joint, key) is not None for joint in self.of_joint])
 
     def column(self, key: str, off: float | None = None) -> NDArray[np.float64]:
-        """Return the values (joints,) of an argument, ``off`` where it is missing; without ``off`` it is needed."""
-        column = []
-        for joint in self.of_joint:
+        """Return the values (joints,) of an argument, ``off`` where it is missing; without ``off`` it is needed.
+
+        With an infinite ``off`` it is a limit.
+        """
+        column, limits = [], off == math.inf
+        for joint, (_, arguments) in self.of_joint.items():
             value = self._figure(joint, key)
+            if value is None and limits and isinstance(arguments.get(key), dict):
+                problem, remedy = f"{key} has no key for it, hence 0 in Isaac Lab", f"add one; {NO_LIMIT:g} is no limit"
+                raise InvalidArgumentError("text", problem, joint=joint, remedy=remedy)
             if value is None and off is None:
                 remedy = "write the number: without one, Isaac Lab takes it from the USD file"
                 raise InvalidArgumentError("text", f"gives no {key}", joint=joint, remedy=remedy)
@@ -117,7 +123,7 @@ class _Figures:
                 raise InvalidArgumentError(
                     "text", f"{key} is not a number", joint=joint, value=value, remedy="give one"
                 )
-            column.append(off if value is None else float(value))
+            column.append(off if value is None or (limits and value >= NO_LIMIT) else float(value))
         return np.array(column, np.float64)
 
     def _figure(self, joint: str, key: str) -> Any:
@@ -152,7 +158,7 @@ class _Figures:
         found = []
         classes = {cls for cls, _ in self.of_joint.values()}
         if CLASSES["implicit"] in classes:
-            found.append("law: Isaac Lab's implicit drive acts at the end of a step, which damps more")
+            found.append("law: stiffness and damping act implicitly in Isaac Lab, which damps more")
         if (self.column("min_delay", 0.0) != self.column("max_delay", 0.0)).any():
             found.append("command_delay: drawn from min_delay to max_delay at each reset there; here the middle")
         for key in ("velocity_limit", "velocity_limit_sim"):

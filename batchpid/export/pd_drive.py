@@ -42,7 +42,7 @@ class Drive(Differences):
         two_sided: bool = False,
     ) -> None:
         super().__init__(params, joint_names, dt, inertia, implicit)
-        self._damps_more = implicit and params.discretization is None
+        self._is_implicit = params.discretization is not None
         self.actuators = (
             Actuators()
             if actuators is None
@@ -153,5 +153,7 @@ class Drive(Differences):
             self.append("continuous: errors are not taken the short way round")
         if params.non_finite is not None:
             self.append("non_finite: inputs are not checked")
-        if self._damps_more:
-            self.append("law: stiffness and damping act at the end of a step, implicitly, which damps more")
+        if implicit:
+            here = "here at the end of a step" if self._is_implicit else "which damps more"
+            ends = "at the end of a step under PGS, of each position iteration's share of it under TGS"
+            self.append(f"law: stiffness and damping act implicitly, {ends}, {here}")

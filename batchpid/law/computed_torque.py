@@ -17,6 +17,13 @@ nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the rob
 setpoint, however tight the limits. A joint whose passive force alone exceeds its limit is clipped, and left out of s.
 While s < 1, conditional integration does not integrate further into the direction of a.
 
+A limit of the effort's rate scales the change of the effort as a whole, for the same reason::
+
+    effort = u' + z (u - u'),   z = the largest in [0, 1] with |z (u - u')| <= rate limit * dt in every joint
+
+with the last effort u'. Both efforts are within the limits, and so is each on the line between them. While z < 1,
+conditional integration does not integrate further into the direction of u - effort.
+
 The time step limits the gains per mass matrix, unless the law is implicit (:mod:`batchpid.law.implicit`).
 """
 
@@ -86,11 +93,10 @@ def advance_terms_with_mass_matrix(
 def check_gain_units(params: PIDParams) -> None:
     """Raise InvalidArgumentError for options that have no meaning for accelerations.
 
-    With gain_units "mass_matrix" these are back-calculation, an effort rate limit and a policy for non-finite inputs.
+    With gain_units "mass_matrix" these are back-calculation and a policy for non-finite inputs.
     """
     instead = {
         "tracking_time": "anti_windup 'conditional'",
-        "effort_rate_limit": "no effort rate limit",
         "non_finite": "non_finite 'propagate'",
     }
     for option, remedy in instead.items():
@@ -124,7 +130,7 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
 
 
 def _unlimited(k: Coefficients) -> Coefficients:
-    return k._replace(effort_min=None, effort_max=None)
+    return k._replace(effort_min=None, effort_max=None, effort_step=None)
 
 
 def _to_effort(
@@ -135,15 +141,33 @@ def _to_effort(
     wanted = multiply(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = wanted + passive
+    stops = k.ki_dt is not None and k.conditional is not None
+    change, deeper = new.integral - old.integral if stops else None, None
     if low is not None or high is not None:
         share = _share(wanted, passive, low, high, xp)
         effort = clip(share * wanted + passive, low, high, xp)
-        if k.ki_dt is not None and k.conditional is not None:
-            deeper = (share < 1) & (a * (new.integral - old.integral) > 0)
-            if not isinstance(k.conditional, Everywhere):
-                deeper = deeper & (k.conditional > 0)
-            new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
+        deeper = None if change is None else (share < 1) & (a * change > 0)
+    if k.effort_step is not None:
+        reached = effort
+        effort = clip(_towards(reached, old.effort, k.effort_step, xp), low, high, xp)
+        new = new._replace(effort=effort.copy())
+        late = None if change is None else (reached - effort) * change > 0
+        deeper = late if deeper is None else deeper | late
+    if deeper is not None:
+        if not isinstance(k.conditional, Everywhere):
+            deeper = deeper & (k.conditional > 0)
+        new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
     return new, effort, unsaturated
+
+
+def _towards(effort: Any, last: Any, step: Any, xp: Any) -> Any:
+    """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more than ``step`` for."""
+    change = effort - last
+    size = xp.abs(change)
+    late = size > step
+    part = xp.where(late, step / xp.where(late, size, 1.0), 1.0).min(-1, keepdims=True)
+    # Within the limit in spite of rounding, and exactly the effort where nothing is late.
+    return clip(xp.where(part < 1, last + part * change, effort), last - step, last + step, xp)
 
 
 def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:

@@ -36,6 +36,8 @@ USED = {
     "urdf": (),
 }
 """Flags that have an effect for each target, of those that only some have."""
+COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
+"""Comment of a target's language; of the others "# {}"."""
 UNLIMITED = "guard: setpoints are not limited in the target"
 PROJECT = ("CMakeLists.txt", "example.c")
 """Files of ``--project``, besides the header."""
@@ -124,7 +126,7 @@ class ExportCommand:
             files = to_c_project(chosen.params, self.timestep, header=out.name, **self._c_options(robot))
             for name, path in others.items():
                 write_atomically(path, files[name])
-        write_atomically(out, exported.text)
+        write_atomically(out, _with_differences(exported, COMMENTS.get(self.to, "# {}")))
         for each in differences:
             print(f"differs: {each}")
         print(f"written: {out}: {content}")
@@ -160,6 +162,14 @@ class ExportCommand:
             "prefix": self.prefix,
             "tree": robot.kinematic_tree() if self.dynamics else None,
         }
+
+
+def _with_differences(exported: Exported, comment: str) -> str:
+    """Return the text, with a comment for each difference that it does not hold yet."""
+    sentences = [" ".join(each.split()).replace("--", "- -").replace("*/", "* /") for each in exported.differences]
+    lines = "".join(f"{comment.format(f'differs: {each}')}\n" for each in sentences if each not in exported.text)
+    declaration, end, rest = exported.text.partition("?>\n") if exported.text.startswith("<?xml") else ("", "", "")
+    return f"{declaration}{end}{lines}{rest}" if end else f"{lines}{exported.text}"
 
 
 def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:

@@ -107,10 +107,52 @@ def test_per_inertia_scales_every_gain_and_nothing_else():
         np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
 
 
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 2**31), envs=st.integers(1, 4), joints=st.integers(1, 5), limited=st.booleans())
+def test_a_rate_limit_keeps_the_direction_of_the_change_of_the_effort(seed, envs, joints, limited):
+    rng = np.random.default_rng(seed)
+    matrix, rate = mass(rng, envs, joints), rng.uniform(100, 1e5, joints)
+    own = {"effort_limit": rng.uniform(1, 50, joints)} if limited else {}
+    p = params(joints, effort_rate_limit=rate, **own)
+    y, r, passive = rng.normal(size=(3, envs, joints))
+    k, state = bp.discretise(p, DT), bp.init(p, y)
+    for _ in range(3):
+        free = advance_terms_with_mass_matrix(k._replace(effort_step=None), state, r, y, matrix, feedforward=passive)[1]
+        new, terms = advance_terms_with_mass_matrix(k, state, r, y, matrix, feedforward=passive)
+        wanted, change = free.effort - state.effort, terms.effort - state.effort
+        assert (np.abs(change) <= rate * DT * (1 + 1e-12) + 1e-12).all()
+        assert not limited or (np.abs(terms.effort) <= own["effort_limit"]).all()
+        part = np.where((wanted == 0).all(1), 1.0, (change * wanted).sum(1) / np.maximum((wanted**2).sum(1), 1e-300))
+        np.testing.assert_allclose(change, part[:, None] * wanted, rtol=1e-9, atol=1e-9)
+        late = part < 1 - 1e-9
+        assert (np.isclose(np.abs(change), rate * DT).any(1) == late).all()
+        np.testing.assert_array_equal(new.effort, terms.effort)
+        assert (terms.saturated.any(1) >= late).all()
+        # The integral stops where it would move the effort further from what the rate allows, and nowhere else.
+        if not limited:
+            stopped = (terms.unsaturated - terms.effort) * k.ki_dt * (r - y) > 0
+            np.testing.assert_array_equal(new.integral == state.integral, stopped)
+        state = new
+
+
+def test_with_a_unit_mass_matrix_a_joint_alone_has_the_law_in_efforts():
+    options = {"effort_limit": 40.0, "effort_rate_limit": 900.0, "anti_windup": "conditional"}
+    p = bp.make_params(1, 400.0, 300.0, 40.0, **options)
+    k, q, v = bp.discretise(p, DT), np.zeros((1, 1)), np.zeros((1, 1))
+    here = there = bp.init(p, q)
+    for _ in range(500):
+        here, effort = bp.advance(k, here, np.ones((1, 1)), q)
+        there, whole = advance_with_mass_matrix(k, there, np.ones((1, 1)), q, np.ones((1, 1, 1)))
+        np.testing.assert_allclose(whole, effort, rtol=1e-9, atol=1e-9)
+        v = v + DT * effort
+        q = q + DT * v
+    assert abs(q[0, 0] - 1) < 0.2
+
+
 def test_jax_and_numpy_agree():
     jnp = pytest.importorskip("jax.numpy")
     rng = np.random.default_rng(0)
-    p = params(3, effort_limit=4.0)
+    p = params(3, effort_limit=4.0, effort_rate_limit=900.0)
     p = p._replace(**{n: v.astype(np.float32) for n, v in p._asdict().items() if isinstance(v, np.ndarray)})
     y, r = rng.normal(size=(2, 2, 3)).astype(np.float32)
     matrix = mass(rng, 2, 3).astype(np.float32)
@@ -124,7 +166,6 @@ def test_jax_and_numpy_agree():
 def test_options_without_meaning_for_accelerations_are_refused():
     for options in (
         {"anti_windup": "back_calculation", "effort_limit": 1.0},
-        {"effort_rate_limit": 3.0},
         {"non_finite": "hold"},
     ):
         with pytest.raises(InvalidArgumentError, match="mass_matrix"):

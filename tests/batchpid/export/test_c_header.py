@@ -147,7 +147,7 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     options["continuous"] = draw(st.lists(st.booleans(), min_size=joints, max_size=joints))
     units = draw(st.sampled_from(["effort", "effort", "inertia", "mass_matrix"]))
     if units == "mass_matrix":  # its law lacks these
-        for name in ("effort_rate_limit", "non_finite", "tracking_time"):
+        for name in ("non_finite", "tracking_time"):
             options.pop(name, None)
         if options.get("anti_windup") == "back_calculation":
             options["anti_windup"] = "conditional"
@@ -212,16 +212,24 @@ def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_pat
     params = bp.make_params(2, **{**SINGLE["pid"], "kp": 1.0, "ki": 1.0, "kd": 0.1})
     tree = planar((1.0, 1.0))
     (tmp_path / "law.h").write_text(to_c(params, DT, joint_names=tree.joint_names, tree=tree).text)
+    guard = bp.make_guard(3, lower=-1.5, upper=1.5, rate=3.0, acceleration=20.0)
+    whole = {"effort_limit": 3.0, "effort_rate_limit": 9.0, "anti_windup": "conditional", "gain_units": "mass_matrix"}
+    every = to_c(bp.make_params(3, **SINGLE["everything"]), DT, guard=guard, prefix="every")
+    matrix = to_c(bp.make_params(3, 4.0, 2.0, 0.1, **whole), DT, prefix="matrix")
+    (tmp_path / "every.h").write_text(every.text + matrix.text)
     (tmp_path / "law.cpp").write_text(
-        '#include "law.h"\n'
+        '#include "law.h"\n#include "every.h"\n'
+        "void each(double *x, every_state *a, matrix_state *b) {\n"
+        "  every_init(a, x); every_reset(a, x); every_step(a, x, x, x, x);\n"
+        "  matrix_init(b, x); matrix_reset(b, x); matrix_step(b, x, x, x, x, x); }\n"
         "void use(double *x) {\n"
         "  batchpid_controller arm(x); arm.step(x, x, x, x); arm.reset(x);\n"
         "  batchpid_mass_matrix(x, x + 2); batchpid_bias(x, x, x); }\n"
     )
     subprocess.run(["g++", *STRICT, "-O2", "-c", "law.cpp"], cwd=tmp_path, check=True)
     listed = subprocess.run(["nm", "law.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    # Nothing undefined but trigonometry (malloc would be), and no data that can change.
-    assert not re.search(r" U (?!sincos|sin|cos|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), listed
+    # Nothing undefined but mathematics (malloc would be), and no data that can change.
+    assert not re.search(r" U (?!sincos|sin|cos|sqrt|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), listed
 
 
 TABLE = """#include <stdio.h>

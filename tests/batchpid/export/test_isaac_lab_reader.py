@@ -117,6 +117,7 @@ def test_a_round_trip_loses_only_what_is_listed(params, model, seed):
         ('["wr.*"]', '[".*"]', "several actuators"),
         ('["wr.*"]', '["("]', "regular expression"),
         ('".*bow"', '".*"', "several keys of stiffness"),
+        ("effort_limit=40.0", "effort_limit={'shoulder': 40.0}", "effort_limit has no key"),
         ("DelayedPDActuatorCfg", "ActuatorNetLSTMCfg", "ActuatorNetLSTMCfg"),
         ("joint_names_expr", "joints", "holds no actuators"),
         ("ROBOT = ", "ROBOT = = ", "is not Python"),

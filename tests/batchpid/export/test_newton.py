@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from export_cases import DT, JOINTS, random_params, values
+from export_cases import DT, JOINTS, motion, random_params, run, values
 from hypothesis import given, settings
 
 import batchpid as bp
@@ -79,24 +79,6 @@ def target_run(text, columns):
             effort = actuator.kp * (r - q) + getattr(actuator, "ki", 0.0) * integral + actuator.kd * (v_d - v) + ff
             efforts[at, j] = clamped(actuator.clamping, effort, q, v)
     return efforts
-
-
-def motion(steps=200):
-    """Return setpoint, measurement, their rates and a feedforward (steps, joints)."""
-    t = np.arange(steps)[:, None] * DT
-    w, far = np.array([3.0, 7.0, 11.0]), np.array([1.0, 0.5, 2.0])
-    setpoint, measurement = far * np.sin(w * t) + 0.3, 0.7 * far * np.sin(0.8 * w * t)
-    rates = far * w * np.cos(w * t), 0.56 * far * w * np.cos(0.8 * w * t)
-    return setpoint, measurement, *rates, 0.5 * np.sin(2 * t) * far
-
-
-def run(params, columns):
-    state, efforts = bp.init(params, columns[1][:1]), []
-    for r, q, v_d, v, ff in zip(*(column[:, None] for column in columns), strict=True):
-        rates = {"setpoint_rate": v_d, "measurement_rate": v, "feedforward": ff}
-        state, effort = bp.step(params, state, r, q, DT, **rates)
-        efforts.append(effort[0])
-    return np.array(efforts)
 
 
 GAINS = {"kp": [40.0, 20.0, 1 / 3], "ki": [50.0, 0.0, 2.0], "kd": [2.0, 0.3, 0.02]}
@@ -185,6 +167,16 @@ def test_nothing_is_lost_that_is_not_listed(params):
         assert [x for x, on in zip(limits, integrates, strict=True) if on] == pytest.approx(
             [x for x, on in zip(wanted, integrates, strict=True) if on], rel=tolerance
         )
+
+
+@given(random_params())
+@settings(max_examples=40)
+def test_params_without_a_listed_difference_have_the_targets_efforts(params):
+    params = params.replace(gain_units="effort", dtype=np.float64)
+    text, differences = to_newton(params, JOINTS, DT)
+    if not differences:
+        ours = run(params, motion())
+        np.testing.assert_allclose(target_run(text, motion()), ours, atol=1e-9 * max(1.0, np.abs(ours).max()))
 
 
 def test_bad_requests_are_refused():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 import re
 
 import numpy as np
 import pytest
-from export_cases import DT, JOINTS, random_params, values
+from export_cases import DT, JOINTS, motion, random_params, run, values
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,59 +32,93 @@ def configurations(text):
 
 
 def figure(text, key, joint, default=None):
-    """Return the figure of a joint, as Isaac Lab finds it by the regular expressions."""
+    """Return the figure of a joint, as Isaac Lab finds it: by regular expressions, 0 for one that a dict lacks."""
     for _, arguments in configurations(text):
         if any(re.fullmatch(each, joint) for each in arguments["joint_names_expr"]):
             found = arguments.get(key, default)
             if isinstance(found, dict):
-                return next((value for name, value in found.items() if re.fullmatch(name, joint)), default)
+                return next((value for name, value in found.items() if re.fullmatch(name, joint)), 0.0)
             return found
     raise AssertionError(joint)
 
 
-def test_an_ideal_pd_is_the_law():
-    """u = clip(kp e + kd (v_d - v) + feedforward), isaaclab/actuators/actuator_pd.py, without differences."""
-    params = bp.make_params(3, [40.0, 20.0, 1 / 3], None, [2.0, 0.3, 0.1], effort_limit=[30.0, 4.0, 1.0], **PD)
+def isaac_lab_run(text, columns):
+    """Return the efforts (steps, joints) of Isaac Lab 2's explicit actuators, after isaaclab/actuators/actuator_pd.py.
+
+    A DelayedPDActuator takes setpoint, its rate and feedforward of ``max_delay`` steps ago, at first the oldest. A
+    DCMotor clips at the line S (+-1 - v / v0), the speed at v0 (1 + L / S), and at the effort limit L.
+    """
+    efforts = np.zeros_like(columns[0])
+    for j, joint in enumerate(JOINTS):
+        keys = ("stiffness", "damping", "effort_limit", "velocity_limit", "saturation_effort")
+        k, c, most, speed, stall = (figure(text, key, joint) for key in keys)
+        late = np.maximum(np.arange(len(efforts)) - figure(text, "max_delay", joint, 0), 0)
+        for at, (q, v) in enumerate(zip(columns[1][:, j], columns[3][:, j], strict=True)):
+            r, v_d, ff = (columns[each][late[at], j] for each in (0, 2, 4))
+            low, high = -most, most
+            if stall is not None:
+                end = speed * (1 + most / stall)
+                line = np.clip(v, -end, end) / speed
+                low, high = max(stall * (-1 - line), -most), min(stall * (1 - line), most)
+            efforts[at, j] = min(max(k * (r - q) + c * (v_d - v) + ff, low), high)
+    return efforts
+
+
+GAINS = {"kp": [40.0, 20.0, 1 / 3], "kd": [2.0, 0.3, 0.1]}
+
+
+@pytest.mark.parametrize("limit", [[30.0, 4.0, 1.0], [30.0, math.inf, 1.0], math.inf])
+def test_an_ideal_pd_is_the_law(limit):
+    params = bp.make_params(3, **GAINS, effort_limit=limit, **PD)
     text, differences = to_isaac_lab(params, JOINTS, DT, model="ideal_pd")
     assert differences == ()
-    rng = np.random.default_rng(0)
-    r, y, v, v_d, ff = rng.normal(size=(5, 1, 3))
-    _, effort = bp.step(params, bp.init(params, y), r, y, DT, measurement_rate=v, setpoint_rate=v_d, feedforward=ff)
-    p, d, limit = ([figure(text, key, joint) for joint in JOINTS] for key in ("stiffness", "damping", "effort_limit"))
-    expected = np.clip(p * (r - y) + d * (v_d - v) + ff, np.negative(limit), limit)
-    np.testing.assert_allclose(effort, expected, rtol=1e-12)
+    np.testing.assert_allclose(isaac_lab_run(text, motion()), run(params, motion()), rtol=1e-12, atol=1e-12)
 
 
 def test_a_delayed_pd_is_the_law_with_a_late_setpoint():
-    """Isaac Lab's DelayedPDActuator (isaaclab/actuators/actuator_pd.py): setpoint, its rate and feedforward from the
-    step ``delay`` ago, at first the oldest, then the PD of the present state; stepped beside the law."""
-    motors = make_actuators(3, command_delay=[0.008, 0.0, 0.012])
-    params = bp.make_params(3, [40.0, 20.0, 1 / 3], None, [2.0, 0.3, 0.1], effort_limit=[30.0, 4.0, 1.0], **PD)
-    text = to_isaac_lab(params, JOINTS, DT, actuators=motors).text
-    p, d, limit, steps = (
-        np.array([figure(text, key, joint) for joint in JOINTS])
-        for key in ("stiffness", "damping", "effort_limit", "max_delay")
-    )
-    rng, history, state = np.random.default_rng(0), [], bp.init(params, np.zeros((1, 3)))
-    for at in range(40):
-        history.append(rng.normal(size=(3, 3)))
-        r, v_d, ff = np.stack([history[max(at - each, 0)][:, j] for j, each in enumerate(steps)], axis=1)
-        q, v = rng.normal(size=(2, 3))
-        effort = np.clip(p * (r - q) + d * (v_d - v) + ff, -limit, limit)
-        rates = {"measurement_rate": v[None], "setpoint_rate": v_d[None], "feedforward": ff[None]}
-        state, ours = bp.step(params, state, r[None], q[None], DT, **rates)
-        np.testing.assert_allclose(ours[0], effort, rtol=1e-12)
+    motors, steps = make_actuators(3, command_delay=[0.008, 0.0, 0.012]), (2, 0, 3)
+    params = bp.make_params(3, **GAINS, effort_limit=[30.0, 4.0, math.inf], **PD)
+    text, differences = to_isaac_lab(params, JOINTS, DT, actuators=motors)
+    assert [each.partition(":")[0] for each in differences] == ["command_delay"]
+    late = [column.copy() for column in motion()]
+    for at, (j, delay) in itertools.product((0, 2, 4), enumerate(steps)):
+        late[at][delay:, j], late[at][:delay, j] = late[at][: len(late[at]) - delay, j].copy(), late[at][0, j]
+    np.testing.assert_allclose(isaac_lab_run(text, motion()), run(params, late), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [math.inf, [30.0, 5.0, 20.0]])
+def test_a_dc_motor_is_the_law_within_the_motors_envelope(limit):
+    """The third joint's motor is ideal, the second's has an infinite speed."""
+    line = {"saturation_effort": [60.0, 9.0, math.inf], "no_load_speed": [8.0, math.inf, 1.0], "effort_limit": limit}
+    params, motors = bp.make_params(3, 400.0, None, 2.0, **PD), make_actuators(3, **line)
+    text, differences = to_isaac_lab(params, JOINTS, DT, actuators=motors)
+    assert differences == ()
+    columns = motion()
+    low, high = envelope.limits(envelope.envelope(motors), columns[1], columns[3])
+    expected = np.clip(run(params, columns), low, high)
+    np.testing.assert_allclose(isaac_lab_run(text, columns), expected, rtol=1e-7, atol=1e-9)
+    assert (np.isclose(expected, low) | np.isclose(expected, high)).sum() > 100
+
+
+@given(random_params())
+@settings(max_examples=40)
+def test_params_without_a_listed_difference_have_the_targets_efforts(params):
+    params = params.replace(gain_units="effort", dtype=np.float64)
+    text, differences = to_isaac_lab(params, JOINTS, DT, model="ideal_pd")
+    if not differences:
+        ours = run(params, motion())
+        np.testing.assert_allclose(isaac_lab_run(text, motion()), ours, atol=1e-9 * max(1.0, np.abs(ours).max()))
 
 
 @pytest.mark.parametrize("target", ["implicit", "maniskill"])
 def test_an_implicit_drive_is_the_implicit_law(target):
-    """PhysX's drive acts at the end of the step: m (v+ - v) / dt = k (r - q+) - c v+, q+ = q + dt v+."""
+    """PhysX's drive under PGS acts at the end of the step: m (v+ - v) / dt = k (r - q+) - c v+, q+ = q + dt v+."""
     options = {"gain_units": "mass_matrix", "discretization": "implicit"}
     params = bp.make_params(3, [900.0, 400.0, 50.0], None, [60.0, 20.0, 30.0], **options, **PD)
     m = np.array([2.0, 1.0, 0.05])
     to = {"implicit": to_isaac_lab, "maniskill": to_maniskill}[target]
     text, differences = to(params, JOINTS, DT, inertia=m)
-    assert [each.partition(":")[0] for each in differences] == ["gain_units"]
+    assert [each.partition(":")[0] for each in differences] == ["gain_units", "law"]
     ((_, arguments),) = configurations(text)
     k, c = (
         np.array(list(figures.values()) if isinstance(figures := arguments[key], dict) else figures)
@@ -113,23 +148,11 @@ def test_motors_are_grouped_by_what_a_configuration_has_once():
     assert (one["joint_names_expr"], other["joint_names_expr"]) == (["shoulder", "wrist"], ["elbow"])
     assert one["velocity_limit"] == {"shoulder": 8.0, "wrist": 9.0}
     assert (one["armature"], one["friction"], one["dynamic_friction"]) == (0.01, 0.2, 0.2)
-    assert "effort_limit" not in one
+    assert one["effort_limit"] == 1e9
     partly = motors.replace(saturation_effort=[60.0, np.inf, 60.0])
     text = to_isaac_lab(bp.make_params(3, 1.0, **PD), JOINTS, DT, actuators=partly).text
     assert [cls for cls, _ in configurations(text)] == ["DCMotorCfg", "IdealPDActuatorCfg"]
     assert "import DCMotorCfg, IdealPDActuatorCfg" in text
-
-
-def test_the_envelope_of_a_dc_motor_is_that_of_the_actuators():
-    """DCMotor clips the speed at v0 (1 + L / S) and the line at the continuous effort."""
-    motors = make_actuators(1, saturation_effort=60.0, no_load_speed=8.0, effort_limit=30.0)
-    text = to_isaac_lab(bp.make_params(1, 1.0, **PD), ["a"], DT, actuators=motors).text
-    stall, speed, limit = (figure(text, key, "a") for key in ("saturation_effort", "velocity_limit", "effort_limit"))
-    v = np.linspace(-20, 20, 81)[:, None]
-    at = np.clip(v, -speed * (1 + limit / stall), speed * (1 + limit / stall))
-    low, high = envelope.limits(envelope.envelope(motors), np.zeros_like(v), v)
-    np.testing.assert_allclose(high, np.minimum(stall * (1 - at / speed), limit))
-    np.testing.assert_allclose(low, np.maximum(stall * (-1 - at / speed), -limit))
 
 
 def test_delays_are_whole_steps_of_the_setpoint():
@@ -182,7 +205,7 @@ def test_nothing_is_lost_that_is_not_listed(params, target):
         limit = [math.inf if each == 1e10 else each for each in limit]
     else:
         p, d = ([figure(text, name, joint) for joint in JOINTS] for name in ("stiffness", "damping"))
-        limit = [figure(text, key, joint, math.inf) for joint in JOINTS]
+        limit = [math.inf if (x := figure(text, key, joint)) == 1e9 else x for joint in JOINTS]
     scale = 1.0 if params.gain_units is None else inertia
     tolerance = 1e-12 if params.dtype == np.float64 else 1e-6
     np.testing.assert_allclose(p, np.array(values(params, "kp")) * scale, rtol=tolerance)

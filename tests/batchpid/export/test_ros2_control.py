@@ -131,7 +131,7 @@ SCHEMA = {
     },
 }
 """Types, or values, of the parameters that the files use, after those that generate_parameter_library declares in
-ros2_controllers 5. Its lists are not empty and without repetition, its doubles refuse integers."""
+ros2_controllers 6.9. Its lists are not empty and without repetition, its doubles refuse integers."""
 
 
 def fits(value, kind):
@@ -148,6 +148,7 @@ def check_schema(text, controller):
     schema = SCHEMA[controller]
     assert body.keys() == schema.keys()
     assert set(body["gains"]) == set(body.get("joints", body.get("dof_names")))
+    assert len(body.get("reference_and_state_interfaces", ())) < 3
     for key in body.keys() - {"gains"}:
         assert fits(body[key], schema[key]), (key, body[key])
     for gains in body["gains"].values():

@@ -45,6 +45,7 @@ def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
     status, said, _ = batchpid("export", path, "--out", tmp_path / "arm.h")
     assert status == 0
     assert said.startswith("differs: b: followers are joints of their own")
+    assert (tmp_path / "arm.h").read_text().startswith("/* differs: b: followers are joints of their own")
     status, _, complaint = batchpid("export", path, "--out", tmp_path / "strict.h", "--strict")
     assert status == 2
     assert "followers" in complaint
@@ -64,6 +65,7 @@ def test_controllers_of_ros2_control_are_written_and_read(batchpid, tmp_path):
     assert (status, said.splitlines()[-1]) == (0, f"written: {out}: tuned gains of 9 joints at 1000 Hz")
     listed = {line.split(":")[1].strip() for line in said.splitlines()[:-1]}
     assert {"gain_units", "guard", "effort_limit"} <= listed
+    assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[:-1])
     panda = Robot.load("panda")
     with pytest.warns(UserWarning, match="effort_limit"):
         params = gain_set(panda, str(out)).params
@@ -106,6 +108,7 @@ def test_a_repaired_urdf_is_written_with_its_changes(batchpid, tmp_path):
     status, said, _ = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "again.urdf")
     assert status == 0
     assert said.startswith("differs: joint 'a' (3, 1): limits are swapped; swap them\nwritten: ")
+    assert "<!-- differs: joint 'a' (3, 1): limits are swapped; swap them -->" in (tmp_path / "again.urdf").read_text()
     assert Robot.load(tmp_path / "again.urdf", strict=True).joints == Robot.load(path).joints
     status, _, complaint = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "b.urdf", "--strict")
     assert (status, "swapped" in complaint) == (2, True)
@@ -138,6 +141,7 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     words = ("--gains", "designed", "--timestep", 0.0005, "--limits", "--out", out)
     status, said, _ = batchpid("export", "panda", "--to", "mjcf", *words)
     assert (status, "differs: guard" in said) == (0, True)
+    assert "<!-- differs: guard" in out.read_text()
     model = mujoco.MjModel.from_xml_path(str(out))
     assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
     status, said, _ = batchpid("export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out)

@@ -18,6 +18,7 @@ from batchpid.sim.identification.excitation import excite
 from batchpid.sim.identification.fit import Step, fit
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import Progress, search
+from batchpid.sim.identification.log_noise import split
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log, read_logs
 from batchpid.sim.identification.plant import Motors, Plant, Segment
@@ -68,7 +69,10 @@ def runs(arm, mujoco_log):
 
 
 def error_of_the_export(found, log: Log, params: bp.PIDParams, dt: float) -> float:
-    """Return the error on the held-out rows of the identified motors as MJCF, in MuJoCo under the law [rad]."""
+    """Return the error on the held-out rows of the identified motors as MJCF, in MuJoCo under the law [rad].
+
+    The law is given the noise of the log, as in the fit, since it shakes the robot.
+    """
     import mujoco
 
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
@@ -80,12 +84,14 @@ def error_of_the_export(found, log: Log, params: bp.PIDParams, dt: float) -> flo
     time = np.arange(round(log.time[-1] / dt) + 1) * dt
     wanted = np.zeros((len(time), robot.dof))  # the other joints are locked at 0 in the log
     wanted[:, moving] = log.commands_at(time)
+    noise = np.zeros_like(wanted)
+    noise[:, moving] = split(log.time, log.qpos, time)[1].values
     data.qpos[order] = wanted[0]
     moved = []
-    for setpoint in wanted:
+    for setpoint, error in zip(wanted, noise, strict=True):
         mujoco.mj_forward(model, data)
         moved.append(data.qpos[order][moving])
-        data.ctrl[:] = pid(setpoint[None], data.qpos[order][None])[0]
+        data.ctrl[:] = pid(setpoint[None], (data.qpos[order] + error)[None])[0]
         data.qfrc_applied[:] = data.qfrc_bias
         mujoco.mj_step(model, data)
     held_out = np.concatenate([fit.time[~fit.fitted] for fit in found.fits])
@@ -407,11 +413,10 @@ def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
             errors[unknown] = max(errors[unknown], abs(interval[0] / wanted - 1))
     before, after = found.held_out_error
     if name == "panda" and kind == "setpoint":
-        # Without the sensor noise, which shakes the robot in the log differently than in a second run.
-        quiet = mujoco_log["simulate"](
-            robot, truth._replace(noise=0.0), excite(robot, 10.0), params, moving=7, every=every
-        )
-        exported = error_of_the_export(found, replace(log, qpos=quiet["qpos"]), params, 1 / 2000)
+        # With every step logged, since the noise between the rows shakes the robot too.
+        whole = mujoco_log["simulate"](robot, truth, excite(robot, 10.0), params, moving=7, every=1, seed=seed)
+        steps = replace(log, time=whole["time"], qpos=whole["qpos"])
+        exported = error_of_the_export(found, steps, params, 1 / 2000)
         print(f"exported to MJCF, held out: {exported:.3g} rad; the fit's own: {after:.3g} rad")
         assert exported < 2 * after
     print(
