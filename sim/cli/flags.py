@@ -46,7 +46,8 @@ Gains = Annotated[
     _flag(
         "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
         "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml), Isaac Lab (.py) or MuJoCo "
-        "(.xml). Default: tuned where the robot has them, else designed.",
+        "(.xml). Default: tuned where the robot has them, else designed. With --control osc: a file of `batchpid tune "
+        "--control osc`.",
         metavar="NAME|FILE",
     ),
 ]

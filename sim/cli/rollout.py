@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from batchpid.checks.validate import array, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Recorder, Robot, write_recording
+from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.tool_space.osc_controller import default_tool
+from batchpid.sim.tool_space.tool_goals import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.task_space import load_osc_options
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class RolloutCommand:
     """With --control osc: link to move. Default: the last one of the longest chain."""
     setpoint: flags.OptionalFloats = None
     """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
-    target, else the start pose, or the tool's pose there."""
+    target, else the start pose; with --control osc a pose near that, which all robots reach within joint limits."""
     seconds: flags.Seconds = 2.0
     timestep: float = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -42,7 +46,8 @@ class RolloutCommand:
     seed: int = 0
     """Seed of the start poses."""
     spread: float = 0.3
-    """Largest distance of a start pose from the robot's own [rad or m]; env 0 starts at that itself."""
+    """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target [rad or
+    m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
     engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
@@ -76,16 +81,20 @@ class RolloutCommand:
         )
         robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
-        start = start_poses(robot, self.num_envs, self.spread, self.seed)
         target = robot.start if robot.settings is None else robot.settings.target
-        goal: Any = target if self.setpoint is None else self.setpoint
+        params: Any = None
         if osc := self.control == "osc":
-            if self.gains is not None:
-                problem = "are those of joints, and --control osc has its own"
-                raise InvalidArgumentError("gains", problem, value=self.gains, remedy="leave them out")
-            params: Any = None
-            control: Any = "osc"
+            options = {} if self.gains is None else load_osc_options(self._osc_file(self.gains))
+            control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target, **options)
+            start = start_poses(robot, self.num_envs, self.spread, self.seed, target)
+            if self.setpoint is None:
+                near = start_poses(robot, 8, self.spread, self.seed + 1, target)
+                setpoint = default_goal(robot, control, start, near[1:])
+            else:
+                setpoint = array("setpoint", self.setpoint, (1, 7), control.command.names, kind="entry")[0]
         else:
+            start = start_poses(robot, self.num_envs, self.spread, self.seed)
+            goal: Any = target if self.setpoint is None else self.setpoint
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
@@ -99,10 +108,7 @@ class RolloutCommand:
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
-                if osc:
-                    rollout, report = hold_pose(runner, start, target, self.setpoint, seconds)
-                else:
-                    rollout, report = hold_setpoint(runner, start, setpoint, seconds)
+                rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
         if out is not None and not streamed:
             write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)
@@ -111,3 +117,11 @@ class RolloutCommand:
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")
+
+    def _osc_file(self, name: str) -> Path:
+        """Return the path of the gains for ``--control osc``."""
+        if not (path := Path(name)).is_file():
+            problem = "is not a file, and --control osc has no gains by name"
+            remedy = "give a file of batchpid tune --control osc, or leave it out"
+            raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
+        return path

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.checks.validate import array, integer, number
+from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.progress import bar
@@ -25,18 +25,21 @@ from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import at_the_joints, load_randomization, reseeded, usual_variation
 
 
-def start_poses(robot: Robot, num_envs: int, spread: float, seed: int) -> NDArray[np.float64]:
-    """Return poses (envs, dof) [rad or m] around the robot's start pose, inside its limits; env 0 is that pose itself.
+def start_poses(
+    robot: Robot, num_envs: int, spread: float, seed: int, center: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose itself.
 
-    Uniform within ``spread`` [rad or m], and within a quarter of the joint's range where that is less. Row k is the
-    same for any ``num_envs``.
+    The center is by default the robot's start pose. Uniform within ``spread`` [rad or m], and within a quarter of the
+    joint's range where that is less. Row k is the same for any ``num_envs``.
     """
     num_envs = integer("num_envs", num_envs, 1, 1_000_000)
     spread = number("spread", spread, 0.0, 10.0, "rad or m")
     random = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
-    poses = robot.start + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
-    poses[0] = robot.start
+    center = robot.start if center is None else center
+    poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
+    poses[0] = center
     return robot.coupled(np.clip(poses, robot.lower, robot.upper))
 
 
@@ -48,14 +51,9 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
     return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
 
 
-def hold_pose(
-    runner: Runner, start: NDArray[Any], target: NDArray[Any], given: Any, seconds: float
-) -> tuple[Rollout, str]:
-    """Hold the pose ``given`` (7,), or None for that at ``target`` (dof,), from ``start`` (envs, dof)."""
-    began, names = time.perf_counter(), runner.command.names
-    assert runner.options.tool_pose is not None
-    goal = runner.options.tool_pose(target) if given is None else given
-    goal = array("setpoint", goal, (1, len(names)), names, kind="entry")[0]
+def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: float) -> tuple[Rollout, str]:
+    """Hold the pose ``goal`` (7,) of a tool from ``start`` (envs, dof) for ``seconds``; return rollout and report."""
+    began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     rollout = runner.rollout(np.tile(goal, (ticks, 1)), progress=bar("simulating", unit="tick"))

@@ -10,12 +10,17 @@ from typing import Annotated, Literal
 import tyro
 
 from batchpid import save_params
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs, beside
 from batchpid.sim.cli.progress import bar
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.weights import Weights
+from batchpid.task_space import save_osc_options
+
+SUFFIXES = ".yaml", ".yml", ".json"
+"""Formats of a params file."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,10 @@ class TuneCommand:
     """
 
     robot: flags.RobotName = "panda"
+    control: Literal["pid", "osc"] = "pid"
+    """Gains of the joints, or of operational-space control of a tool: bandwidths and damping ratios."""
+    tool: Annotated[str | None, tyro.conf.arg(metavar="LINK", help_behavior_hint="")] = None
+    """With --control osc: link to move. Default: the last one of the longest chain."""
     generations: int = 10
     """Number of populations that the search evaluates."""
     population: int = 8
@@ -74,7 +83,11 @@ class TuneCommand:
         read = [Path(path) for path in (self.actuators, self.randomize) if path is not None]
         outputs = Outputs(force=self.force, inputs=read)
         named = self.out or Path("out") / robot.path.name
-        out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json"))
+        if self.control == "osc":
+            return self._tune_tool(robot, named, outputs)
+        if self.tool is not None:
+            raise InvalidArgumentError("tool", "is for --control osc", value=self.tool, remedy="leave it out")
+        out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), SUFFIXES)
         picture = outputs.path("picture", self.picture or beside(named, "tune"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -124,9 +137,39 @@ class TuneCommand:
             print(f"SHORT of the usual demands: {text}")
         print(f"next: {self._next_command(out)}")
 
+    def _tune_tool(self, robot: Robot, named: Path, outputs: Outputs) -> None:
+        """Tune operational-space control: print a table and write the options."""
+        from batchpid.sim.cli.report import gains_table
+        from batchpid.sim.tuning.tool_search import tune_tool
+
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in ("gain_units", "per_joint", "randomize", "variation", "cluster", "actuators", "picture"):
+            if (value := getattr(self, name)) != defaults[name]:
+                problem = "is not available with --control osc"
+                raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+        out = outputs.path("out", self.out or named.with_suffix(".osc.yaml"), SUFFIXES)
+        history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        found = tune_tool(
+            robot,
+            self.tool,
+            seconds=self.search_seconds,
+            history=history,
+            progress=bar("tuning", unit="generation"),
+            **flags.chosen(self, "seed generations population weights time_limit workers engine physics collisions"),
+        )
+        tool, (before, after) = found.settings["tool"], found.costs
+        print(f"{robot.name}, {tool}: cost {before:.4f} by default, {after:.4f} as tuned\n")
+        print(gains_table(("default", "tuned"), found.metrics))
+        save_osc_options(out, found.options, found.settings)
+        history.unlink(missing_ok=True)
+        print(f"\nwritten: {out}\nnext: {self._next_command(out)}")
+
     def _next_command(self, params: Path) -> str:
         """Return the command that runs the robot under the gains in the file ``params``, with the same options."""
         words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
+        if self.control == "osc":
+            words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
         defaults = {each.name: each.default for each in fields(self)}
         for name in ("randomize", "engine", "physics", "collisions", "cluster", "actuators", "missing_meshes"):
             value, flag = getattr(self, name), name.replace("_", "-")

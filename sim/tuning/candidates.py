@@ -24,6 +24,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.gains.stability import stability_bound
+from batchpid.metrics import StepMetrics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -49,6 +50,22 @@ PENALTY_RATIO = 0.8
 """Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
 DIVERGED_COST = 1e3
 """Cost of a candidate that diverges; up to twice as much if it diverges early."""
+
+
+def bounded(figure: Float64) -> Float64:
+    """Return a figure of merit, at most 1e6."""
+    return np.minimum(figure, 1e6)
+
+
+def response_cost(w: Weights, m: StepMetrics, size: Float64, band: Float64) -> Float64:
+    """Return the terms of the cost for the response, of each move and joint; figures and ``settling_time`` bounded."""
+    cost: Float64 = (
+        w.itae * np.log1p(m.itae / size)
+        + w.settling * m.settling_time
+        + w.overshoot * np.log1p(m.peak_deviation / size / 0.05)
+        + w.final * np.log1p(m.steady_state_error / band)
+    )
+    return cost
 
 
 class Candidates:
@@ -129,17 +146,12 @@ class Candidates:
         rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each)
         w = self.weights
 
-        def bounded(figure: Float64) -> Float64:
-            return np.minimum(figure.reshape(count, *moves.start.shape), 1e6)
-
-        settling = np.minimum(bounded(m.settling_time), 1.5 * self.seconds)
+        m = StepMetrics(*(bounded(figure).reshape(count, *moves.start.shape) for figure in m))
+        settling = np.minimum(m.settling_time, 1.5 * self.seconds)
         cost = (
-            w.itae * np.log1p(bounded(m.itae) / self._size)
-            + w.settling * settling
-            + w.overshoot * np.log1p(bounded(m.peak_deviation) / self._size / 0.05)
-            + w.final * np.log1p(bounded(m.steady_state_error) / self._band)
-            + w.chatter * np.log1p(np.maximum(bounded(m.effort_variation) / self._smooth - 1, 0))
-            + w.saturation * bounded(m.saturation_share)
+            response_cost(w, m._replace(settling_time=settling), self._size, self._band)
+            + w.chatter * np.log1p(np.maximum(m.effort_variation / self._smooth - 1, 0))
+            + w.saturation * m.saturation_share
         )[..., self.robot.independent].mean(2)
         late = np.maximum(settling[..., arm_joints(self.robot)].max(2) / self._limit - 1, 0)
         lasted = rollout.ok.mean(0).reshape(count, -1)

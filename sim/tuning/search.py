@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -139,14 +139,7 @@ def tune(
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
-    try:
-        from cmaes import CMA
-    except ImportError:
-        raise MissingDependencyError("cmaes", "tuning", "tune") from None
-    seed = integer("seed", seed, 0, 2**31 - 1)
-    generations = integer("generations", generations, 1, 100_000)
-    population = integer("population", population, 4, 1000)
-    seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
+    seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     is_varied = randomization is not None or robot.actuators is not None
@@ -175,15 +168,10 @@ def tune(
         "versions": package_versions(("batchpid", runner_options.get("engine", "sapien"), "numpy", "cmaes")),
     }
     record = HistoryFile(history, "search", settings)
-    known = _known_costs(record, population)
     search = Candidates(
         robot, gain_units, per_joint, moves, seconds, weights, headroom=1.0 if is_varied else HEADROOM, varied=is_varied
     )
 
-    def optimizer_at(mean: Float64) -> CMA:
-        return CMA(mean=mean, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
-
-    optimizer = optimizer_at(np.zeros(search.dimension))
     start = search.params(np.zeros((1, search.dimension)))
     firsts = [np.zeros(search.dimension)]  # the designed gains are a candidate too
     if is_varied:
@@ -192,28 +180,19 @@ def tune(
         firsts += [*search.points(first_gains(delay))][: population - 1]
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
-    points: list[Float64] = []
-    began = time.monotonic()
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * count, **search_options) as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave its line
-        bar = (progress or (lambda items: items))(range(generations))
-        for generation in bar:
-            points += [optimizer.ask() for _ in range(population)]
-            if generation == 0:
-                points[: len(firsts)] = firsts
-            if generation == len(known):
-                known.append(search.costs(runner, np.array(points[-population:])))
-                record.write(known)
-            if generation == 0 and is_varied:
-                optimizer = optimizer_at(points[int(np.argmin(known[0]))])
-            else:
-                optimizer.tell(list(zip(points[-population:], known[generation], strict=True)))
-            costs = known[: generation + 1]
-            if hasattr(bar, "set_postfix"):
-                bar.set_postfix(cost=f"{np.min(costs):.4f}", designed=f"{costs[0][0]:.4f}")
-            if time_limit is not None and time.monotonic() - began > time_limit:
-                break
+    with Runner(robot, population * count, **search_options) as runner:
+        points, costs = evolve(
+            lambda points: search.costs(runner, points),
+            firsts,
+            seed=seed,
+            generations=generations,
+            population=population,
+            record=record,
+            restart=is_varied,
+            time_limit=time_limit,
+            progress=progress,
+        )
     every = np.concatenate([np.ravel(row) for row in costs])
     best, rejected = int(np.argmin(every)), None
     if not best:
@@ -224,7 +203,7 @@ def tune(
         judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
         with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
-            finals = judge.costs(runner, np.array(points)[finalists])
+            finals = judge.costs(runner, points[finalists])
         best = finalists[int(np.argmin(finals))]
         if not best:
             rejected = f"cost in the final: best candidate {min(finals[:-1]):.4f}, designed {finals[-1]:.4f}"
@@ -233,10 +212,75 @@ def tune(
         cost=float(every[best]),
         start_params=start,
         start_cost=costs[0][0],
-        history=tuple(costs),
+        history=costs,
         settings={**settings, "generations": len(costs)},
         rejected=rejected,
     )
+
+
+def checked_effort(seed: int, generations: int, population: int, seconds: float) -> tuple[int, int, int, float]:
+    """Return the arguments of a search if they are in range.
+
+    Raises InvalidArgumentError if one is not, and MissingDependencyError without the package ``cmaes``.
+    """
+    try:
+        import cmaes  # noqa: F401
+    except ImportError:
+        raise MissingDependencyError("cmaes", "tuning", "tune") from None
+    return (
+        integer("seed", seed, 0, 2**31 - 1),
+        integer("generations", generations, 1, 100_000),
+        integer("population", population, 4, 1000),
+        number("seconds", seconds, 0.05, 600.0, "seconds"),
+    )
+
+
+def evolve(
+    evaluate: Callable[[Float64], tuple[float, ...]],
+    firsts: Sequence[Float64],
+    *,
+    seed: int,
+    generations: int,
+    population: int,
+    record: HistoryFile,
+    restart: bool = False,
+    time_limit: float | None = None,
+    progress: Callable[[Any], Any] | None = None,
+) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
+    """Search by CMA-ES from ``firsts[0]``; return all points (n, dimension) and the costs of each generation.
+
+    ``evaluate`` returns the costs of points (population, dimension). ``firsts`` are the first points of the first
+    generation; with ``restart`` the search starts again from the best point of that generation. Known generations come
+    from ``record``, which is written after each new one.
+    """
+    from cmaes import CMA
+
+    def optimizer_at(mean: Float64) -> CMA:
+        return CMA(mean=mean, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+
+    optimizer, known, points = optimizer_at(firsts[0]), _known_costs(record, population), list[Float64]()
+    costs: list[tuple[float, ...]] = []
+    began = time.monotonic()
+    bar = (progress or (lambda items: items))(range(generations))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave its line
+        for generation in bar:
+            points += [optimizer.ask() for _ in range(population)]
+            if generation == 0:
+                points[: len(firsts)] = firsts
+            if generation == len(known):
+                known.append(evaluate(np.array(points[-population:])))
+                record.write(known)
+            if generation == 0 and restart:
+                optimizer = optimizer_at(points[int(np.argmin(known[0]))])
+            else:
+                optimizer.tell(list(zip(points[-population:], known[generation], strict=True)))
+            costs = known[: generation + 1]
+            if hasattr(bar, "set_postfix"):
+                bar.set_postfix(cost=f"{np.min(costs):.4f}", start=f"{costs[0][0]:.4f}")
+            if time_limit is not None and time.monotonic() - began > time_limit:
+                break
+    return np.array(points), tuple(costs)
 
 
 def _plain(name: str, value: Any, resumes: bool) -> Any:

@@ -130,7 +130,7 @@ def test_a_tool_is_moved_to_a_pose(batchpid, tmp_path):
         (("--seconds", "-1"), "seconds: out of range"),
         (("--timestep", "0"), "timestep: out of range"),
         (("--substeps", "0"), "substeps: out of range"),
-        (("--control", "osc", "--gains", "tuned"), "gains: are those of joints"),
+        (("--control", "osc", "--gains", "tuned"), "gains: is not a file, and --control osc has no gains by name"),
         (("--control", "osc", "--setpoint", "1", "2"), "setpoint: has shape (2,)"),
         (("--tool", "panda_hand"), "tool: is for control 'osc'"),
     ],

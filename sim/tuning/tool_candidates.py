@@ -1,0 +1,175 @@
+r"""Candidates of a search for gains of operational-space control: from points in log space to options and costs.
+
+A point holds factors of the bandwidths of positions, of rotations and of the posture, and of the damping ratios of
+positions and rotations. The tool makes moves within its reach, and the cost of a candidate is the mean over moves plus
+the worst move of the terms of :mod:`batchpid.sim.tuning.candidates`: for the response the mean over the six axes, with
+the error of each axis as its response; for chatter and saturation the mean over the joints.
+
+All candidates run in one runner: its setpoints hold the gains of each env, beside the pose.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
+from batchpid.arrays.elementwise import namespace
+from batchpid.errors import InvalidArgumentError
+from batchpid.metrics import StepMetrics, step_metrics
+from batchpid.sim.command import CommandSpec
+from batchpid.sim.observation import Rollout
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.tool_space.tool_goals import reaches
+from batchpid.sim.tuning.candidates import DIVERGED_COST, PENALTY_RATIO, bounded, response_cost
+from batchpid.sim.tuning.evaluation import PRISMATIC_BAND, REVOLUTE_BAND, SETTLE_SECONDS
+from batchpid.sim.tuning.moves import Moves, smooth_variation
+from batchpid.sim.tuning.weights import Weights
+from batchpid.task_space.frames import pose_error
+
+GAINS = {
+    "position_bandwidth": ("rad/s", np.sqrt(150.0)),
+    "rotation_bandwidth": ("rad/s", np.sqrt(150.0)),
+    "posture_bandwidth": ("rad/s", np.sqrt(10.0)),
+    "position_damping_ratio": ("1", 1.0),
+    "rotation_damping_ratio": ("1", 1.0),
+}
+"""Gains that are searched: units, and the values of the defaults of :func:`batchpid.task_space.make_osc_params`."""
+SPREAD = np.array([3.0, 3.0, 3.0, 1.0, 1.0])
+"""Standard deviations of their logarithms at first, in units of INITIAL_SPREAD."""
+BAND = np.array([PRISMATIC_BAND] * 3 + [REVOLUTE_BAND] * 3)
+"""Least half width of the settling band of each axis [m, rad]."""
+AT_LIMIT = 0.999
+"""Share of its limit at which an effort counts as saturated."""
+SIZE = 0.5
+"""Largest distance of a joint from the posture at the ends of a move [rad or m]."""
+_ROUNDS = 4
+
+
+def osc_options(gains: Float64) -> dict[str, Any]:
+    """Return the options of :func:`batchpid.task_space.make_osc_params` for GAINS (5,)."""
+    position, rotation, posture, *ratios = gains.tolist()
+    return {
+        "stiffness": [position**2] * 3 + [rotation**2] * 3,
+        "damping_ratio": [ratios[0]] * 3 + [ratios[1]] * 3,
+        "posture_stiffness": posture**2,
+    }
+
+
+class SearchedSpace(OperationalSpace):
+    """Operational-space control whose setpoints hold a pose (7,) and GAINS (5,)."""
+
+    def __init__(self, robot: Robot, link: str, **options: Any) -> None:
+        super().__init__(robot, link, **options)
+        units, values = zip(*GAINS.values(), strict=True)
+        names = (*self.command.names, *GAINS)
+        neutral = (*np.array(self.command.neutral).tolist(), *values)
+        self.command = CommandSpec(names, (*self.command.units, *units), neutral=neutral)
+
+    def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
+        """Return the coefficients of each env (envs, 6 | dof)."""
+        xp = namespace(setpoint)
+        position, rotation, posture, *ratios = (setpoint[:, 7 + k : 8 + k] for k in range(len(GAINS)))
+        bandwidth = xp.concatenate([position] * 3 + [rotation] * 3, axis=1)
+        ratio = xp.concatenate([ratios[0]] * 3 + [ratios[1]] * 3, axis=1)
+        joint = posture + xp.zeros_like(self.params.posture_stiffness)
+        gains = {"stiffness": bandwidth**2, "damping": 2 * ratio * bandwidth}
+        gains |= {"posture_stiffness": joint**2, "posture_damping": 2 * joint}
+        return ts.discretise(self.params._replace(**gains), self._timestep)
+
+
+class ToolMoves(NamedTuple):
+    """Moves of a tool, from rest."""
+
+    joints: Moves
+    """Joint positions at the start, and others at which the tool is at the goal."""
+    goal: Float64
+    """Poses of the tool (moves, 7)."""
+
+
+def tool_moves(robot: Robot, control: OperationalSpace, count: int, seed: int) -> ToolMoves:
+    """Return ``count`` seeded moves between poses of the tool near that of the control's posture.
+
+    Their ends touch nothing, and joints stay within their limits on the way under the control's gains.
+
+    Raises
+    ------
+    InvalidArgumentError
+        There are no such moves.
+    """
+    random, dynamics, center = np.random.default_rng(seed), robot.dynamics(), control.init(robot, 1).posture
+    reach, found = np.minimum(SIZE, (robot.upper - robot.lower) / 4), np.zeros((0, 2, robot.dof))
+    for _ in range(_ROUNDS):
+        drawn = center + reach * random.uniform(-1, 1, (count, 2, robot.dof))
+        drawn = robot.coupled(np.clip(drawn, robot.lower, robot.upper))
+        goal = _poses(control, drawn[:, 1])
+        touching = dynamics.in_contact(drawn.reshape(-1, robot.dof), 0.0).reshape(count, 2).any(1)
+        found = np.concatenate([found, drawn[reaches(robot, control, drawn[:, 0], goal) & ~touching]])[:count]
+    if len(found) < count:
+        problem = f"has few moves on which {control.link!r} reaches its goal within the joint limits: {len(found)}"
+        raise InvalidArgumentError("robot", problem, remedy="give the gains yourself")
+    start, target = found[:, 0], found[:, 1]
+    return ToolMoves(Moves(start, target, ("of the tool",) * count), _poses(control, target))
+
+
+def _poses(control: OperationalSpace, qpos: Float64) -> Float64:
+    """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""
+    poses: Float64 = ts.link_poses(control.tree, qpos, [control.link], point=control.point)[..., 0, :]
+    return poses
+
+
+def tool_metrics(rollout: Rollout, goal: Float64, start: Float64) -> StepMetrics:
+    """Return the metrics of the six axes for moves to ``goal`` from the poses ``start`` (envs, 7); inf if diverged."""
+    assert rollout.tool_pose is not None
+    course = np.where(rollout.ok[..., None], -pose_error(goal, rollout.tool_pose.astype(np.float64)), np.nan)
+    return step_metrics(rollout.tick, np.zeros(6), course, start=-pose_error(goal, start), absolute_band=BAND)
+
+
+class ToolCandidates:
+    """Candidates of a search, and the costs of their rollouts on ``moves``."""
+
+    def __init__(
+        self, robot: Robot, control: SearchedSpace, moves: ToolMoves, seconds: float, weights: Weights
+    ) -> None:
+        self.robot, self.control, self.moves, self.seconds, self.weights = robot, control, moves, seconds, weights
+        self._start = _poses(control, moves.joints.start)
+        self._size = np.maximum(np.abs(pose_error(moves.goal, self._start)), BAND / 0.02)
+        self._smooth, self._limit = smooth_variation(robot, moves.joints, 1.0), control.params.effort_max
+
+    def gains(self, points: Float64) -> Float64:
+        """Return the GAINS (n, 5) of ``points`` (n, 5)."""
+        return np.array([value for _, value in GAINS.values()]) * np.exp(SPREAD * points)
+
+    def evaluate(self, runner: Runner, gains: Float64) -> tuple[tuple[float, ...], StepMetrics]:
+        """Run all moves under each of ``gains`` (n, 5); return costs (n,), and metrics of the axes (n x moves, 6)."""
+        count, w, lead = len(gains), self.weights, (len(gains), len(self.moves.goal))
+        goal, start = np.tile(self.moves.goal, (count, 1)), np.tile(self._start, (count, 1))
+        setpoint = np.concatenate([goal, np.repeat(gains, lead[1], axis=0)], axis=1)
+        ticks = max(2, round(self.seconds / (runner.timestep * runner.substeps)))
+        runner.reset(np.tile(self.moves.joints.start, (count, 1)))
+        rollout = runner.rollout(np.broadcast_to(setpoint, (ticks, *setpoint.shape)))
+        metrics = tool_metrics(rollout, goal, start)
+        m = StepMetrics(*(bounded(figure).reshape(*lead, 6) for figure in metrics))
+        settling = np.minimum(m.settling_time, 1.5 * self.seconds)
+        variation = bounded(np.abs(np.diff(rollout.effort, axis=0)).sum(0)).reshape(*lead, -1)
+        chatter = np.log1p(np.maximum(variation / self._smooth - 1, 0)).mean(2)
+        cost = response_cost(w, m._replace(settling_time=settling), self._size, BAND).mean(2)
+        saturated = np.abs(rollout.effort) >= AT_LIMIT * self._limit  # the law scales its efforts: none is clipped
+        cost = cost + w.chatter * chatter + w.saturation * saturated.mean((0, 2)).reshape(lead)
+        late = np.maximum(settling.max(2) / SETTLE_SECONDS - 1, 0)
+        total = cost.mean(1) + cost.max(1) + w.late * np.log1p(late / 0.05).mean(1)
+        lasted = rollout.ok.mean(0).reshape(lead)
+        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST))
+        return tuple((total + stability_penalty(gains, runner.timestep)).tolist()), metrics
+
+
+def stability_penalty(gains: Float64, dt: float) -> Float64:
+    """Return the penalty (n,) of explicit gains (n, 5) near the stability bound, kp dt^2 + 2 kd dt = 4."""
+    ratios = np.stack([gains[:, 3], gains[:, 4], np.ones(len(gains))], axis=1)
+    step = gains[:, :3] * dt
+    penalty: Float64 = 10 * np.maximum((step**2 + 4 * ratios * step).max(1) / 4 - PENALTY_RATIO, 0)
+    return penalty
