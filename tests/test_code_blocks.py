@@ -46,6 +46,8 @@ SHORTER_CODE = {
     # pattern in Python blocks: a smaller size
     r"\b64\b": "8",
     r"\brange\(\d{2,}\)": "range(5)",
+    r"\((?:100|150|200), robot\.dof\)": "(10, robot.dof)",
+    r"\b8(?=, robot\.dof\)|, params=params|, substeps=20\))": "2",
 }
 TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))
 ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is slow
@@ -107,8 +109,10 @@ def test_every_page_is_in_the_index():
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
-def test_python_blocks_run(page, tmp_path, monkeypatch, capsys):
+def test_python_blocks_run(page, tmp_path, monkeypatch, capsys, request):
     monkeypatch.chdir(tmp_path)
+    if "import jax" in page.read_text() and importlib.util.find_spec("jax"):
+        request.getfixturevalue("quick_compilation")
     write(tmp_path, TWO_JOINTS, "two.urdf")
     if page.name != "README.md":
         monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
@@ -133,6 +137,7 @@ def test_commands_in_the_text_have_flags_that_exist(page):
         parse(words)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=name)
 def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

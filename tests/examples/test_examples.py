@@ -35,16 +35,6 @@ def one_process(monkeypatch):
     monkeypatch.setattr(batchpid.sim, "Runner", partial(Runner, workers=0))
 
 
-@pytest.fixture
-def quick_compilation():
-    """Let JAX compile with few optimisations."""
-    jax = pytest.importorskip("jax")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()
-
-
 def errors(table: str) -> dict[str, float]:
     """Joint -> error of env 0, from the table of drive_robot.py."""
     return {row.split()[0]: float(row.split()[4]) for row in table.splitlines()[2:]}
@@ -57,7 +47,8 @@ def test_every_example_is_tested():
 
 @pytest.mark.usefixtures("one_process")
 @pytest.mark.parametrize(
-    ("robot", "joint", "seconds"), [("jaco2", "j2s7s300_joint_4", "1.5"), ("panda", "panda_joint2", "4")]
+    ("robot", "joint", "seconds"),
+    [pytest.param("jaco2", "j2s7s300_joint_4", "1.5", marks=pytest.mark.slow), ("panda", "panda_joint2", "4")],
 )
 def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot, joint, seconds):
     drive = ("drive_robot.py", robot, "--num-envs", "1", "--use-internal-drive", "--seconds")
@@ -116,6 +107,7 @@ SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", 
 
 
 @needs_training
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_compilation")
 def test_a_short_training_ends_with_a_picture(run, tmp_path):
     picture = tmp_path / "curve.png"

@@ -28,7 +28,7 @@ def test_gymnasiums_own_checks_pass():
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-@pytest.mark.parametrize("actions", ["setpoint", "increment"])
+@pytest.mark.parametrize("actions", ["increment", pytest.param("setpoint", marks=pytest.mark.slow)])
 def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mode, actions):
     """Equal observations, rewards, flags and infos through time limits, success and resets."""
     drawn = Randomization(payload=Uniform(0, 1), qvel=Uniform(-0.1, 0.1), params={"kp": Uniform(-5, 5)})

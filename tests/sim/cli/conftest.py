@@ -8,14 +8,6 @@ from batchpid.sim.cli import main
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are not drawn: that takes longer than the robots."""
-    for name in ("step_responses", "comparison", "fit_errors"):
-        monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
-    monkeypatch.setattr("batchpid.sim.plots.save", lambda _, path: path)
-
-
-@pytest.fixture
 def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Function that runs a command line in this process and returns (exit status, stdout, stderr)."""
 

@@ -1,5 +1,7 @@
 import json
 
+import pytest
+
 
 def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     path = tmp_path / "new" / "bench.json"
@@ -16,6 +18,7 @@ def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     assert figures["setup"]["num_envs"] == 1
 
 
+@pytest.mark.slow
 def test_bench_refuses_too_short_a_run(batchpid):
     status, _, err = batchpid("bench", "--num-envs", 1, "--workers", 0, "--ticks", 1, "--rounds", 1)
     assert status == 2

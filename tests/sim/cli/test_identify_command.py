@@ -40,9 +40,15 @@ def make_log(folder, engine="sapien"):
 
 
 @pytest.mark.parametrize("engine", ["sapien", pytest.param("mujoco", marks=pytest.mark.slow)])
-def test_motors_are_written_for_other_commands(batchpid, tmp_path, engine):
-    """From the motion in either engine, whose model the fit shares."""
+def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, engine):
+    """From the motion in either engine, whose model the fit shares; the progress promises no remaining time, since a
+    fit mostly ends long before its last evaluation.
+    """
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
+    bars = []
+    monkeypatch.setattr(
+        "batchpid.sim.cli.identify.bar", lambda label, **options: bars.append((label, options)) or (lambda x: x)
+    )
     robot, recording, gains = make_log(tmp_path, engine)
     out, details = tmp_path / "motors.yaml", tmp_path / "motors.json"
     options = ("--evaluations", 4, "--workers", 0, "--no-payload", "--out", out, "--json", details)
@@ -55,6 +61,9 @@ def test_motors_are_written_for_other_commands(batchpid, tmp_path, engine):
     assert Robot.load(robot, actuators=out).actuators is not None
     assert (tmp_path / "motors-fit.png").exists()
     assert not out.with_suffix(".fit.json").exists()
+    ((label, options),) = bars
+    shown = tqdm.format_meter(8, 91, 63.0, prefix=label, postfix="error=0.1", **options)
+    assert shown == "identifying: 8 of at most 91 evaluations, 01:03, error=0.1"
 
 
 def test_what_is_missing_is_named(batchpid, log, tmp_path):
@@ -67,18 +76,3 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
         assert status != 0
         assert message in error
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_progress_promises_no_remaining_time(batchpid, log, tmp_path, monkeypatch):
-    """A fit mostly ends long before its last evaluation."""
-    bars = []
-    monkeypatch.setattr(
-        "batchpid.sim.cli.identify.bar", lambda label, **options: bars.append((label, options)) or (lambda x: x)
-    )
-    robot, recording, gains = log
-    options = ("--evaluations", 1, "--workers", 0, "--no-payload", "--out", tmp_path / "motors.yaml")
-    batchpid("identify", robot, recording, "--params", gains, *options)
-    ((label, options),) = bars
-    shown = tqdm.format_meter(8, 91, 63.0, prefix=label, postfix="error=0.1", **options)
-    assert shown == "identifying: 8 of at most 91 evaluations, 01:03, error=0.1"

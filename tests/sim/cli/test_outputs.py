@@ -52,6 +52,16 @@ def files(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def empty_pictures(monkeypatch):
+    """Let commands write empty files in place of pictures: their names are of interest."""
+    for name in ("step_responses", "efforts", "comparison"):
+        monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
+    monkeypatch.setattr(
+        "batchpid.sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path
+    )
+
+
 @pytest.mark.parametrize(("name", "flag"), output_flags())
 def test_an_existing_output_is_refused_before_the_run(name, flag, files, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(files)
@@ -73,6 +83,7 @@ def test_every_command_with_outputs_has_force():
     assert {name for name, command in COMMANDS.items() if hasattr(command, "force")} == WORDS.keys()
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.npz").write_bytes((files / "run.npz").read_bytes())
@@ -88,11 +99,8 @@ def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch
     assert (tmp_path / "run.png").read_text() == "kept"
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp_path, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.plots.step_responses", lambda *_, **__: None)
-    monkeypatch.setattr(
-        "batchpid.sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path
-    )
     monkeypatch.chdir(tmp_path)
     assert batchpid("demo", *SHORT)[0] == 0
     status, said, complaint = batchpid("demo", *SHORT)

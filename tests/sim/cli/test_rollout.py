@@ -7,6 +7,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import Runner
+from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
@@ -33,6 +34,15 @@ def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_p
     np.testing.assert_array_equal(file["effort_limit"], panda.effort_limit)
 
 
+@pytest.fixture(scope="module")
+def default_motion(tmp_path_factory):
+    """File of the short rollout without further flags."""
+    path = tmp_path_factory.mktemp("rollout") / "run.npz"
+    assert main(["rollout", *map(str, SHORT), "--out", str(path)]) == 0
+    with np.load(path) as file:
+        return dict(file)
+
+
 @pytest.mark.parametrize(
     "flags",
     [
@@ -47,10 +57,9 @@ def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_p
     ],
     ids=lambda flags: flags[0],
 )
-def test_every_flag_changes_the_motion(flags, batchpid, tmp_path):
-    file = saved(batchpid, tmp_path / "a.npz")
+def test_every_flag_changes_the_motion(flags, batchpid, default_motion, tmp_path):
     other = saved(batchpid, tmp_path / "b.npz", *flags)
-    assert np.abs(file["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
+    assert np.abs(default_motion["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
 
 
 def test_gains_from_a_file(batchpid, tmp_path, panda):

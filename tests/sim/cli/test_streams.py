@@ -60,9 +60,8 @@ def shell(line: str, folder: Path, status: str = "$?") -> tuple[int, str, str]:
         ("--help >&-", 0, 0),
         ("--help >/dev/full", 2, 1),
         ("--version <&- >&- 2>&-", 0, 0),
-        ("inspect panda >&-", 0, 0),
         ("inspect nobody 2>/dev/full", 2, 0),
-        ("inspect nobody 2>&-", 2, 0),
+        pytest.param("inspect nobody 2>&-", 2, 0, marks=pytest.mark.slow),
     ],
 )
 def test_streams_that_are_closed_or_full(line, status, lines, tmp_path):

@@ -26,31 +26,16 @@ SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--work
 def few_moves(monkeypatch):
     """Use one random move in the final of a search and in the commands' table."""
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
+    monkeypatch.setattr("batchpid.sim.tuning.search.VARIED_MOVES", 1)
     monkeypatch.setattr(
         "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed)
     )
 
 
-def test_tune_writes_params_with_their_settings_and_their_metrics(batchpid, tmp_path):
+def test_tune_resumes_an_interrupted_search_and_writes_params_with_settings_and_metrics(
+    batchpid, tmp_path, monkeypatch
+):
     out = tmp_path / "panda.yaml"
-    status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
-    assert status == 0
-    assert "designed" in said
-    assert "tuned" in said
-    params, names = bp.load_params(out)
-    assert tuple(names) == load_bundled("panda").joint_names
-    assert type(params.gain_units).__name__ == "PerMassMatrix"
-    about = bp.load_about(out)
-    assert about["seed"] == 0
-    assert about["judged"]["settling_time"] > 0
-    assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
-    assert (tmp_path / "panda-tune.png").stat().st_size > 10_000
-    assert not out.with_suffix(".search.json").exists()
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypatch):
-    out = tmp_path / "a.yaml"
 
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -68,18 +53,33 @@ def test_tune_resumes_a_search_that_was_interrupted(batchpid, tmp_path, monkeypa
     status, said, _ = batchpid("tune", "panda", *SHORT, "--resume", "--out", out)
     assert status == 0
     assert f"{costs[0][0]:.4f} as designed" in said
+    assert "tuned" in said
+    params, names = bp.load_params(out)
+    assert tuple(names) == load_bundled("panda").joint_names
+    assert type(params.gain_units).__name__ == "PerMassMatrix"
+    about = bp.load_about(out)
+    assert about["seed"] == 0
+    assert about["judged"]["settling_time"] > 0
+    assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
+    assert (tmp_path / "panda-tune.png").stat().st_size > 10_000
+    assert not history.exists()
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
-    out = tmp_path / "panda.yaml"
+    """With settings of the types of their options: text "False" would be true to any program that reads it."""
+    urdf, out = write(tmp_path, one_joint(), "arm.urdf"), tmp_path / "gains.yaml"
     monkeypatch.setattr("batchpid.sim.tuning.evaluation.Evaluation.drawback", lambda *_: "chatter: tuned 3, designed 2")
-    status, said, _ = batchpid("tune", "panda", *SHORT, "--out", out)
-    assert status == 0
+    status, said, error = batchpid("tune", urdf, *SHORT, "--no-collisions", "--out", out)
+    assert status == 0, error
     assert "the tuned ones are rejected: chatter: tuned 3, designed 2." in said
-    assert bp.load_about(out)["gains"] == "designed"
-    assert bp.load_about(out)["rejected"] == "chatter: tuned 3, designed 2"
-    assert (bp.load_params(out)[0].kp == load_bundled("panda").designed().kp).all()
+    about = bp.load_about(out)
+    assert about["gains"] == "designed"
+    assert about["rejected"] == "chatter: tuned 3, designed 2"
+    assert (bp.load_params(out)[0].kp == Robot.load(urdf).designed().kp).all()
+    assert about["collisions"] is False
+    assert about["physics"] == "fast"
+    assert not [name for name, value in about.items() if value in ("True", "False", "None")]
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -98,19 +98,6 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
     assert again.actuators == Path("motors.yaml")
     status, said, error = batchpid(*command[1:], "--num-envs", 1, "--workers", 0, "--seconds", 0.05)
     assert status == 0, error
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_settings_keep_the_types_of_options(batchpid, tmp_path):
-    """Flags are not text in the file: "False" would be true to any program that reads it."""
-    urdf = write(tmp_path, one_joint(), "arm.urdf")
-    out = tmp_path / "gains.yaml"
-    status, _, error = batchpid("tune", urdf, *SHORT, "--no-collisions", "--out", out)
-    assert status == 0, error
-    about = bp.load_about(out)
-    assert about["collisions"] is False
-    assert about["physics"] == "fast"
-    assert not [name for name, value in about.items() if value in ("True", "False", "None")]
 
 
 def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch):

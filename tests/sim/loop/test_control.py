@@ -20,11 +20,11 @@ def error_after(runner, seconds):
 def test_the_integral_of_a_drive_removes_the_error_of_gravity(panda):
     options = {"effort_limit": None, "anti_windup": "none"}
     sagging = panda.params(kp=400.0, ki=0.0, kd=80.0, **options)
-    lifting = panda.params(kp=400.0, ki=800.0, kd=80.0, **options)
+    lifting = panda.params(kp=400.0, ki=1600.0, kd=80.0, **options)
     with Runner(panda, 1, workers=0, control="drive", compensate="none", params=sagging) as runner:
-        sag = error_after(runner, 3.0)
+        sag = error_after(runner, 1.5)
     with Runner(panda, 1, workers=0, control="drive", compensate="none", params=lifting) as runner:
-        left = error_after(runner, 3.0)
+        left = error_after(runner, 1.5)
     assert sag > 0.03
     assert left < 0.1 * sag
 
@@ -32,9 +32,9 @@ def test_the_integral_of_a_drive_removes_the_error_of_gravity(panda):
 def test_the_integral_of_the_pid_removes_the_error_of_gravity(panda):
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
     with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=0.0, **gains)) as runner:
-        sag = error_after(runner, 3.0)
-    with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=800.0, **gains)) as runner:
-        left = error_after(runner, 3.0)
+        sag = error_after(runner, 1.5)
+    with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=1600.0, **gains)) as runner:
+        left = error_after(runner, 1.5)
     assert sag > 0.03
     assert left < 0.1 * sag
 

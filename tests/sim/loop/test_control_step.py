@@ -141,6 +141,7 @@ def test_envs_do_not_see_each_other(case, order):
 @given(CASES)
 def test_jax_runs_the_same_function(case):
     import jax
+    from quick_jit import quick_jit
 
     arguments = a_step(case[0], case[1] or "effort", *case[2:])
 
@@ -149,7 +150,7 @@ def test_jax_runs_the_same_function(case):
 
     with jax.enable_x64(True):
         traced = arguments[0]._replace(model=Model(mass_matrix, mass_matrix, when=when))
-        step = jax.jit(lambda *inputs: control_step(traced, *inputs[:-1], Step(inputs[-1], 10)))
+        step = quick_jit(lambda *inputs: control_step(traced, *inputs[:-1], Step(inputs[-1], 10)))
         state, outputs = run(*arguments, function=lambda _, *inputs: step(*inputs[:-1], inputs[-1].index))
         expected_state, expected = run(*arguments)
         pairs = zip(jax.tree.leaves((state, outputs)), jax.tree.leaves((expected_state, expected)), strict=True)

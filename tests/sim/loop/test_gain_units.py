@@ -79,7 +79,7 @@ def test_gain_units_change_in_flight_without_a_bump(units, panda):
     setpoint = panda.settings.target * [[1.0], [0.9]]
     with Runner(panda, 2, workers=0, compensate="none", params=per_effort) as runner:
         runner.reset(setpoint)
-        before = runner.rollout(np.broadcast_to(setpoint, (600, 2, 9))).effort[-1]
+        before = runner.rollout(np.broadcast_to(setpoint, (400, 2, 9))).effort[-1]
         assert np.abs(before).max() > 10.0
         for params in (per_inertia, per_effort):
             runner.params = params

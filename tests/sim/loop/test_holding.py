@@ -7,7 +7,7 @@ from batchpid.sim import Runner
 POSE = np.array([0.3, 0.4, -0.2, -1.8, 0.5, 1.9, 0.7, 0.02, 0.02])
 
 
-def drift(runner, seconds=10.0):
+def drift(runner, seconds=3.0):
     runner.reset(POSE)
     far = 0.0
     for _ in range(round(seconds * 100)):

@@ -53,18 +53,18 @@ def commands(robot, ticks, seed=0):
 
 def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
     chosen, table = actuators(panda), commands(panda, 16)
-    with Runner(panda, N, workers=0, actuators=chosen) as runner:
+    with Runner(panda, N, workers=0, substeps=5, actuators=chosen) as runner:
         first = runner.rollout(table[:8])
         snapshot = runner.snapshot()
         second = runner.rollout(table[8:])
         runner.restore(snapshot)
         assert_identical(second, runner.rollout(table[8:]))
     snapshot.save(tmp_path / "at8.npz")
-    with Runner(panda, N, workers=2, actuators=chosen) as runner:
+    with Runner(panda, N, workers=2, substeps=5, actuators=chosen) as runner:
         assert_identical(first, runner.rollout(table[:8]))
         runner.restore(Snapshot.load(tmp_path / "at8.npz"))
         assert_identical(second, runner.rollout(table[8:]))
-    with Runner(panda, 2, workers=0, actuators=chosen.for_envs(slice(2))) as runner:
+    with Runner(panda, 2, workers=0, substeps=5, actuators=chosen.for_envs(slice(2))) as runner:
         assert_identical(first.for_envs(slice(2)), runner.rollout(table[:8, :2]))
 
 
@@ -77,7 +77,7 @@ def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_p
     long = short.replace(command_delay=3 * delays[::-1])
 
     def run(**options):
-        with Runner(panda, envs, actuators=short, **options) as runner:
+        with Runner(panda, envs, substeps=5, actuators=short, **options) as runner:
             rollouts = [runner.rollout(table)]
             snapshot = runner.snapshot()
             runner.actuators = long

@@ -126,6 +126,7 @@ def test_a_killed_process_and_a_killed_worker_are_replaced(machines, undisturbed
     assert_identical(undisturbed, rollout)
 
 
+@pytest.mark.slow
 def test_the_envs_of_a_killed_machine_go_to_another(machines, undisturbed):
     def kill(runner):
         pid = runner.nodes[1].pid

@@ -301,6 +301,21 @@ def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
     assert again.ok.all()
 
 
+def test_a_tick_whose_call_ends_after_the_workers_answers_is_replayed_once(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with make_runner(workers=1) as runner, make_runner(workers=0) as model:
+        with monkeypatch.context() as patched:
+            patched.setattr("batchpid.sim.loop.faults.FaultLog.with_faults", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                runner.step(setpoints()[0])
+        assert_identical(runner.observe(), model.step(setpoints()[0]))
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            assert_identical(runner.step(setpoints()[1]), model.step(setpoints()[1]))
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
     results = []
