@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.leaves import frozen
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
@@ -116,7 +117,8 @@ class OperationalSpace:
         elif options:
             problem, remedy = "are given together with params", "give them to the function that makes the params"
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
-        self._params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
         self._friction: Friction | None = None
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
@@ -230,9 +232,9 @@ def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArr
 
 
 def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:
-    """Raise InvalidArgumentError for options that differ by env: a controller is called for any group of envs."""
+    """Return a copy; raise InvalidArgumentError for options that differ by env: a controller gets any group of envs."""
     for name, leaf in params._asdict().items():
         if isinstance(leaf, np.ndarray) and len(leaf) > 1:
             problem = f"has rows for {len(leaf)} envs"
             raise InvalidArgumentError(name, problem, remedy="give one row: a controller is called for groups of envs")
-    return params
+    return frozen(params)
