@@ -264,9 +264,10 @@ class Session:
         self._transactions.ready()
 
         def commit(state: RunnerState, results: list[Any]) -> tuple[RunnerState, Snapshot]:
-            episodes = None if self.options.randomization is None else state.draws.episodes
+            episodes = None if self.options.randomization is None else state.draws.episodes.copy()
+            targets = None if state.targets is None else state.targets.copy()
             about, states = self.options.describe(), EnvStates.join(results)
-            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes, state.targets)
+            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes, targets)
             self.pool.start_replay_from(Restore(snapshot, state.draws))
             return state._replace(steps_since_checkpoint=0), snapshot
 
@@ -305,7 +306,7 @@ class Session:
                 params=params,
                 actuators=actuators,
                 steps=snapshot.steps,
-                targets=snapshot.targets,
+                targets=request.snapshot.targets,
                 steps_since_checkpoint=0,
                 faults=state.faults.restored(request.snapshot.states.containment["step"]),
             )

@@ -23,6 +23,7 @@ from batchpid.errors import CallOrderError, InvalidArgumentError
 from batchpid.sim.gym.pictures import RENDER_MODES, EnvPictures, check_render_mode
 from batchpid.sim.observation import Observation
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import RunnerKeywords
@@ -229,8 +230,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         ------
         CallOrderError
             A step was begun and has not been waited for.
+        InvalidArgumentError
+            A seed is negative or no int, or an option is unknown.
         """
         self._expect_no_step("reset")
+        check_keywords("reset(options=)", options or {}, ("reset_mask",))
         mask = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
@@ -238,7 +242,12 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             raise InvalidArgumentError(
                 "options['reset_mask']", "selects no env", remedy="use e.g. mask = terminated | truncated"
             )
-        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
+        seeds: Sequence[int | None] | None = None
+        if isinstance(seed, Sequence | np.ndarray):
+            seeds = [None if each is None else integer("seed", each, 0, LARGEST) for each in seed]
+        elif seed is not None:
+            first = integer("seed", seed, 0, LARGEST - self.num_envs)
+            seeds = range(first, first + self.num_envs)
         if seeds is not None and len(seeds) != self.num_envs:
             raise InvalidArgumentError(
                 "seed", f"has {len(seeds)} entries for {self.num_envs} envs", remedy="give an int, or one for each env"

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.leaves import frozen
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
@@ -119,8 +120,8 @@ class OperationalSpace:
         elif options:
             problem, remedy = "are given together with params", "give them to the function that makes the params"
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
-        self.params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
-        """Params of the law."""
+        params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
         self._friction: Friction | None = None
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
@@ -152,6 +153,11 @@ class OperationalSpace:
         self.command = CommandSpec(tuple(entries), tuple(entries.values()), neutral=neutral)
         """Names and units of a setpoint; the neutral one is the pose of the posture."""
 
+    @property
+    def params(self) -> ts.OSCParams:
+        """Params of the law, one row for all envs, read-only."""
+        return self._params
+
     def __repr__(self) -> str:
         return summary(type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)])
 
@@ -166,7 +172,7 @@ class OperationalSpace:
         if robot.joint_names != self.tree.joint_names:
             problem = f"was made for the joints {', '.join(self.tree.joint_names)}, but the runner's robot has others"
             raise InvalidArgumentError("control", problem, remedy="make it for the robot of the runner")
-        return ts.init(self.params, np.repeat(self._posture, num_envs, axis=0))
+        return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any]:
         """Return the state and the efforts (envs, dof) [N m or N]."""
@@ -204,13 +210,13 @@ class OperationalSpace:
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
         """Return this controller for the time step [s] and the option ``compensate`` of a runner."""
         other = copy(self)
-        other._k, other._timestep = ts.discretise(self.params, timestep), timestep
+        other._k, other._timestep = ts.discretise(self._params, timestep), timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
 
     def check_stability(self, stacklevel: int = 2) -> None:
         """Warn, ``stacklevel`` frames up, if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
-        p, dt = self.params, self._timestep
+        p, dt = self._params, self._timestep
         if p.discretization is not None or isinstance(p.decoupling, NoDecoupling):
             return
         for name, kp, kd, columns in (
@@ -244,9 +250,9 @@ def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArr
 
 
 def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:
-    """Raise InvalidArgumentError for options that differ by env: a controller is called for any group of envs."""
+    """Return a copy; raise InvalidArgumentError for options that differ by env: a controller gets any group of envs."""
     for name, leaf in params._asdict().items():
         if isinstance(leaf, np.ndarray) and len(leaf) > 1:
             problem = f"has rows for {len(leaf)} envs"
             raise InvalidArgumentError(name, problem, remedy="give one row: a controller is called for groups of envs")
-    return params
+    return frozen(params)

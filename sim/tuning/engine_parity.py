@@ -42,7 +42,7 @@ class Parity(NamedTuple):
     time: Float64
     """Times of the open-loop motion (ticks,) [s]."""
     open_loop: Float64
-    """Largest difference of a position up to then, under equal efforts (ticks,)."""
+    """Largest difference of a position up to then, under equal efforts (ticks,); NaN if all envs began at limits."""
     chaos: Float64
     """The same between two runs in SAPIEN whose starts differ by one bit of a float32 (ticks,)."""
     moves: tuple[Evaluation, Evaluation]
@@ -75,7 +75,9 @@ class Parity(NamedTuple):
         else:
             said.append("The engines do NOT simulate the same robot: compare masses, inertias and joints first.")
         apart = np.flatnonzero(self.open_loop > np.maximum(MOTION_TOLERANCE, 10 * self.chaos))
-        if not len(apart):
+        if np.isnan(self.open_loop).any():
+            said.append("Under equal efforts NOTHING was compared: every env began at a joint limit.")
+        elif not len(apart):
             said.append("Under equal efforts they part no faster than rounding explains.")
         else:
             said.append(
@@ -184,10 +186,13 @@ def _open_loop(robot: Robot, start: Float64, seed: int, workers: int | None) -> 
             warnings.simplefilter("ignore", MissedContactWarning)
             runner.reset(qpos)
             runs.append(runner.rollout(efforts))
-    within = ((runs[0].qpos > robot.lower + _NEAR) & (runs[0].qpos < robot.upper - _NEAR)).all(2)
-    free = np.logical_and.accumulate(within)[..., None]
+    within = (runs[0].qpos > robot.lower + _NEAR) & (runs[0].qpos < robot.upper - _NEAR)
+    within |= robot.upper - robot.lower <= 4 * _NEAR  # a joint that is held counts from the start
+    free = np.logical_and.accumulate(within.all(2))[..., None]
     apart = [np.maximum.accumulate(np.where(free, np.abs(runs[0].qpos - run.qpos), 0).max((1, 2))) for run in runs[1:]]
     open_loop, chaos = (np.nan_to_num(each, nan=np.inf).astype(np.float64) for each in apart)
+    if not free[0].any():
+        open_loop = np.full_like(open_loop, np.nan)
     return time, open_loop, chaos, _relative(runs[0].qvel[0], runs[1].qvel[0])
 
 

@@ -148,8 +148,11 @@ def test_bad_arguments_are_named():
     with pytest.raises(InvalidArgumentError, match="render_mode"):
         ReachVectorEnv(1, render_mode="human")
     env = ReachVectorEnv(2, workers=0, autoreset_mode="Disabled", max_episode_steps=1)
-    with pytest.raises(InvalidArgumentError, match="seed"):
-        env.reset(seed=[1])
+    for seed in ([1], -1, [0, -1], [0, 1.5], "ab"):
+        with pytest.raises(InvalidArgumentError, match="seed"):
+            env.reset(seed=seed)
+    with pytest.raises(InvalidArgumentError, match="did you mean 'reset_mask'"):
+        env.reset(options={"reset_masks": [True, False]})
     with pytest.raises(InvalidArgumentError, match="reset_mask"):
         env.reset(options={"reset_mask": np.zeros(2, bool)})
     env.reset(seed=[1, None])

@@ -134,6 +134,19 @@ def test_xla_computes_the_same(panda):
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
 
 
+def test_later_writes_to_params_have_no_effect(panda):
+    params = ts.make_osc_params(panda.kinematic_tree(), effort_limit=panda.effort_limit)
+    own = params._replace(stiffness=np.array(params.stiffness))
+    control = OperationalSpace(panda, "panda_hand", params=own)
+    target = np.add(control.command.neutral, 0.02)
+    with Runner(panda, 1, control=control, workers=0) as runner:
+        effort = runner.step(target).effort
+        own.stiffness[:] = 1.0
+        runner.reset()
+        again = runner.step(target).effort
+    np.testing.assert_array_equal(effort, again)
+
+
 def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
     point = [0.0, 0.0, 0.1]
     control = OperationalSpace(panda, HAND, point=point, posture=START)

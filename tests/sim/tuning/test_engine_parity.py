@@ -6,6 +6,9 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
+from tiny_urdf import joint, link, robot, write
+
+from batchpid.sim import Robot
 from batchpid.sim.engine.mujoco import model_builder, mujoco_dynamics
 from batchpid.sim.tuning.engine_parity import compare_engines
 
@@ -34,3 +37,12 @@ def test_another_mass_is_found(panda, monkeypatch):
     assert "more than rounding explains" in said
     # The gains cope with it, since each engine's control knows its own robot.
     assert np.isfinite(found.closed_loop).all()
+
+
+def test_a_joint_without_range_does_not_end_the_comparison(tmp_path):
+    held = joint("held", "arm", "tip", inner='<limit lower="0" upper="0" effort="10"/>')
+    text = robot(*map(link, ("base", "arm", "tip")), joint("hinge", "base", "arm"), held)
+    found = compare_engines(Robot.load(write(tmp_path, text)), moves=1, seconds=0.5, workers=0)
+    assert found.open_loop[-1] > 0
+    at_limits = found._replace(open_loop=np.full_like(found.open_loop, np.nan))
+    assert "NOTHING was compared" in " ".join(at_limits.verdict())
