@@ -28,7 +28,8 @@ from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState, check_guard
-from batchpid.native.tracing import Symbol, trace
+from batchpid.native.symbols import Symbol
+from batchpid.native.tracing import trace
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 RATES = {

@@ -12,6 +12,7 @@ import numpy as np
 from batchpid.native.array_program import ArrayProgram, interpreter
 from batchpid.native.extensions import StaleExtensionError, load_all
 from batchpid.native.operations import PROGRAM
+from batchpid.native.symbols import Stack
 from batchpid.native.tracing import trace
 
 SWITCH = "BATCHPID_NATIVE"
@@ -64,6 +65,13 @@ def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
     return [*numbers, *pairs, *ends, xp.where(a > b, b, c), least, product, *masks, *some]
 
 
+def history_operations(places: Any, history: Any, a: Any, b: Any) -> list[Any]:
+    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (1, rows, columns)."""
+    xp = a.__array_namespace__()
+    later = xp.concatenate((xp.concatenate((a, b), axis=1)[:, None], history[:, :-1]), axis=1)
+    return [*later.take(places)]
+
+
 def first_difference() -> str | None:
     """Return the first difference between native and NumPy's results of all operations, or None: takes 1 ms.
 
@@ -81,6 +89,12 @@ def first_difference() -> str | None:
         for number, pair in enumerate(zip(found, expected, strict=True)):
             if _bits(pair[0]) != _bits(pair[1]):
                 return f"result {number} of a native program of {np.dtype(dtype)} is not NumPy's"
+    a, b, history = *rng.normal(size=(2, *shape)), rng.normal(size=(shape[0], 4, 2 * shape[1]))
+    places = rng.integers(history.size, size=(1, *shape))
+    (numbers,) = history_operations(places, history, a, b)
+    traced = trace(lambda places, *others: history_operations(Stack([places]), *others), 1, 3)
+    if _bits(ArrayProgram(traced, [*places], 3, shape)(history, a, b)[0]) != _bits(numbers):
+        return "the history of a native program is not NumPy's"
     return None
 
 

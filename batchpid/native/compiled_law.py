@@ -13,7 +13,8 @@ from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance, advance_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.tracing import Symbol, Trace, trace
+from batchpid.native.symbols import Symbol
+from batchpid.native.tracing import Trace, trace
 
 _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""

@@ -17,7 +17,8 @@ from batchpid.law.coefficients import Coefficients
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.compiled_law import structure
 from batchpid.native.operations import MOST_SUMMED
-from batchpid.native.tracing import Symbol, Trace, trace
+from batchpid.native.symbols import Symbol
+from batchpid.native.tracing import Trace, trace
 from batchpid.sim.engine import native
 from batchpid.sim.loop.pid_law import PIDLaw
 

@@ -17,7 +17,8 @@ from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import every_operation, program_status
-from batchpid.native.tracing import Stack, trace
+from batchpid.native.symbols import Stack
+from batchpid.native.tracing import trace
 
 pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from batchpid.native.tracing import Namespace, trace
+from batchpid.native.symbols import Namespace
+from batchpid.native.tracing import trace
 
 
 def test_an_operation_that_programs_do_not_have_is_an_error():

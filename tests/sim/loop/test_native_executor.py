@@ -15,7 +15,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.loop import native_executor
+from batchpid.sim.loop import native_executor, tick_program
 from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
@@ -88,12 +88,12 @@ def test_the_program_is_a_trace_of_the_control_step(panda, monkeypatch):
         calls.append(layout.control)
         return control_step(layout, *arguments)
 
-    assert native_executor.control_step is control_step
-    monkeypatch.setattr(native_executor, "control_step", recorded)
-    native_executor._trace.cache_clear()
+    assert native_executor.control_step is tick_program.control_step is control_step
+    monkeypatch.setattr(tick_program, "control_step", recorded)
+    tick_program._trace.cache_clear()
     with Runner(panda, 2, workers=0, substeps=30) as runner:
         runner.step(panda.settings.target)
-    native_executor._trace.cache_clear()
+    tick_program._trace.cache_clear()
     assert calls == ["pid"], "traced once; friction is not due within 64 sim steps"
 
 

@@ -1,0 +1,237 @@
+"""Symbols that stand for arrays in a trace (:mod:`batchpid.native.tracing`), and the namespace of their operations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from batchpid.native.operations import MASKS, OPERATIONS
+
+_NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
+"""Operations that have another name in NumPy."""
+
+
+class Namespace:
+    """Array namespace of symbols; it records the operations on them in order."""
+
+    inf = np.inf
+
+    def __init__(self, dtype: Any = np.float64) -> None:
+        self.dtype = np.dtype(dtype)
+        self.noted: list[tuple[str, tuple[Symbol, ...], Symbol]] = []
+        self.literals: dict[str, tuple[float, Symbol]] = {}
+        """Numbers and their symbols, by ``repr``, which distinguishes -0.0 from 0.0."""
+
+    def symbol(self, value: Any) -> Symbol:
+        """Return the symbol of a number; a symbol is returned unchanged.
+
+        A number is rounded to the arrays' dtype. A scalar of a wider dtype is a TypeError, because
+        NumPy would promote the arrays instead.
+        """
+        if isinstance(value, Symbol):
+            return value
+        if isinstance(value, np.generic) and np.result_type(value, self.dtype) != self.dtype:
+            raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
+        return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
+
+    def apply(self, name: str, *values: Any) -> Any:
+        """Record an operation; return its result. Stacks take part entry by entry."""
+        if stacks := [value for value in values if isinstance(value, Stack)]:
+            size = max(map(len, stacks))
+            each = (value if isinstance(value, Stack) else Stack([value]) for value in values)
+            spread = [stack * size if len(stack) == 1 else stack for stack in map(tuple, each)]
+            return Stack(self.apply(name, *entries) for entries in zip(*spread, strict=True))
+        result = Symbol(self, name in MASKS)
+        self.noted.append((name, tuple(map(self.symbol, values)), result))
+        return result
+
+    def __getattr__(self, name: str) -> Callable[..., Symbol]:
+        name = _NAMES.get(name, name)
+        if name not in OPERATIONS:
+            raise AttributeError(f"programs have no operation {name!r}")
+        return lambda *values: self.apply(name, *values)
+
+    def concatenate(self, arrays: tuple[Any, Any], axis: int) -> Any:
+        """Return positions and velocities side by side, or a history with a later sample in front."""
+        assert axis == 1
+        first, second = arrays
+        if isinstance(first, _AsRows) and isinstance(second, _WithoutOldest):
+            samples = first.vector if isinstance(first.vector, _Pair) else (first.vector,)
+            return self.apply("push", second.history, *samples)
+        return _Pair(first, second)
+
+    def atleast_2d(self, value: Any) -> Any:
+        """Return ``value``, which already has rows and columns."""
+        return value
+
+    def zeros_like(self, _: Any) -> Symbol:
+        """Return the number 0."""
+        return self.symbol(0.0)
+
+    def ones_like(self, _: Any) -> Symbol:
+        """Return the number 1."""
+        return self.symbol(1.0)
+
+
+class Stack(tuple[Any, ...]):
+    """Array (n, rows, columns) in a trace, as n symbols."""
+
+    __slots__ = ()
+
+    def __mul__(self, other: Any) -> Any:
+        return self[0].__array_namespace__().apply("multiply", self, other)
+
+    def sum(self, axis: int) -> Symbol:
+        """Return 0 plus all entries in order, as NumPy sums them."""
+        assert axis == 0
+        total = self[0].__array_namespace__().symbol(0.0)
+        for entry in self:
+            total = total + entry
+        return total
+
+
+class Symbol:
+    """Array (rows, columns) in a trace; a mask holds 1.0 and 0.0.
+
+    It may also stand for a matrix in each row, or for a history of samples. A program changes a history in place.
+    """
+
+    def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:
+        self._namespace = namespace
+        self.is_mask = is_mask
+
+    def __array_namespace__(self) -> Namespace:
+        return self._namespace
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Dtype of the array: bool for a mask, else the dtype of the trace."""
+        return np.dtype(bool) if self.is_mask else self._namespace.dtype
+
+    def astype(self, dtype: Any) -> Symbol:
+        """Return a mask as numbers; return numbers unchanged."""
+        assert np.dtype(dtype) == self._namespace.dtype
+        return self._namespace.apply("add", self, -0.0) if self.is_mask else self
+
+    def copy(self) -> Symbol:
+        """Return the same symbol: the results of a program are new arrays."""
+        return self
+
+    def min(self, axis: int, keepdims: bool) -> Symbol:
+        """Return the minimum of each row, repeated in all columns."""
+        assert (axis, keepdims) == (-1, True)
+        return self._namespace.apply("row_minimum", self)
+
+    def __bool__(self) -> NoReturn:
+        raise TypeError("a function that is traced cannot depend on the entries of an array")
+
+    def take(self, places: Stack) -> Stack:
+        """Return the numbers of a history at places in the whole of it, which are constants."""
+        return Stack(self._namespace.apply("take", self, each) for each in places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if index is None:
+            return Stack([self])
+        if index == (slice(None), slice(None, -1)):
+            return _WithoutOldest(self)
+        return _as_rows(self, index)
+
+    def __abs__(self) -> Symbol:
+        return self._namespace.apply("absolute", self)
+
+    def __neg__(self) -> Symbol:
+        return self._namespace.apply("negative", self)
+
+    def __invert__(self) -> Symbol:
+        return self._namespace.apply("not", self)
+
+    def __mul__(self, other: Any) -> Any:
+        return _Products(self, other.vector) if isinstance(other, _AsRows) else self._apply("multiply", other)
+
+    def __add__(self, other: Any) -> Symbol:
+        return self._apply("add", other)
+
+    def __sub__(self, other: Any) -> Symbol:
+        return self._apply("subtract", other)
+
+    def __rsub__(self, other: Any) -> Symbol:
+        return self._namespace.apply("subtract", other, self)
+
+    def __truediv__(self, other: Any) -> Symbol:
+        return self._apply("divide", other)
+
+    def __rtruediv__(self, other: Any) -> Symbol:
+        return self._namespace.apply("divide", other, self)
+
+    def __gt__(self, other: Any) -> Symbol:
+        return self._apply("greater", other)
+
+    def __ge__(self, other: Any) -> Symbol:
+        return self._apply("greater_equal", other)
+
+    def __lt__(self, other: Any) -> Symbol:
+        return self._apply("less", other)
+
+    def __le__(self, other: Any) -> Symbol:
+        return self._apply("less_equal", other)
+
+    def __and__(self, other: Any) -> Symbol:
+        return self._apply("and", other)
+
+    def __or__(self, other: Any) -> Symbol:
+        return self._apply("or", other)
+
+    def __eq__(self, other: object) -> Symbol:  # type: ignore[override]
+        return self._apply("equal", other)
+
+    def __ne__(self, other: object) -> Symbol:  # type: ignore[override]
+        return self._apply("not_equal", other)
+
+    __hash__ = object.__hash__
+    __rmul__, __radd__ = __mul__, __add__
+
+    def _apply(self, name: str, other: Any) -> Symbol:
+        return self._namespace.apply(name, self, other)
+
+
+class _AsRows(NamedTuple):
+    """vector[:, None, :]"""
+
+    vector: Any
+
+
+class _WithoutOldest(NamedTuple):
+    """history[:, :-1]"""
+
+    history: Symbol
+
+
+class _Pair:
+    """concatenate((first, second), axis=1)"""
+
+    def __init__(self, *both: Symbol) -> None:
+        self._both = both
+
+    def __iter__(self) -> Iterator[Symbol]:
+        return iter(self._both)
+
+    def __getitem__(self, index: Any) -> _AsRows:
+        return _as_rows(self, index)
+
+
+def _as_rows(vector: Any, index: Any) -> _AsRows:
+    assert index in ((slice(None), None), (slice(None), None, slice(None)))
+    return _AsRows(vector)
+
+
+class _Products(NamedTuple):
+    """matrix * vector[:, None, :]"""
+
+    matrix: Symbol
+    vector: Symbol
+
+    def sum(self, axis: int) -> Symbol:
+        assert axis == -1
+        return self.matrix.__array_namespace__().apply("matrix_vector", self.matrix, self.vector)

@@ -1,0 +1,236 @@
+"""Program of the sim steps of a tick: the control step, traced, with the arrays that hold the state between them."""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from batchpid.arrays.array_types import Float64
+from batchpid.motors import ActuatorState, advance_measurement
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.symbols import Stack, Symbol
+from batchpid.native.tracing import Trace, trace
+from batchpid.sim.engine.engines import scene_dynamics
+from batchpid.sim.engine.native.native_tick import NativeTick
+from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+
+
+class TickProgram:
+    """Control step of a group of envs as a program, and its arrays; ``gravity``: it takes a passive force.
+
+    Attributes
+    ----------
+    state, measured, outputs
+        Arrays that the sim steps read and write.
+    reading
+        ``measured`` with an array for the passive force, even if it is not used.
+    before
+        Positions before the last sim step (M, dof).
+    """
+
+    def __init__(
+        self,
+        pack: CompiledPack,
+        layout: Layout,
+        constants: Constants,
+        state: StepState,
+        command: Command,
+        gravity: bool,
+    ) -> None:
+        shape, law, matrix = (pack.size, pack.dof), layout.law, None
+        if law is not None and law.needs_matrix:
+            matrix = np.zeros((*shape, pack.dof) if law.whole else shape)
+        self.state = mapped(partial(np.array, order="C"), state._replace(matrix=matrix))
+        self.reading = Measured(*np.zeros((3, *shape)))
+        self.measured = self.reading if gravity else self.reading._replace(passive=None)
+        self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
+        self._constants = mapped(stacked, constants)
+        self._sensors: tuple[ArrayProgram, list[Float64], list[Float64]] | None = None
+        self._command = command.map(lambda rows: np.zeros(shape))
+        guarded = None if constants.guard is None else np.zeros(shape, bool)
+        saturated = None if layout.control == "drive" else np.zeros(shape, bool)
+        self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
+        self.before = np.zeros(shape)
+        fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
+        inputs = (fixed, self._command, self.measured, self._seen)
+        traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
+        given = leaves(inputs)
+        program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
+        results = [*leaves(_returned(fixed)), *leaves(self.outputs)]
+        arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
+        if matrix is not None:
+            bodies = scene_dynamics(pack.spec).bodies
+            tree = np.ascontiguousarray(bodies.tree, np.int32)
+            arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
+            arrays |= {} if self._seen is None else dict(zip(("pose", "rate"), self._seen, strict=True))
+            arrays |= {"armature": constants.armature, "damping": constants.damping}
+        whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
+        self._tick = NativeTick(
+            program, given, results, timestep=constants.timestep, matrix_steps=steps, whole=whole, **arrays
+        )
+
+    def load(self, state: StepState, measured: Measured, command: Command) -> None:
+        """Copy the arguments into the program's arrays, where they are not these arrays."""
+        if state is not self.state:
+            self._copy(state)
+        if measured is not self.measured:
+            for array, value in zip(self.measured, measured, strict=True):
+                if value is not None:
+                    array[...] = value
+        for array, value in zip(self._command, command, strict=True):
+            if array is not None:
+                array[...] = value
+
+    def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
+        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status."""
+        done, status = self._tick.run(step.prepare(), begin, until, end)
+        if self.state.age is not None:
+            self.state.age[...] += done - begin
+        if self.state.motors is not None and self.state.motors.step is not None:
+            self.state.motors.step[...] += done - begin
+        return done, status
+
+    def measure(self, *noise: Float64 | None) -> Any:
+        """Advance the sensors with the noise of positions and velocities; return both as measured, but for a step.
+
+        Only :meth:`run` counts the step.
+        """
+        drawn = [each for each in noise if each is not None]
+        if self._sensors is None:
+            side, k = _sensor_side(self.state.motors), self._constants.motors
+            inputs = (side, *self.reading[:2])
+            traced = _trace_sensors(*map(structure, (k, *inputs, noise)))
+            fixed, shape = leaves(inputs), self.before.shape
+            program = ArrayProgram(traced, leaves(k), len(fixed) + len(drawn), shape)
+            self._sensors = program, fixed, [*leaves(side.encoder), *leaves(self._seen)]
+        program, fixed, out = self._sensors
+        program(*fixed, *drawn, out=out)
+        return self._seen
+
+    def take(self, state: StepState, outputs: Outputs) -> None:
+        """Copy the results of a control step in NumPy."""
+        self._copy(state)
+        self.before[...] = self.measured.qpos
+        for name in ("qf", "motor", "saturated", "guarded"):
+            if (array := getattr(outputs, name)) is not None:
+                getattr(self.outputs, name)[...] = array
+
+    def _copy(self, state: StepState) -> None:
+        _write(_copied(self.state), _copied(state))
+        if state.matrix is not None:
+            self.state.matrix[...] = state.matrix
+        if state.motors is not None:  # the same object, by which the executor knows its noise
+            self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
+
+
+@lru_cache(maxsize=64)
+def _trace(layout: Layout, *structures: Any) -> Trace:
+    """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
+
+    ``structures`` describe constants, state, command, reading, and what the sensors measure. No update of mass matrix
+    or friction is due.
+    """
+
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        k, before, command, measured, seen = (filled(each, given) for each in structures)
+        model = Model(when=lambda due, function, otherwise: otherwise)
+        if seen is not None:
+            model = model._replace(measure=lambda k, motors, *_: (motors, *seen))
+        rubs = k.friction.coulomb is not None
+        start = before._replace(age=symbols[0] if rubs else None)
+        new, outputs = control_step(layout._replace(model=model), k, start, command, measured, Step(0, 1))
+        results = leaves(_returned(new._replace(age=None)))
+        assert len(results) == len(leaves(_returned(before)))
+        return [*results, *leaves(outputs._replace(returned=None, target=None, target_rate=None))]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+@lru_cache(maxsize=64)
+def _trace_sensors(*structures: Any) -> Trace:
+    """Return the trace of the sensors: position of the encoder, and measured positions and velocities.
+
+    ``structures`` describe coefficients, state, positions, velocities and noise.
+    """
+
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        new, *seen = advance_measurement(*(filled(each, given) for each in structures))
+        return [*leaves(new.encoder), *seen]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+def _motor_side(motors: ActuatorState | None) -> ActuatorState | None:
+    """Return the state of the motors without the sensors' state."""
+    return None if motors is None else ActuatorState(motors.command, motors.effort)
+
+
+def _sensor_side(motors: ActuatorState) -> ActuatorState:
+    """Return the part of the sensors' state that their program has: without key and step."""
+    return ActuatorState(sensor=motors.sensor, encoder=motors.encoder)
+
+
+def _returned(state: StepState) -> StepState:
+    """Return the part of a state that programs return: without matrices, and histories, which they change in place."""
+    motors = None if state.motors is None else state.motors._replace(command=None)
+    return state._replace(matrix=None, motors=motors)
+
+
+def _copied(state: StepState) -> StepState:
+    """Return the part of a state whose arrays keep their structure: without matrices and the key of the noise."""
+    motors = None if state.motors is None else state.motors._replace(key=None)
+    return state._replace(matrix=None, motors=motors)
+
+
+# -- nested named tuples of arrays -------------------------------------------------------------------------------------
+
+
+def is_leaf(tree: Any) -> bool:
+    """Return whether ``tree`` is an array, a symbol, or the place of one (``...``)."""
+    return isinstance(tree, np.ndarray | Symbol) or tree is ...
+
+
+def stacked(array: Any) -> Any:
+    """Return an array (n, envs, dof) as a stack of n arrays, and other arrays unchanged."""
+    return Stack(array) if array.ndim == 3 else array
+
+
+def leaves(tree: Any) -> list[Any]:
+    """Return the arrays in a nested tuple, in order."""
+    if is_leaf(tree):
+        return [tree]
+    return [leaf for part in tree for leaf in leaves(part)] if isinstance(tree, tuple) else []
+
+
+def mapped(function: Any, tree: Any) -> Any:
+    """Return a nested tuple with ``function`` applied to its arrays."""
+    if is_leaf(tree):
+        return function(tree)
+    if not isinstance(tree, tuple) or not tree:
+        return tree
+    parts = [mapped(function, part) for part in tree]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
+
+
+def structure(tree: Any) -> Any:
+    """Return a nested tuple with ``...`` in place of each array; it is hashable."""
+    return mapped(lambda _: ..., tree)
+
+
+def filled(tree: Any, given: Any) -> Any:
+    """Return a structure with its places filled from an iterator."""
+    return mapped(lambda _: next(given), tree)
+
+
+def _write(to: Any, values: Any) -> None:
+    """Copy the arrays of a nested tuple into another one of the same structure."""
+    for array, value in zip(leaves(to), leaves(values), strict=True):
+        array[...] = value
