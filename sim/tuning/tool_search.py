@@ -30,7 +30,7 @@ from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
 
-MOVES, FINAL_MOVES = 8, 16
+MOVES, FINAL_MOVES = 16, 16
 """Moves of the search and of its final round."""
 _FINAL_SEED = 1_000_003
 
