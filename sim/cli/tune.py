@@ -161,6 +161,8 @@ class TuneCommand:
         tool, (before, after) = found.settings["tool"], found.costs
         print(f"{robot.name}, {tool}: cost {before:.4f} by default, {after:.4f} as tuned\n")
         print(gains_table(("default", "tuned"), found.metrics))
+        if found.rejected:
+            print(f"\nThe default gains are written, the tuned ones are rejected: {found.rejected}.")
         save_osc_options(out, found.options, found.settings)
         history.unlink(missing_ok=True)
         print(f"\nwritten: {out}\nnext: {self._next_command(out)}")

@@ -30,7 +30,7 @@ from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
 
-MOVES, FINAL_MOVES = 8, 16
+MOVES, FINAL_MOVES = 16, 16
 """Moves of the search and of its final round."""
 _FINAL_SEED = 1_000_003
 
@@ -46,6 +46,8 @@ class ToolTuning(NamedTuple):
     """Metrics of the six axes on the moves of the final round (moves, 6): of the default gains, and of the result."""
     settings: dict[str, Any]
     """Seed, moves, options and versions, for the record."""
+    rejected: str | None = None
+    """Criterion by which the default gains beat all candidates, with both figures; None if a candidate was best."""
 
 
 def tune_tool(
@@ -119,10 +121,14 @@ def tune_tool(
             gains = judge.gains(finalists)
             finals, metrics = judge.evaluate(runner, gains)
             best = int(np.argmin(finals))
+    rejected = None
+    if not best:
+        rejected = f"cost in the final: best candidate {min(finals[1:]):.4f}, default {finals[0]:.4f}"
     each = [StepMetrics(*(leaf.reshape(len(finalists), FINAL_MOVES, 6)[k] for leaf in metrics)) for k in (0, best)]
     return ToolTuning(
         osc_options(gains[best]),
         (finals[0], finals[best]),
         (each[0], each[1]),
         {**settings, "generations": len(costs), "costs": [finals[0], finals[best]]},
+        rejected,
     )
