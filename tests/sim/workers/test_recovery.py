@@ -316,6 +316,25 @@ def test_a_tick_whose_call_ends_after_the_workers_answers_is_replayed_once(monke
             assert_identical(runner.step(setpoints()[1]), model.step(setpoints()[1]))
 
 
+def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
+    class Tape:
+        times, interrupts = (), 1
+
+        def append(self, time_, setpoint, observation):
+            if self.interrupts:
+                self.interrupts = 0
+                raise KeyboardInterrupt
+            self.times += (time_,)
+
+    with make_runner(workers=0) as runner:
+        tape = runner.recorder = Tape()
+        with pytest.raises(KeyboardInterrupt):
+            runner.step(setpoints()[0])
+        assert tape.times == ()
+        runner.observe()
+        assert tape.times == (runner.time,)
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
     results = []
