@@ -48,7 +48,7 @@ class NativeExecutor(NumPyExecutor):
         self._calls_force = self._reads_force and not self._steps_read_force
         self._compiles = is_compiled(layout, constants, pack.dof)
         if options.backend == "jax" and layout.law is not None:  # the law is XLA's
-            self._compiles &= constants.motors is None and not self._calls_force
+            self._compiles = False
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
