@@ -39,7 +39,6 @@ def test_every_benchmark_is_part_of_the_tests():
 
 def test_the_slow_tests_print_each_result_as_it_comes():
     assert " -vv " in recipe("soak")
-    assert "numprocesses" not in recipe("soak")
 
 
 def test_slow_tests_have_no_limits_of_their_own():

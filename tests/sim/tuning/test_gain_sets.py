@@ -65,7 +65,7 @@ def test_gains_of_other_programs_are_read_from_their_files(panda, tmp_path):
     assert (found.name, found.control) == ("arm.py", "pid")
     assert same(found.params, params)
     path.write_text(to_isaac_lab(params, panda.joint_names, 0.005).text)
-    with pytest.warns(UserWarning, match=r"arm.py: law: Isaac Lab's implicit drive"):
+    with pytest.warns(UserWarning, match=r"arm.py: law: stiffness and damping act implicitly"):
         gain_set(panda, str(path))
 
 
