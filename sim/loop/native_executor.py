@@ -14,20 +14,13 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.native.operations import MOST_SUMMED
+from batchpid.native.trees import leaves, mapped
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import (
-    REFRESH_STEPS,
-    Constants,
-    Layout,
-    Measured,
-    Step,
-    StepState,
-    control_step,
-)
+from batchpid.sim.loop.control_step import REFRESH_STEPS, Constants, Layout, Measured, Step, StepState, control_step
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
-from batchpid.sim.loop.tick_program import TickProgram, leaves, mapped
+from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
 
 LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")

@@ -12,6 +12,7 @@ from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Stack, Symbol
 from batchpid.native.tracing import Trace, trace
+from batchpid.native.trees import filled, leaves, mapped, structure
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
@@ -48,7 +49,7 @@ class TickProgram:
         self.reading = Measured(*np.zeros((3, *shape)))
         self.measured = self.reading if gravity else self.reading._replace(passive=None)
         self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
-        self._constants = mapped(stacked, constants)
+        self._constants = mapped(_stacked, constants)
         self._sensors: tuple[ArrayProgram, list[Float64], list[Float64]] | None = None
         self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
@@ -190,44 +191,9 @@ def _copied(state: StepState) -> StepState:
     return state._replace(matrix=None, motors=motors)
 
 
-# -- nested named tuples of arrays -------------------------------------------------------------------------------------
-
-
-def is_leaf(tree: Any) -> bool:
-    """Return whether ``tree`` is an array, a symbol, or the place of one (``...``)."""
-    return isinstance(tree, np.ndarray | Symbol) or tree is ...
-
-
-def stacked(array: Any) -> Any:
+def _stacked(array: Any) -> Any:
     """Return an array (n, envs, dof) as a stack of n arrays, and other arrays unchanged."""
     return Stack(array) if array.ndim == 3 else array
-
-
-def leaves(tree: Any) -> list[Any]:
-    """Return the arrays in a nested tuple, in order."""
-    if is_leaf(tree):
-        return [tree]
-    return [leaf for part in tree for leaf in leaves(part)] if isinstance(tree, tuple) else []
-
-
-def mapped(function: Any, tree: Any) -> Any:
-    """Return a nested tuple with ``function`` applied to its arrays."""
-    if is_leaf(tree):
-        return function(tree)
-    if not isinstance(tree, tuple) or not tree:
-        return tree
-    parts = [mapped(function, part) for part in tree]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
-
-
-def structure(tree: Any) -> Any:
-    """Return a nested tuple with ``...`` in place of each array; it is hashable."""
-    return mapped(lambda _: ..., tree)
-
-
-def filled(tree: Any, given: Any) -> Any:
-    """Return a structure with its places filled from an iterator."""
-    return mapped(lambda _: next(given), tree)
 
 
 def _write(to: Any, values: Any) -> None:

@@ -230,7 +230,8 @@ class Twin:
         """Close the runner, and go on with another one from a snapshot."""
         if self._recorders is not None:
             self.record()
-        snapshot = self.runner.snapshot()
+        snapshots: list[Snapshot] = []
+        undisturbed(lambda: snapshots.append(self.runner.snapshot()))  # a worker killed before is replaced now
         pids = self.runner.pids
         disturb(self.runner.close)
         self.runner.close()
@@ -238,7 +239,7 @@ class Twin:
         assert have_ended(pids)
         self._model.close()
         self.runner, self._model = self._make(self._workers), self._make(0)
-        self.restore(snapshot)
+        self.restore(snapshots[0])
 
     def construct(self, disturb: Disturbance = undisturbed) -> None:
         """Make one more runner and close it."""
