@@ -263,10 +263,11 @@ def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
     assert sorted(os.listdir(tmp_path)) == sorted([*methods, "armed"])
 
 
-def test_a_request_that_kills_every_worker_is_given_up(monkeypatch):
+def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path):
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 2)
 
     def crash(*_):
+        (tmp_path / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGSEGV)
 
     with (
@@ -274,6 +275,7 @@ def test_a_request_that_kills_every_worker_is_given_up(monkeypatch):
         pytest.raises(WorkerError, match=r"(?s)SIGSEGV.*lost 2 times.*workers=0"),
     ):
         runner.step(ROBOT.settings.target)
+    assert len(os.listdir(tmp_path)) == 2
 
 
 def test_an_error_in_a_loop_is_raised_with_its_traceback():
