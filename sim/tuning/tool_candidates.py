@@ -123,10 +123,17 @@ def _poses(control: OperationalSpace, qpos: Float64) -> Float64:
 
 
 def tool_metrics(rollout: Rollout, goal: Float64, start: Float64) -> StepMetrics:
-    """Return the metrics of the six axes for moves to ``goal`` from the poses ``start`` (envs, 7); inf if diverged."""
+    """Return the metrics of the six axes for moves to ``goal`` from the poses ``start`` (envs, 7); inf if diverged.
+
+    Overshoots are fractions of the farthest move of an axis, of the three of the position or of the rotation: an axis
+    may hardly move.
+    """
     assert rollout.tool_pose is not None
     course = np.where(rollout.ok[..., None], -pose_error(goal, rollout.tool_pose.astype(np.float64)), np.nan)
-    return step_metrics(rollout.tick, np.zeros(6), course, start=-pose_error(goal, start), absolute_band=BAND)
+    move = -pose_error(goal, start)
+    metrics = step_metrics(rollout.tick, np.zeros(6), course, start=move, absolute_band=BAND)
+    farthest = np.repeat(np.abs(move).reshape(-1, 2, 3).max(2), 3, axis=1)
+    return metrics._replace(overshoot=metrics.peak_deviation / np.maximum(farthest, BAND))
 
 
 class ToolCandidates:
