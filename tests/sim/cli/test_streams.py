@@ -43,7 +43,7 @@ RUNS = {
 UNDISTURBED = {name: {0, 2} if name == "render" else {0} for name in RUNS}
 """Exit statuses of these runs; 2 where this machine cannot render."""
 INPUTS = {"arm.urdf", "gains.yaml", "run.npz", "log.npz"}
-WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".npz", ".json", ".md", ".csv")
+WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".npz", ".json", ".md", ".csv", ".h")
 MOMENTS = int(os.environ.get("BATCHPID_SOAK_MOMENTS", "8"))
 """Number of interrupts of each command."""
 
