@@ -1,4 +1,4 @@
-"""Symbols that stand for arrays in a trace (:mod:`batchpid.native.tracing`), and the namespace of their operations."""
+"""Symbols in place of arrays in a trace (:mod:`batchpid.native.tracing`), and the namespace of their operations."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Stack(tuple[Any, ...]):
 class Symbol:
     """Array (rows, columns) in a trace; a mask holds 1.0 and 0.0.
 
-    It may also stand for a matrix in each row, or for a history of samples. A program changes a history in place.
+    It can also be a matrix in each row, or a history of samples, which a program changes in place.
     """
 
     def __init__(self, namespace: Namespace, is_mask: bool = False) -> None:

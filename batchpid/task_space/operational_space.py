@@ -158,21 +158,10 @@ def advance(
         return _integrated(k, state, sums, effort != whole), effort
 
 
-def advance_terms(
-    k: OSCCoefficients,
-    state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dynamics: TaskDynamics,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> tuple[OSCState, OSCTerms]:
+def advance_terms(k: OSCCoefficients, state: OSCState, *inputs: Any, **named: Any) -> tuple[OSCState, OSCTerms]:
     """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
     with quiet():
-        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
+        sums = _sums(k, state, *inputs, **named)
         effort, whole, s1, s2 = elementwise(_saturated, *sums.parts)
         state = _integrated(k, state, sums, effort != whole)
     p = sums.projections
@@ -231,10 +220,10 @@ def _sums(
     qpos: Any,
     qvel: Any,
     dynamics: TaskDynamics,
-    twist: Any,
-    acceleration: Any,
-    wrench: Any,
-    feedforward: Any,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
 ) -> _Sums:
     """Return the efforts of task and posture before saturation."""
     xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)

@@ -1,11 +1,11 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Sensors are a program of their own, since their noise, and the passive
-force at the measured state, are computed in Python: then each sim step is a call, and so it is where the passive force
-of the joints' state is (masses that vary). Where the control step cannot be traced (a caller's own controller, drives
-whose targets move within a tick), it runs in NumPy, and one native call applies the efforts, steps the engine and reads
-it. A sim step in which the friction model updates its mass matrix runs in the same way.
+arrays that hold the state from step to step. Python computes the noise of sensors, the passive force at a measured
+state, and the passive force of robots whose masses vary: with these each sim step is a call, and sensors have another
+program. Where the control step cannot be traced (a caller's controller, drives whose targets move within a tick), it
+runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the friction
+model updates its mass matrix runs in the same way.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ class NativeExecutor(NumPyExecutor):
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._calls_force = self._reads_force and not self._steps_read_force
-        self._compiles = is_compiled(layout, constants, pack.dof)
-        if options.backend == "jax" and layout.law is not None:  # the law is XLA's
-            self._compiles = False
+        has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
+        self._compiles = has_own_law and is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""

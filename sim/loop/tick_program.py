@@ -21,7 +21,7 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 
 
 class TickProgram:
-    """Control step of a group of envs as a program, and its arrays; ``gravity``: it takes a passive force.
+    """Control step of a group of envs as a program, and its arrays; with ``gravity`` it reads a passive force.
 
     Attributes
     ----------
@@ -132,8 +132,8 @@ class TickProgram:
 def _trace(layout: Layout, *structures: Any) -> Trace:
     """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
 
-    ``structures`` describe constants, state, command, reading, and what the sensors measure. No update of mass matrix
-    or friction is due.
+    ``structures`` describe constants, state, command, reading, and measured positions and velocities. No update of mass
+    matrix or friction is due.
     """
 
     def function(*symbols: Symbol) -> list[Any]:

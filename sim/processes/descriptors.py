@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def standard_streams_occupied() -> Iterator[None]:
-    """Let files that are opened inside have numbers above those of the standard streams.
+    """Give files that are opened inside a number above 2.
 
-    A program may have closed these. Without this, the next file would get such a number: text that is printed would go
-    into that file, and a child process would get another file under it.
+    The numbers 0 to 2 belong to the standard streams. In a program that has closed these, the next file would get such
+    a number, and printed text would go into it.
     """
     with contextlib.ExitStack() as files:
         number = 0

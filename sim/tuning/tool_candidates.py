@@ -5,7 +5,7 @@ positions and rotations. The tool makes moves within its reach, and the cost of 
 the worst move of the terms of :mod:`batchpid.sim.tuning.candidates`: for the response the mean over the six axes, with
 the error of each axis as its response; for chatter and saturation the mean over the joints.
 
-All candidates run in one runner: its setpoints hold the gains of each env, beside the pose.
+All candidates run in one runner: the setpoint of each env holds the pose and the gains.
 """
 
 from __future__ import annotations
