@@ -84,7 +84,8 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
-        self.models, self.rows = [robot.model] * self.size, self._pool.initial(self.size)
+        # A model of its own, since native code switches its contacts off and on.
+        self.models, self.rows = [copy.copy(robot.model)] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
         self._change_masses(range(self.size))
         self._update(range(self.size))
@@ -105,7 +106,7 @@ class MujocoPack(SingleOwner):
     def _own_model(self, row: int) -> Any:
         """Return the model of robot ``row`` alone, which may be changed."""
         model = self.models[row]
-        if model is self._robot.model or self.models.count(model) > 1:
+        if self.models.count(model) > 1:
             model = self.models[row] = copy.copy(model)
         return model
 

@@ -17,11 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine import native
+from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Group, Mujoco
 
-FUNCTIONS = {"step1": "mj_step1", "step2": "mj_step2", "set_log_handler": "mju_setLogHandler"}
-"""Functions of MuJoCo's library, by field of :class:`batchpid.sim.engine.native.interface.Mujoco`."""
+FUNCTIONS = {
+    "step1": "mj_step1",
+    "step2": "mj_step2",
+    "set_log_handler": "mju_setLogHandler",
+    "kinematics": "mj_kinematics",
+}
+"""Functions of MuJoCo's library, by field of the structures in :mod:`batchpid.sim.engine.native.interface`."""
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
 FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias"}
@@ -77,8 +83,11 @@ class MujocoStep:
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
     ) -> None:
-        addresses, data = functions(), take_data()
-        assert addresses is not None
+        found, data = functions(), take_data()
+        assert found is not None
+        addresses = dict(found)
+        kinematics, shapes = addresses.pop("kinematics"), shape_tables(robot)
+        clearance = None if shapes is None else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
         self._native = native.extension("_gateway")
         tables = {
             "models": [model._address for model in models],
@@ -88,6 +97,7 @@ class MujocoStep:
         arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
+        robots.clearance = None if clearance is None else clearance.address
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)
         self._group = Group(
             mujoco=ctypes.addressof(robots),
@@ -99,7 +109,7 @@ class MujocoStep:
             velocities=True,
             speed_limit=None if limit is None else limit.ctypes.data,
         )
-        self._take_data, self._kept = take_data, (models, data, arrays, robots, skip, limit)
+        self._take_data, self._kept = take_data, (models, data, arrays, robots, clearance, skip, limit)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension or of XLA; the robots are in their states."""

@@ -51,6 +51,20 @@ class Group(ctypes.Structure):
     ]
 
 
+class Clearance(ctypes.Structure):
+    """Shapes of robots in MuJoCo, and their clearances, as Clearance in clearance.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
+        *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
+        *((name, ctypes.c_void_p) for name in ("pairs", "arms", "travel", "last", "moved", "left", "rate", "wait")),
+        ("number", ctypes.c_int64),
+        ("flags", ctypes.c_int64),
+        ("contact", ctypes.c_int32),
+        ("unused", ctypes.c_int32),
+    ]
+
+
 class Mujoco(ctypes.Structure):
     """Robots in MuJoCo, as Mujoco in mujoco_step.h."""
 
@@ -58,6 +72,7 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
+        ("clearance", ctypes.c_void_p),
     ]
 
 
@@ -91,6 +106,7 @@ def _gateway_tables() -> tuple[Any, ...]:
         STATUS,
         FARTHEST,
         _layout(Group),
+        _layout(Clearance),
         _layout(Mujoco),
         _layout(Tick),
         list(BODY.items()),
@@ -110,6 +126,7 @@ EXTENSIONS = {
                 "gateway.cpp",
                 "gateway.h",
                 "mujoco_step.h",
+                "clearance.h",
                 "sim_step.h",
                 "tick.h",
                 "xla_call.h",

@@ -3,6 +3,8 @@
 
 #pragma once
 
+#include "clearance.h"
+
 #include <atomic>
 #include <csetjmp>
 #include <cstdint>
@@ -35,6 +37,7 @@ struct Mujoco {
   double *const *applied, *const *bias;
   std::int64_t const *qpos_at, *qvel_at;    // (dof,): places of the joints in these arrays
   double *qf;                               // (robots, dof): efforts last applied
+  Clearance const *clearance;               // or null: MuJoCo looks for contacts in every sim step
 };
 
 // Handler of MuJoCo's messages while this thread steps: an error, which would end the process, leaves the step.
@@ -86,9 +89,11 @@ class StoppedClock {
 // Return false after an error of MuJoCo, with its message.
 inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, double farthest, char *message) {
   std::jmp_buf frame;
+  Clearance const *clearance = mujoco.clearance;
   Messages::text = message;
   Messages::frame = &frame;
   if (setjmp(frame) != 0) {
+    if (clearance != nullptr) switch_contacts(*clearance, row, false);
     Messages::frame = nullptr;
     return false;
   }
@@ -98,7 +103,13 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
     double const q = mujoco.qpos[row][mujoco.qpos_at[joint]];
     finite = finite && q <= farthest && q >= -farthest;
   }
-  if (finite) mujoco.step1(mujoco.models[row], mujoco.data[row]);
+  if (finite) {
+    bool const clear =
+        clearance != nullptr && is_clear(*clearance, row, dof, mujoco.data[row], mujoco.qpos[row], mujoco.qpos_at);
+    if (clear) switch_contacts(*clearance, row, true);
+    mujoco.step1(mujoco.models[row], mujoco.data[row]);
+    if (clear) switch_contacts(*clearance, row, false);
+  }
   Messages::frame = nullptr;
   return true;
 }

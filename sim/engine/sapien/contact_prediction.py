@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
+from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
 
 MAX_ACCELERATION = 3000.0
 """Largest acceleration [m/s^2] of one link towards another that is predicted: a light finger's under full effort."""
@@ -44,25 +45,6 @@ WORLD = -1
 """Link number of the ground."""
 
 
-class LinkExtent(NamedTuple):
-    """Size of a link, and how the joint above it moves it."""
-
-    parent: int | None
-    """Number of the parent link; None for the root."""
-    dof: int | None
-    """Number of the joint above it; None if that joint is fixed."""
-    slides: bool
-    """True if that joint is prismatic."""
-    in_parent: Float64
-    """Pose of that joint in the parent's frame (4, 4), homogeneous [m]: the joint turns about x, or slides along it."""
-    in_link: Float64
-    """Pose of that joint in this link's frame (4, 4)."""
-    travel: float
-    """Largest distance by which that joint slides [m]."""
-    balls: Float64
-    """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
-
-
 class NearPair(NamedTuple):
     """Two shapes near each other: the numbers of their links, or WORLD, and their distance [m]."""
 
@@ -74,21 +56,16 @@ class NearPair(NamedTuple):
 class ContactPredictor:
     """Predictor of contact for a robot made of ``links``, parents first, of which the ``pairs`` may touch.
 
-    ``reach`` (len(links) + 1, dof) is the largest speed of a point of each link per unit of each joint's speed: the
-    distance from the joint [m], or 1 for a joint that slides. The last row is the world's. ``arms`` (pairs, dof) is how
-    fast the links of a pair close, at most, per unit of each joint's speed.
+    ``reach`` (len(links) + 1, dof) is that of the links, as :func:`batchpid.sim.engine.link_reach.link_reach` says, and
+    0 for the world. ``arms`` (pairs, dof) is how fast the links of a pair close, at most, per unit of each joint's
+    speed.
     """
 
     def __init__(
         self, links: Sequence[LinkExtent], pairs: Iterable[tuple[int, int]], dof: int, timestep: float
     ) -> None:
-        reach = np.zeros((len(links) + 1, dof))
-        for row, link in zip(reach, links, strict=False):
-            _add_reach(row, link, links)
-        self.reach = read_only(reach)
-        between = (reach[:, None] > 0) != (reach[None] > 0)
-        # A joint above both links does not change their distance.
-        self._arm = np.where(between, reach[:, None] + reach[None], 0.0)
+        self.reach = read_only(np.vstack([link_reach(links, dof), np.zeros(dof)]))
+        self._arm = closing_arms(self.reach[:, None], self.reach[None])
         self._lookahead, self._speed_gain = LOOKAHEAD_STEPS * timestep, MAX_ACCELERATION * timestep
         self._timestep = timestep
         pairs = [pair for pair in pairs if self._arm[pair].any()]
@@ -170,29 +147,6 @@ class ContactPredictor:
         table = np.minimum.reduceat(table, self._starts, axis=0)
         table = np.minimum.reduceat(table, [*self._starts, len(radii)], axis=1)
         return table[self._first_row, self._second_row]
-
-
-def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) -> None:
-    """Write into ``reach`` (dof,) the largest distance of the shapes of ``link`` from the axis of each joint above it.
-
-    Whatever the positions of the joints between: a ball that turns about an axis stays in a ball around a point on it.
-    A second bound is the sum of the distances along the chain.
-    """
-    centers, radii, at = link.balls[:, :3], link.balls[:, 3], link
-    farthest = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)
-    while at.parent is not None:
-        centers = (centers - at.in_link[:3, 3]) @ at.in_link[:3, :3]
-        farthest += np.linalg.norm(at.in_link[:3, 3])
-        if at.slides:
-            radii, farthest = radii + at.travel, farthest + at.travel
-        elif at.dof is not None:
-            radii = radii + np.hypot(centers[:, 1], centers[:, 2])
-            centers = centers * (1.0, 0.0, 0.0)
-        if at.dof is not None:
-            reach[at.dof] = 1.0 if at.slides else min(farthest, radii.max(initial=0.0))
-        centers = centers @ at.in_parent[:3, :3].T + at.in_parent[:3, 3]
-        farthest += np.linalg.norm(at.in_parent[:3, 3])
-        at = links[at.parent]
 
 
 class SafeRegions:

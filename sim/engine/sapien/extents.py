@@ -9,8 +9,9 @@ import numpy as np
 from sapien import physx
 
 from batchpid.arrays.array_types import Float64
+from batchpid.sim.engine.link_reach import LinkExtent
 from batchpid.sim.engine.sapien.collision_groups import may_touch
-from batchpid.sim.engine.sapien.contact_prediction import WORLD, LinkExtent
+from batchpid.sim.engine.sapien.contact_prediction import WORLD
 
 MAX_BALLS = 8
 """Largest number of balls that cover one shape."""

@@ -10,6 +10,7 @@ from robots import load_bundled
 from scripts import load_script
 
 from batchpid.sim import Runner
+from batchpid.sim.engine.link_reach import LinkExtent
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.contact_prediction import (
     LISTED_DISTANCE,
@@ -18,7 +19,6 @@ from batchpid.sim.engine.sapien.contact_prediction import (
     STEP_FACTOR,
     WORLD,
     ContactPredictor,
-    LinkExtent,
     NearPair,
     SafeRegions,
 )

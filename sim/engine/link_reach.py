@@ -1,0 +1,73 @@
+"""How far the shapes of a robot's links move when its joints do: bounds that hold at every pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Float64
+
+
+class LinkExtent(NamedTuple):
+    """Size of a link, and how the joint above it moves it."""
+
+    parent: int | None
+    """Number of the parent link; None for the root."""
+    dof: int | None
+    """Number of the joint above it; None if that joint is fixed."""
+    slides: bool
+    """True if that joint is prismatic."""
+    in_parent: Float64
+    """Pose of that joint in the parent's frame (4, 4), homogeneous [m]: the joint turns about x, or slides along it."""
+    in_link: Float64
+    """Pose of that joint in this link's frame (4, 4)."""
+    travel: float
+    """Largest distance by which that joint slides [m]."""
+    balls: Float64
+    """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
+
+
+def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
+    """Return the largest speed of a point of each link per unit of each joint's speed (links, dof), parents first.
+
+    That is the distance of its shapes from the joint's axis [m], or 1 for a joint that slides, and 0 for a joint that
+    does not move the link.
+    """
+    reach = np.zeros((len(links), dof))
+    for row, link in zip(reach, links, strict=True):
+        _add_reach(row, link, links)
+    return reach
+
+
+def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
+    """Return how fast two links close, at most, per unit of each joint's speed, from their reach (..., dof).
+
+    A joint above both links does not change their distance.
+    """
+    return np.where((first > 0) != (second > 0), first + second, 0.0)
+
+
+def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) -> None:
+    """Write into ``reach`` (dof,) the largest distance of the shapes of ``link`` from the axis of each joint above it.
+
+    Whatever the positions of the joints between: a ball that turns about an axis stays in a ball around a point on it.
+    A second bound is the sum of the distances along the chain.
+    """
+    centers, radii, at = link.balls[:, :3], link.balls[:, 3], link
+    farthest = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)
+    while at.parent is not None:
+        centers = (centers - at.in_link[:3, 3]) @ at.in_link[:3, :3]
+        farthest += np.linalg.norm(at.in_link[:3, 3])
+        if at.slides:
+            radii, farthest = radii + at.travel, farthest + at.travel
+        elif at.dof is not None:
+            radii = radii + np.hypot(centers[:, 1], centers[:, 2])
+            centers = centers * (1.0, 0.0, 0.0)
+        if at.dof is not None:
+            reach[at.dof] = 1.0 if at.slides else min(farthest, radii.max(initial=0.0))
+        centers = centers @ at.in_parent[:3, :3].T + at.in_parent[:3, 3]
+        farthest += np.linalg.norm(at.in_parent[:3, 3])
+        at = links[at.parent]

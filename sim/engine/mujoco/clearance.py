@@ -1,0 +1,162 @@
+"""Shapes of a robot in MuJoCo, for proofs in native code that none of them touch (``clearance.h``).
+
+Looking for contacts is a half of a sim step of a robot with meshes, and most of the time there are none.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
+from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.native.interface import Clearance
+
+Arrays = dict[str, NDArray[Any]]
+
+_BEYOND = 0.01
+"""Travel of a sliding joint beyond its limits for which clearances are proved [m]: limits are a little soft."""
+_NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_BEGINNING = 4096
+"""Bytes of ``mjModel`` in which its options are looked for; there are more."""
+_GEOM = mujoco.mjtGeom
+_KINDS = {
+    int(kind) for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX)
+} | {int(_GEOM.mjGEOM_MESH), int(_GEOM.mjGEOM_PLANE)}
+
+
+@lru_cache(maxsize=8)
+def shape_tables(robot: RobotMj) -> Arrays | None:
+    """Return the tables of shapes and pairs that ``Clearance`` in ``clearance.h`` lists, the same for every robot.
+
+    None if nothing can be proved: no shapes may touch, the base floats over ground, or the flag for contacts is not
+    found in this version of MuJoCo.
+    """
+    model = robot.model
+    pairs = touching_pairs(model) if flags_offset() is not None else np.empty((0, 2))
+    floats = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+    world = model.body_weldid[model.geom_bodyid] == 0
+    if not len(pairs) or (floats and world[pairs].any()) or not set(model.geom_type.tolist()) <= _KINDS:
+        return None
+    reach, travel = _reach(robot)
+    bodies = model.geom_bodyid[pairs]
+    meshes = np.where(model.geom_type == int(_GEOM.mjGEOM_MESH), model.geom_dataid, -1)
+    hulls = np.zeros((model.ngeom, 2), np.int32)
+    hulls[meshes >= 0] = np.stack([model.mesh_vertadr, model.mesh_vertnum], axis=1)[meshes[meshes >= 0]]
+    return {
+        "kinds": model.geom_type.astype(np.int32),
+        "sizes": model.geom_size.astype(float),
+        "radii": model.geom_rbound.astype(float),
+        "hulls": hulls,
+        "vertices": model.mesh_vert.astype(float).reshape(-1, 3),
+        "pairs": pairs,
+        "arms": closing_arms(reach[bodies[:, 0]], reach[bodies[:, 1]]),
+        "travel": travel,
+    }
+
+
+def touching_pairs(model: Any) -> NDArray[np.int32]:
+    """Return the pairs of shapes (pairs, 2), by number, for which MuJoCo looks for contacts; a plane comes first.
+
+    See "Collision detection" in MuJoCo's documentation: not within bodies that are welded together, not between a body
+    and its parent unless that is the world, not between excluded bodies, and not where the bits of type forbid it.
+    """
+    pairs = np.column_stack(np.triu_indices(model.ngeom, 1))
+    planes = model.geom_type == int(_GEOM.mjGEOM_PLANE)
+    pairs = np.where(planes[pairs[:, 1:]], pairs[:, ::-1], pairs)
+    bodies = np.sort(model.geom_bodyid[pairs], axis=1)
+    welded = model.body_weldid[bodies]
+    parents = model.body_weldid[model.body_parentid[welded]]
+    related = (welded != 0).all(axis=1) & (welded == parents[:, ::-1]).any(axis=1)
+    excluded = np.isin((bodies[:, 0] << 16) + bodies[:, 1], model.exclude_signature)
+    types = (model.geom_contype[pairs] & model.geom_conaffinity[pairs[:, ::-1]]).any(axis=1)
+    found = (welded[:, 0] != welded[:, 1]) & ~related & ~excluded & types & ~planes[pairs].all(axis=1)
+    return pairs[found].astype(np.int32)
+
+
+def _reach(robot: RobotMj) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the reach of the bodies (bodies, dof), and the positions of the joints at which it holds (2, dof)."""
+    model, dof = robot.model, len(robot.qvel)
+    places = {int(at): number for number, at in enumerate(robot.qvel)}
+    travel = np.tile([[-np.inf], [np.inf]], (1, dof))
+    links = []
+    for body in range(model.nbody):
+        pose, in_link = _pose(model.body_pos[body], model.body_quat[body]), np.eye(4)
+        number, slides, farthest = None, False, 0.0
+        for joint in np.flatnonzero(model.jnt_bodyid == body):
+            number = places.get(int(model.jnt_dofadr[joint]))
+            if number is None:  # a free joint
+                continue
+            slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+            in_link[:3, :3] = np.linalg.qr(np.column_stack([model.jnt_axis[joint], np.eye(3)]))[0]
+            in_link[:3, 3] = model.jnt_pos[joint]
+            if slides and model.jnt_limited[joint]:
+                travel[:, number] = model.jnt_range[joint] + (-_BEYOND, _BEYOND)
+            farthest = float(np.abs(travel[:, number]).max()) if slides else 0.0
+        balls = np.column_stack([model.geom_pos, model.geom_rbound])[model.geom_bodyid == body]
+        parent = int(model.body_parentid[body]) if body else None
+        links.append(LinkExtent(parent, number, slides, pose @ in_link, in_link, farthest, balls))
+    return link_reach(links, dof), travel
+
+
+def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    pose, turn = np.eye(4), np.empty(9)
+    mujoco.mju_quat2Mat(turn, wxyz)
+    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), position
+    return pose
+
+
+@cache
+def flags_offset() -> int | None:
+    """Return the place of ``opt.disableflags`` in ``mjModel`` [bytes], found by a change; None without exactly one."""
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    before = ctypes.string_at(model._address, _BEGINNING)
+    model.opt.disableflags ^= _NO_CONTACT
+    after = ctypes.string_at(model._address, _BEGINNING)
+    found = [place for place in range(_BEGINNING) if before[place] != after[place]]
+    return found[0] if len(found) == 1 and found[0] % 4 == 0 else None
+
+
+class GroupClearance:
+    """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of ``mj_kinematics``.
+
+    ``tables`` are those of :func:`shape_tables`, ``models`` and ``data`` of each robot. Native code switches the
+    contacts of a model off for the part of a sim step, so no other group may use these models. Nothing has to be done
+    when a robot is placed elsewhere: a clearance is that of the positions for which it was computed.
+
+    Attributes
+    ----------
+    arrays
+        By the names of the fields in ``clearance.h``.
+    """
+
+    def __init__(self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int) -> None:
+        robots, pairs = len(data), len(tables["pairs"])
+        addresses = {
+            "models": [model._address for model in models],
+            "places": [each.geom_xpos.ctypes.data for each in data],
+            "turns": [each.geom_xmat.ctypes.data for each in data],
+        }
+        arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
+        arrays |= tables | {name: np.zeros((robots, dof)) for name in ("last", "moved", "rate")}
+        arrays |= {"left": np.full((robots, pairs), -1.0, np.float32), "wait": np.ones(robots, np.int32)}
+        self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        self._kept = models, data
+        self._fields = Clearance(
+            kinematics=kinematics,
+            number=pairs,
+            flags=flags_offset(),
+            contact=_NO_CONTACT,
+            **{name: array.ctypes.data for name, array in self.arrays.items()},
+        )
+
+    @property
+    def address(self) -> int:
+        """Address of the fields."""
+        return ctypes.addressof(self._fields)
