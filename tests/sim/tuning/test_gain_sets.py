@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -78,6 +79,14 @@ def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
     )
     (path := tmp_path / "arm.xml").write_text(to_mjcf(panda, params, 1 / 2000).text)
     assert same(gain_set(panda, str(path)).params, params)
+    other = 'forcerange="-20.0 30.0" delay="0.01" nsample="9"'
+    path.write_text(path.read_text().replace('forcerange="-20.0 20.0"', other))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert same(gain_set(panda, str(path)).params, params)
+    said = " ".join(str(each.message) for each in warned)
+    assert "the limits of the effort differ by direction" in said
+    assert "has a delay, which is not simulated" in said
     path.write_text(path.read_text().replace("panda_joint1", "joint_1"))
     with pytest.raises(InvalidArgumentError, match="panda_joint1"):
         gain_set(panda, str(path))
