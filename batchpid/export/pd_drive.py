@@ -109,8 +109,11 @@ class Drive(Differences):
         limited |= np.isfinite(self.motor("effort_limit", math.inf))
         limited |= np.isfinite(self.motor("saturation_effort", math.inf))
         if (winds := (ki > 0) & limited & (used != "none")).any():
-            limit = self.listed(self.integral_limit, winds)
-            self.append(f"anti_windup: the integral goes on while the effort is at its limit, up to {limit} N m or N")
+            ends = np.isfinite(self.integral_limit)
+            limit = f"up to {self.listed(self.integral_limit, winds & ends)} N m or N" if (winds & ends).any() else ""
+            free = f"without end: {self.listed_names(winds & ~ends)}" if (winds & ~ends).any() else ""
+            how = "; ".join(each for each in (limit, free) if each)
+            self.append(f"anti_windup: the integral goes on while the effort is at its limit, {how}")
         low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
         uneven, ends, exact = -low != high, np.isfinite(low) | np.isfinite(high), np.asarray(clamps) | first
         both, passed = "the same in both directions", "passed by up to one step, ki dt |e|"

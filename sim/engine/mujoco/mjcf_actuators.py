@@ -26,7 +26,6 @@ A plain motor is a ``<general>`` actuator, with x = u(t - delay), or its first-o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,16 +170,11 @@ class MjcfActuators:
                 text = f"the setpoint's acceleration is not limited; here {found.listed(most, on)} rad/s^2 or m/s^2"
                 found.append(f"guard: {text}, a lag of up to {found.listed(lead, on)} rad or m")
         if (lost := own & self._dc & (np.isfinite(self._lower) | np.isfinite(self._upper))).any():
-            found.append(f"guard: a dcmotor has no limits of the position alone: {', '.join(self._names(lost))}")
+            found.append(f"guard: a dcmotor has no limits of the position alone: {found.listed_names(lost)}")
         if (turns := own & continuous & np.isfinite(self._slew)).any():
-            found.append(f"guard: setpoints do not go the short way round: {', '.join(self._names(turns))}")
+            found.append(f"guard: setpoints do not go the short way round: {found.listed_names(turns)}")
         if (moves := own & (found.value("kd") > 0)).any():
-            found.append(
-                f"guard: of the position input; the velocity input is as given: {', '.join(self._names(moves))}"
-            )
-
-    def _names(self, mask: NDArray[np.bool_]) -> Sequence[str]:
-        return [name for name, yes in zip(self._found.joints, mask, strict=True) if yes]
+            found.append(f"guard: of the position input; the velocity input is as given: {found.listed_names(moves)}")
 
 
 def _text(*numbers: float) -> str:
