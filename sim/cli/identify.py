@@ -166,6 +166,10 @@ def _not_identified(found: Identification) -> list[str]:
     if not of_joints and not others:
         return []
     lines = ["NOT IDENTIFIABLE from these logs, and ideal in the actuators file:"]
+    before, after = found.held_out_error
+    if not found.uncertainty.identified.any() and after < before and ("payload", None) in found.unknowns.names:
+        remedy = "pass --no-payload if the tool carries none, or record a longer motion without compensation"
+        return [*lines, f"  everything: no value is certain beside a payload; {remedy}"]
     if not found.uncertainty.identified.any():
         remedy = "check --params, --timestep and --compensate, or give more --evaluations"
         return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]

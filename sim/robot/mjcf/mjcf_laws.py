@@ -86,9 +86,25 @@ def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str
             yield "adds a constant force, which is not simulated", "give bias= to make_actuators", f"{bias[0]:g}"
     if servo is not None and min(servo.kp, servo.kv) < 0:
         yield "has a negative gain, which is 0 here", "correct the file", f"{min(servo.kp, servo.kv):g}"
-    inputs = _inputs(model, actuator)
-    if servo is not None and servo.kp > 0 and inputs and not inputs & _POSITION:
+    chosen = _is_pid(model, actuator) or _is_dcmotor(model, actuator)
+    if chosen and servo is not None and servo.kp > 0 and not _inputs(model, actuator) & _POSITION:
         yield "is a spring, as it has no position input: here the setpoint is its position", "set the setpoint to 0", ""
+    group = int(model.actuator_group[actuator])
+    if 0 <= group <= 30 and model.opt.disableactuator & (1 << group):
+        yield "is disabled in the file (actuatorgroupdisable): here it acts", "remove it from the file", ""
+
+
+def setpoint_range(model: Any, actuator: int, servo: Servo) -> tuple[float, float]:
+    """Return the range of the setpoint that a servo is limited to, in its own units; infinite without one."""
+    chosen = _is_pid(model, actuator) or _is_dcmotor(model, actuator)
+    if servo.kp <= 0 or (chosen and not _inputs(model, actuator) & _POSITION):
+        return -math.inf, math.inf
+    first = int(model.actuator_ctrladr[actuator]) if hasattr(model, "actuator_ctrladr") else actuator
+    if not model.actuator_ctrllimited[first]:
+        return -math.inf, math.inf
+    gain = 1.0 if chosen else float(model.actuator_gainprm[actuator, 0]) / servo.kp
+    low, high = sorted(float(gain * end) for end in model.actuator_ctrlrange[first])
+    return low, high
 
 
 def _is_pid(model: Any, actuator: int) -> bool:

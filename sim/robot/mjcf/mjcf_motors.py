@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_laws import Line, line_of, servo_of, unread
+from batchpid.sim.robot.mjcf.mjcf_laws import Line, line_of, servo_of, setpoint_range, unread
 from batchpid.sim.robot.mjcf.mjcf_names import Names
 
 Couplings = dict[str, tuple[str, float, float]]
@@ -138,6 +138,7 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
                 kv[name] += max(arm**2 * servo.kv, 0.0)
                 ki[name] += arm**2 * servo.ki
                 most[name] += abs(arm) * servo.ki * servo.imax if servo.ki else 0.0
+                findings += _narrower(model, names, name, setpoint_range(model, actuator, servo), arm)
                 if servo.rate:
                     rate[name] = min(rate.get(name, math.inf), servo.rate / abs(arm))
     for name in [name for name in lines if driven[name] > 1]:
@@ -161,6 +162,21 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     speed = {name: lines[name].speed for name in stall}
     lag = {name: line.lag for name, line in lines.items() if line.lag}
     return Motors(dict(limits), armature, damping, dict(kp), dict(kv), dict(ki), imax, rate, stall, speed, lag)
+
+
+def _narrower(model: Any, names: Names, name: str, ends: tuple[float, float], arm: float) -> list[Finding]:
+    """Return a finding if a servo limits the setpoint of a joint to less than the joint's range."""
+    joint = next(joint for joint, each in names.joints.items() if each == name)
+    low, high = sorted(end / arm for end in ends)
+    lower, upper = model.jnt_range[joint] if model.jnt_limited[joint] else (-math.inf, math.inf)
+    margin = 1e-3 * (upper - lower) if math.isfinite(upper - lower) else 0.0
+    if low <= lower + margin and high >= upper - margin:
+        return []
+    text, remedy = (
+        "the setpoint is not limited to the range that the servo has in the file",
+        "pass make_guard(lower=...)",
+    )
+    return [Finding("note", "actuator", text, remedy, name, detail=f"{low:g} to {high:g}")]
 
 
 def _field(model: Any, name: str, index: int) -> float:

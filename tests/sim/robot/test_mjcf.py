@@ -420,12 +420,24 @@ def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
         ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "not proportional to its input"),
         ('<pid joint="j" kp="5" input="vel ff"/>', "is a spring"),
         ('<dcmotor joint="j" nominal="24 6 3" cogging="1 4 0" lugre="9 1 1 1 1"/>', "cogging, friction (lugre)"),
+        (
+            '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
+            "is disabled in the file",
+        ),
+        ('<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2" gear="-2"/>', "(-2 to 1)"),
         ('<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9"/><motor joint="j"/>', "one of several actuators"),
     ],
 )
 def test_what_an_actuator_does_besides_is_told(load, actuator, said):
     robot = load(two_links(rest=f"<actuator>{actuator}</actuator>"))
     assert [said in str(each) for each in robot.repairs if each.code == "actuator"] == [True]
+
+
+def test_the_range_of_a_joint_is_no_narrower_range_of_its_setpoint(load):
+    joint = '<joint name="j" range="-90 90"/>'
+    for share, told in ((1, 0), (0.5, 1)):
+        robot = load(two_links(joint, rest=f'<actuator><pid joint="j" kp="2" inheritrange="{share}"/></actuator>'))
+        assert len(robot.repairs) == told
 
 
 def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
