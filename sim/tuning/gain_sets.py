@@ -86,4 +86,8 @@ def _of_mjcf(path: Path, joints: list[str]) -> Imported:
         raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
     gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
     sentences = summary(each for each in other.repairs if each.code in _OF_GAINS)
-    return Imported(gains, joints, tuple(each.partition(": ")[2] for each in sentences))
+    found = [each.partition(": ")[2] for each in sentences]
+    if gains.continuous is not None:
+        turning = ", ".join(joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes)
+        found.append(f"continuous: errors are taken the short way round, which MuJoCo does not: {turning}")
+    return Imported(gains, joints, tuple(found))
