@@ -360,6 +360,26 @@ def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
     assert np.abs(ours[-1] - moves.start).max() > 0.5
 
 
+def test_a_robot_read_from_its_file_is_written_with_the_same_actuators(tmp_path):
+    loaded = Robot.load("panda")
+    gains = {
+        "ki": np.linspace(1, 30, 9),
+        "integral_limit": np.linspace(0.1, 2, 9),
+        "effort_limit": np.linspace(3, 9, 9),
+    }
+    params = bp.make_params(9, np.linspace(5, 80, 9), kd=2.0, measurement_rate="measured", **gains)
+    line = {"saturation_effort": np.r_[4.0, 8.0, [np.inf] * 7], "no_load_speed": np.r_[2.0, 3.0, [np.inf] * 7]}
+    motors = bp.make_actuators(9, lag=np.r_[0, 0.007, 0.007, [0] * 6], armature=0.1, **line)
+    exported = to_mjcf(loaded, params, DT, actuators=motors, guard=loaded.guard())
+    (path := tmp_path / "arm.xml").write_text(exported.text)
+    other = Robot.load(path)
+    assert not other.repairs
+    again = to_mjcf(other, other.mjcf_gains(), DT, actuators=other.actuators, guard=other.guard())
+    actuators = [text[text.index("<actuator>") : text.index("</actuator>")] for text in (exported.text, again.text)]
+    assert actuators[0].count("<dcmotor") == 3
+    assert actuators[0] == actuators[1]
+
+
 LINKS = [link(name, INERTIAL) for name in "wxyz"]
 CHAIN = [*LINKS, *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy", "yz"), strict=True))]
 
