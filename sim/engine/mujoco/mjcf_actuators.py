@@ -42,6 +42,7 @@ _INPUTS = {"input": "pos vel ff"}
 class MjcfActuators:
     """Actuators of the joints: ``elements`` as (tag, attributes), and their differences, which are added to ``found``.
 
+    ``has_rate``, ``has_lag`` and ``is_dcmotor`` are masks (joints,) of limited setpoints, lags and DC motors;
     ``effort_range`` is the range of the effort (joints, 2) [N m or N] that a joint needs for itself, as its actuator
     has a symmetric one only; infinite elsewhere.
     """
@@ -57,7 +58,7 @@ class MjcfActuators:
         self._lag, self._strength = found.motor("lag"), found.motor("strength", 1.0)
         has_line = np.isfinite(self._stall)
         self._line = has_line & (controls | (self._strength > 0))
-        self._dc = self._line | (controls & (self._lag > 0))
+        self.is_dcmotor = self._line | (controls & (self._lag > 0))
         self._slew, self._lower, self._upper = (
             np.full(len(own), off)
             if guard is None or (leaf := getattr(guard, name)) is None
@@ -65,9 +66,9 @@ class MjcfActuators:
             for name, off in (("rate", math.inf), ("lower", -math.inf), ("upper", math.inf))
         )
         self.effort_range = np.array([self._low, self._high]).T
-        self.effort_range[~self._dc | (-self._low == self._high)] = -math.inf, math.inf
+        self.effort_range[~self.is_dcmotor | (-self._low == self._high)] = -math.inf, math.inf
         self.elements = [self._element(int(at)) for at in np.flatnonzero(own)]
-        self.start_columns = np.flatnonzero(own & np.isfinite(self._slew))
+        self.has_rate, self.has_lag = own & np.isfinite(self._slew), own & (self._lag > 0)
         self._compare(has_line)
         if guard is not None:
             self._compare_guard(guard, continuous)
@@ -84,7 +85,7 @@ class MjcfActuators:
             problem = "must be below effort_max for MuJoCo"
             raise InvalidArgumentError("effort_min", problem, joint=name, value=low, remedy="widen the limits")
         limits = {"forcerange": _text(*np.clip([low, high], -FAR, FAR))} if limited else {}
-        if self._dc[at]:
+        if self.is_dcmotor[at]:
             return "dcmotor", common | self._dcmotor(at, low, high)
         if self.controls:
             return "pid", common | self._pid(at) | limits
@@ -135,11 +136,11 @@ class MjcfActuators:
         found, own = self._found, self._own
         has = {"armature", "viscous", "coulomb", "command_delay", "saturation_effort", "lag"}
         if self.controls:
-            found.compare_integral(first=False, clamps=self._dc)
+            found.compare_integral(first=False, clamps=self.is_dcmotor)
             found.delays_setpoint("; until the first input is due, all are 0, or as mj_initCtrlHistory sets them")
         else:
             has |= {"strength", "bias"}
-            if (lost := own & self._dc & (found.motor("bias") != 0)).any():
+            if (lost := own & self.is_dcmotor & (found.motor("bias") != 0)).any():
                 found.append(f"bias: none in a dcmotor; here {found.listed(found.motor('bias'), lost)} N m or N")
             if (lost := own & has_line & ~self._line).any():
                 found.append(f"saturation_effort: none without strength: {found.listed(self._stall, lost)} N m or N")
@@ -169,7 +170,7 @@ class MjcfActuators:
             if (on := own & np.isfinite(most)).any():
                 text = f"the setpoint's acceleration is not limited; here {found.listed(most, on)} rad/s^2 or m/s^2"
                 found.append(f"guard: {text}, a lag of up to {found.listed(lead, on)} rad or m")
-        if (lost := own & self._dc & (np.isfinite(self._lower) | np.isfinite(self._upper))).any():
+        if (lost := own & self.is_dcmotor & (np.isfinite(self._lower) | np.isfinite(self._upper))).any():
             found.append(f"guard: a dcmotor has no limits of the position alone: {found.listed_names(lost)}")
         if (turns := own & continuous & np.isfinite(self._slew)).any():
             found.append(f"guard: setpoints do not go the short way round: {found.listed_names(turns)}")

@@ -157,18 +157,26 @@ def _add_actuators(root: Any, motors: MjcfActuators) -> None:
 
 
 def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfActuators) -> None:
-    """Add the keyframe "home": the start pose as position and setpoint."""
-    qpos, ctrl, act = model.qpos0.copy(), np.zeros(model.nu), np.zeros(model.na)
+    """Add the keyframe "home": the start pose as position and setpoint, held by the motors against gravity."""
+    data = mujoco.MjData(model)
     for at, name in enumerate(robot.joint_names):
-        qpos[model.joint(name).qposadr] = robot.start[at]
-    limited = {robot.joint_names[at] for at in motors.start_columns}
+        data.qpos[model.joint(name).qposadr] = robot.start[at]
+    mujoco.mj_forward(model, data)
+    holding = np.array([[data.qfrc_bias[model.joint(name).dofadr[0]] for name in robot.joint_names]])
+    if robot.coupling is not None:
+        holding = robot.coupling.efforts(holding)
+    ctrl, act = np.zeros(model.nu), np.zeros(model.na)
     for actuator in range(model.nactuator):
-        at = robot.joint_names.index(name := model.actuator(actuator).name)
+        at = robot.joint_names.index(model.actuator(actuator).name)
+        first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
         if motors.controls:
             ctrl[model.actuator_ctrladr[actuator]] = robot.start[at]
-        if name in limited:  # the setpoint is the first of its states
-            act[model.actuator_actadr[actuator]] = robot.start[at]
-    columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
+        if motors.has_rate[at]:  # the setpoint is the first of the states
+            act[first] = robot.start[at]
+        if motors.has_lag[at]:  # the current, or the filtered input, is the last
+            constant = model.actuator_gainprm[actuator, 1] if motors.is_dcmotor[at] else 1.0
+            act[first + count - 1] = holding[0, at] / constant
+    columns = {"qpos": data.qpos, "ctrl": ctrl, "act": act}
     figures = {key: " ".join(repr(float(each)) for each in row) for key, row in columns.items() if row.any()}
     etree.SubElement(etree.SubElement(root, "keyframe"), "key", {"name": "home", **figures})
 

@@ -94,14 +94,18 @@ def test_the_actuators_compute_the_law_with_limits_and_feedforward():
     assert 100 < saturated < 2600
 
 
-def test_the_file_moves_as_the_runner_does():
+@pytest.mark.parametrize("effects", [{}, {"saturation_effort": 60.0, "no_load_speed": 9.0}, {"lag": 0.003}])
+def test_the_file_moves_as_the_runner_does(effects):
     loaded = Robot.load("panda")
-    params = plain(loaded, effort_limit=loaded.effort_limit)
-    model = model_of(to_mjcf(loaded, params, DT))
+    params = plain(loaded, **({} if effects else {"effort_limit": loaded.effort_limit}))
+    motors = bp.make_actuators(9, **effects)
+    exported = to_mjcf(loaded, params, DT, actuators=motors)
+    assert exported.differences == ()
+    model = model_of(exported)
     data, goal = mujoco.MjData(model), 0.5 * (loaded.start + loaded.settings.target)
-    data.qpos[:] = loaded.start
+    mujoco.mj_resetDataKeyframe(model, data, 0)
     options = {"workers": 0, "timestep": DT, "substeps": 1, "engine": "mujoco", "compensate": "gravity+coriolis"}
-    with Runner(loaded, 1, params=params, **options) as runner:
+    with Runner(loaded, 1, params=params, actuators=motors, **options) as runner:
         runner.reset()
         for _ in range(200):
             reached = runner.step(goal).qpos[0]
@@ -199,7 +203,7 @@ def arm_motion(step, joints=9):
 def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded):
     """The guard, the law and the motors of batchpid, step by step, are MuJoCo's actuators.
 
-    A lag beside a line is listed: MuJoCo's does not end at the line.
+    A lag beside a line is listed: MuJoCo's does not end at the line. At the keyframe motors hold the robot.
     """
     loaded = Robot.load("panda")
     params = plain(loaded).replace(kp=np.linspace(5, 80, 9), ki=np.linspace(1, 30, 9))
@@ -214,10 +218,11 @@ def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     np.testing.assert_array_equal(data.qpos, loaded.start)
-    state = bp.init(params, data.qpos[None])
-    motor = None if motors is None else motor_model.init(motors, data.qpos[None], DT)
+    mujoco.mj_forward(model, data)
+    state, holding = bp.init(params, data.qpos[None]), data.qfrc_bias[None].copy()
+    motor = None if motors is None else motor_model.init(motors, data.qpos[None], DT, effort=holding)
     guard_state = None if guard is None else guard_model.init(guard, data.qpos[None])
-    clipped, late = 0, np.zeros((1, 9))
+    clipped, late = 0, holding
     for step in range(400):
         wanted, rate, feedforward = arm_motion(step)
         data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
