@@ -103,6 +103,10 @@ class Differences(list[str]):
             return texts[0][1]
         return ", ".join(f"{joint} {text}" for joint, text in texts)
 
+    def listed_names(self, where: Any) -> str:
+        """Return the joints of the mask ``where``, as text."""
+        return ", ".join(joint for joint, yes in zip(self.joints, where, strict=True) if yes)
+
     def lack(self, option: str, problem: str, off: float, unit: str = "") -> None:
         """Add an option that the target lacks, where it is on."""
         values = self.value(option, off)

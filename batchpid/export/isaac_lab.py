@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.checks.validate import choice, identifier
+from batchpid.checks.validate import choice, identifier, positive
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
@@ -52,7 +52,7 @@ def to_isaac_lab(
         Motors, of one env: delay, torque-speed line, effort limit, armature, friction.
     model
         ``"implicit"``, ``"ideal_pd"``, ``"dc_motor"`` or ``"delayed_pd"``. Default: "delayed_pd" for motors with a
-        command delay, "dc_motor" for others with a torque-speed line, else "implicit".
+        command delay of half a step and more, "dc_motor" for others with a torque-speed line, else "implicit".
     name
         Of the variable, a dict of configurations: one for each set of joints with one delay or one stall effort.
     inertia
@@ -66,7 +66,8 @@ def to_isaac_lab(
     motors = Actuators() if actuators is None else actuators
     has_line = getattr(motors, "saturation_effort", None) is not None
     if model is None:
-        delayed = getattr(motors, "command_delay", None) is not None
+        delay = getattr(motors, "command_delay", None)
+        delayed = delay is not None and bool(np.rint(np.asarray(delay) / positive("dt", dt, "s")).any())
         model = "delayed_pd" if delayed else "dc_motor" if has_line else "implicit"
     choice("model", model, CLASSES)
     identifier("name", name)

@@ -37,7 +37,10 @@ _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
 }
 _MOST_POWER = 4
 _CONSTANTS = {"pi": math.pi, "inf": math.inf}
-"""Attributes of modules such as math, numpy and torch."""
+_MODULES = ("math", "np", "numpy", "torch")
+"""Modules with these constants."""
+_OTHERS = ("joint_names_expr", "class_type", "velocity_limit_sim")
+"""Arguments of a configuration that are not figures read here."""
 
 
 def from_isaac_lab(text: str, joint_names: Sequence[str], *, dt: float | None = None) -> ImportedMotors:
@@ -156,6 +159,12 @@ class _Figures:
     def differences(self) -> list[str]:
         """Return the differences of the law from the configurations."""
         found = []
+        configurations = {id(arguments): arguments for _, arguments in self.of_joint.values()}.values()
+        for arguments in configurations:
+            found += [f"{key}: not read" for key in arguments if key not in _FIGURES and key not in _OTHERS]
+            keys = [(key, pattern) for key, value in arguments.items() if isinstance(value, dict) for pattern in value]
+            unused = [each for each in keys if not any(_matches([each[1]], joint) for joint in self.of_joint)]
+            found += [f"{key}: no joint matches {pattern!r}" for key, pattern in unused]
         classes = {cls for cls, _ in self.of_joint.values()}
         if CLASSES["implicit"] in classes:
             found.append("law: stiffness and damping act implicitly in Isaac Lab, which damps more")
@@ -179,25 +188,59 @@ def _groups(text: str) -> list[tuple[str, dict[str, Any]]]:
     for statement in tree.body:
         calls = [node for node in ast.walk(statement) if isinstance(node, ast.Call)]
         of_actuators = [call for call in calls if any(each.arg == "joint_names_expr" for each in call.keywords)]
-        groups += [_group(call, known) for call in of_actuators]
         given: dict[str, Any] = {}
+        evaluated: ast.AST = statement
         if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
             targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+            evaluated = statement.value  # before the targets are bound
             with contextlib.suppress(InvalidArgumentError):  # no number, such as the robot's configuration
                 value = _value(statement.value, known)
                 given = {target.id: value for target in targets if isinstance(target, ast.Name)}
-        nodes = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
-        stored = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
-        known = {name: value for name, value in known.items() if name not in stored} | given
+        bound, inside = _bound(statement), _bound(evaluated)
+        groups += [
+            _group(call, {name: each for name, each in known.items() if name not in inside}) for call in of_actuators
+        ]
+        read = {id(node) for call in of_actuators for node in ast.walk(call)}
+        loaded = {node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and id(node) not in read}
+        known = {
+            name: each
+            for name, each in known.items()
+            if name not in bound and not (name in loaded and isinstance(each, list | dict)) and "*" not in bound
+        } | given
     if not groups:
         raise InvalidArgumentError("text", "holds no actuators of Isaac Lab", remedy="give ImplicitActuatorCfg(...)")
     return groups
 
 
+def _bound(tree: Any) -> set[str]:
+    """Return the names that a syntax tree binds: variables, parameters, functions, classes and imports."""
+    found = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store() | ast.Del()) | ast.arg(arg=name):
+                found.add(name)
+            case ast.alias(name=name, asname=other):
+                found.add(other or name.partition(".")[0])
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                found.add(name)
+            case ast.ExceptHandler(name=str(name)) | ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+                found.add(name)
+            case ast.MatchMapping(rest=str(name)):
+                found.add(name)
+    return found
+
+
 def _changes(text: str) -> list[str]:
-    """Return the assignments that change a configuration after its call."""
+    """Return the statements that change a configuration after its call."""
     found = []
     for node in ast.walk(ast.parse(text)):
+        match node:
+            case ast.Call(func=ast.Attribute(attr="replace"), keywords=words) if {
+                each.arg for each in words
+            } & _FIGURES:
+                found.append(f"line {node.lineno}: not read: {ast.unparse(node)}")
+            case ast.Call(func=ast.Name(id="setattr"), args=[_, ast.Constant(value=str(name)), _]) if name in _FIGURES:
+                found.append(f"line {node.lineno}: not read: {ast.unparse(node)}")
         if isinstance(node, ast.Assign | ast.AugAssign):
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
             if isinstance(target, ast.Attribute) and target.attr in _FIGURES:
@@ -224,7 +267,7 @@ def _value(node: ast.expr, known: dict[str, Any]) -> Any:
             return value
         case ast.Name(id=name) if name in known:
             return known[name]
-        case ast.Attribute(value=ast.Name(), attr=name) if name in _CONSTANTS:
+        case ast.Attribute(value=ast.Name(id=module), attr=name) if name in _CONSTANTS and module in _MODULES:
             return _CONSTANTS[name]
         case ast.List(elts=entries) | ast.Tuple(elts=entries):
             return [_value(entry, known) for entry in entries]

@@ -76,11 +76,11 @@ class Drive(Differences):
         if self.actuators.limit_positions is not None and "position_limit" not in has:
             self.append("position_limit: no limit by position")
 
-    def delays_setpoint(self) -> None:
-        """Add the difference of a target that delays the setpoint."""
+    def delays_setpoint(self, more: str = "") -> None:
+        """Add the difference of a target that delays the setpoint; ``more`` is added to the sentence."""
         if (delay := self.motor("command_delay")).any():
             lag = self.degrees(delay)
-            self.append(f"command_delay: of the setpoint, not of the effort: the law is not late{lag}")
+            self.append(f"command_delay: of the setpoint, not of the effort: the law is not late{lag}{more}")
 
     def delay_steps(self) -> list[int]:
         """Return the delay of the setpoint of each joint in whole steps, and add its differences."""
@@ -98,22 +98,28 @@ class Drive(Differences):
         low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
         return np.maximum(np.minimum(-low, high), 0.0)
 
-    def compare_integral(self, first: bool) -> None:
+    def compare_integral(self, first: bool, clamps: ArrayLike = False) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.
 
-        ``first``: it integrates before the output, else after, and then beyond its limit by one step.
+        ``first``: it integrates before the output, else after, and then beyond its limit by one step, except for the
+        joints of the mask ``clamps``.
         """
         ki, used = self.value("ki"), np.array(strategies(self.params))
         limited = np.isfinite(self.value("effort_min", -math.inf)) | np.isfinite(self.value("effort_max", math.inf))
+        limited |= np.isfinite(self.motor("effort_limit", math.inf))
+        limited |= np.isfinite(self.motor("saturation_effort", math.inf))
         if (winds := (ki > 0) & limited & (used != "none")).any():
-            limit = self.listed(self.integral_limit, winds)
-            self.append(f"anti_windup: the integral goes on while the effort is at its limit, up to {limit} N m or N")
+            ends = np.isfinite(self.integral_limit)
+            limit = f"up to {self.listed(self.integral_limit, winds & ends)} N m or N" if (winds & ends).any() else ""
+            free = f"without end: {self.listed_names(winds & ~ends)}" if (winds & ~ends).any() else ""
+            how = "; ".join(each for each in (limit, free) if each)
+            self.append(f"anti_windup: the integral goes on while the effort is at its limit, {how}")
         low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
-        uneven, ends = -low != high, np.isfinite(low) | np.isfinite(high)
-        if ((ki > 0) & (uneven if first else ends)).any():
-            limits = self.listed(self.integral_limit, ki > 0)
-            how = "the same in both directions" if first else "passed by up to one step, ki dt |e|"
-            self.append(f"integral_limit: {limits} N m or N, {how}")
+        uneven, ends, exact = -low != high, np.isfinite(low) | np.isfinite(high), np.asarray(clamps) | first
+        both, passed = "the same in both directions", "passed by up to one step, ki dt |e|"
+        for how, where in ((both, uneven & exact), (passed, ends & ~exact)):
+            if (some := (ki > 0) & where).any():
+                self.append(f"integral_limit: {self.listed(self.integral_limit, some)} N m or N, {how}")
         if isinstance(self.params.integration, IntegrateFirst) != first and ki.any():
             phase = self.phase(self.params._replace(integration=IntegrateFirst() if first else None))
             how = "before the output, a step earlier" if first else "after the output, a step later"

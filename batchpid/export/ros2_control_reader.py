@@ -103,6 +103,9 @@ def _joints(name: str, body: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the checked gains of each joint of a controller."""
     trajectory = "joints" in body
     joints = names(f"{name}.{'joints' if trajectory else 'dof_names'}", body.get("joints", body.get("dof_names")))
+    if (driven := body.get("command_joints") or joints) != joints:
+        remedy = "the law needs gains from a joint's position to its own effort"
+        raise InvalidArgumentError(f"{name}.command_joints", "are not its joints", value=driven, remedy=remedy)
     commands = body.get("command_interfaces", ["effort"]) if trajectory else [body.get("command_interface", "effort")]
     if commands != ["effort"]:
         remedy = "the law needs gains from positions to efforts"

@@ -179,8 +179,8 @@ def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) ->
     load_engine("mujoco")  # raises without MuJoCo
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 
-    exported = to_mjcf(robot, params, dt, actuators=robot.actuators, inertia=_inertia(robot))
-    return exported._replace(differences=(*exported.differences, *([UNLIMITED] if limits else [])))
+    guard = robot.guard() if limits else None
+    return to_mjcf(robot, params, dt, actuators=robot.actuators, guard=guard, inertia=_inertia(robot))
 
 
 def _motors(robot: Robot) -> bp.Actuators:

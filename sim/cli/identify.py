@@ -34,8 +34,9 @@ class IdentifyCommand:
 
     robot: flags.RobotName = "panda"
     logs: Logs = ()
-    params: flags.OptionalPath = None
-    """Params file (.yaml or .json) of the PID law that drove the robot. Without it the logs' efforts are used."""
+    params: flags.OptionalName = None
+    """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
+    other commands. Without it the logs' efforts are used."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
     timestep: float = 1 / 2000
     """Time step of the control that drove the robot [s]."""
@@ -78,7 +79,7 @@ class IdentifyCommand:
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        outputs = Outputs(force=self.force, inputs=(self.params, *self.logs))
+        outputs = Outputs(force=self.force, inputs=(None if self.params is None else Path(self.params), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
@@ -107,12 +108,22 @@ class IdentifyCommand:
         history.unlink(missing_ok=True)
 
 
-def _params(robot: Robot, path: Path) -> Any:
-    """Return the params of a file, of all joints of ``robot`` or of some, in the robot's order."""
+def _params(robot: Robot, name: str) -> Any:
+    """Return gains by name or file, of all joints of ``robot``; a params file may hold some of them."""
     import batchpid as bp
+    from batchpid.export.ros2_control_reader import is_ros2_control
+    from batchpid.io import documents
+    from batchpid.sim.tuning.gain_sets import NAMES, gain_set
 
+    path, known = Path(name), [each for each in NAMES if each != "drive"]
+    if name not in known and not path.is_file():
+        remedy = f"use a file or {', '.join(known)}"
+        raise InvalidArgumentError("params", "is neither a name nor a file of gains", value=name, remedy=remedy)
+    kind = path.suffix.lower()
+    if name in known or kind in (".py", ".xml") or (kind != ".json" and is_ros2_control(documents.read(path))):
+        return gain_set(robot, name).params
     names = bp.load_params(path)[1]
-    order = [name for name in robot.joint_names if name in names]
+    order = [joint for joint in robot.joint_names if joint in names]
     if len(order) < len(names):
         return bp.load_params(path, robot.joint_names)[0]  # raises, naming the joints
     return bp.load_params(path, order)[0]
@@ -155,6 +166,10 @@ def _not_identified(found: Identification) -> list[str]:
     if not of_joints and not others:
         return []
     lines = ["NOT IDENTIFIABLE from these logs, and ideal in the actuators file:"]
+    before, after = found.held_out_error
+    if not found.uncertainty.identified.any() and after < before and ("payload", None) in found.unknowns.names:
+        remedy = "pass --no-payload if the tool carries none, or record a longer motion without compensation"
+        return [*lines, f"  everything: no value is certain beside a payload; {remedy}"]
     if not found.uncertainty.identified.any():
         remedy = "check --params, --timestep and --compensate, or give more --evaluations"
         return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]

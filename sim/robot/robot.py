@@ -84,7 +84,7 @@ class Robot(RobotDescription):
         actuators
             Motors and sensors that runners of this robot have by default: :class:`batchpid.Actuators` of one row, or a
             file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
-            armature of an MJCF file.
+            armature, torque-speed lines and lags of an MJCF file.
         strict
             True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
 
@@ -139,8 +139,8 @@ class Robot(RobotDescription):
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
         )
-        if actuators is None and mjcf is not None and any(mjcf.motors.armature.values()):
-            actuators = bp.make_actuators(robot.dof, armature=[mjcf.motors.armature[joint.name] for joint in joints])
+        if actuators is None and mjcf is not None:
+            actuators = _file_actuators(mjcf, joints)
         return robot if actuators is None else replace(robot, actuators=load_robot_actuators(actuators, robot))
 
     @staticmethod
@@ -252,7 +252,7 @@ class Robot(RobotDescription):
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control.
-        Of <pid> also ki and its limit.
+        Of <pid> and <dcmotor> also ki and its limit.
 
         Raises
         ------
@@ -291,6 +291,18 @@ def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
     columns = (motors.kp, 0.0), (motors.kv, 0.0), (motors.ki, 0.0), (motors.imax, np.inf)
     kp, kv, ki, imax = (read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns)
     return FileDefaults(start, kp, kv, ki, imax)
+
+
+def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | None:
+    """Return the motors of an MJCF file, None where they are ideal."""
+    effects = {"armature": 0.0, "saturation_effort": np.inf, "no_load_speed": np.inf, "lag": 0.0}
+    columns: dict[str, Any] = {
+        name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints] for name, off in effects.items()
+    }
+    found: dict[str, Any] = {
+        name: column for name, column in columns.items() if any(each != effects[name] for each in column)
+    }
+    return bp.make_actuators(len(joints), **found) if found else None
 
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:

@@ -14,11 +14,14 @@ from batchpid.export.exported import Imported, ImportedMotors
 from batchpid.export.isaac_lab_reader import from_isaac_lab
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
 from batchpid.io import documents
+from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
 
 NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
+_OF_GAINS = ("actuator", "limits")
+"""Codes of findings about an MJCF file that concern its gains."""
 
 
 class GainSet(NamedTuple):
@@ -81,4 +84,10 @@ def _of_mjcf(path: Path, joints: list[str]) -> Imported:
     other = Robot.load(path)
     if missing := sorted(set(joints) - set(other.joint_names)):
         raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
-    return Imported(other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints]), joints)
+    gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
+    sentences = summary(each for each in other.repairs if each.code in _OF_GAINS)
+    found = [each.partition(": ")[2] for each in sentences]
+    if gains.continuous is not None:
+        turning = ", ".join(joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes)
+        found.append(f"continuous: errors are taken the short way round, which MuJoCo does not: {turning}")
+    return Imported(gains, joints, tuple(found))

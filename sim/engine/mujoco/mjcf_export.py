@@ -1,19 +1,11 @@
-"""MJCF of the simulated robot, with the law in MuJoCo's own PID actuators, or with its motors alone.
+"""MJCF of the simulated robot, with the law or its motors in MuJoCo's own actuators.
 
-MuJoCo's ``pid`` actuator (3.15 and later), with the error e, inputs r, r' and ff, and the integral A::
-
-    effort = min(max(kp e + ki A + kv (r' - q') + ff, low), high)
-    A     <- A + dt e        while |A| < imax, or towards 0
-
-That is this package's law with the measured velocity, output first, without anti-windup. Its output after a step was
-compared with MuJoCo 4.0's. A motor alone is a ``general`` actuator, whose input u is the effort asked for::
-
-    effort = min(max(s x + b, low), high)        x = u(t - d), or its first-order lag
+Their equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. That of ``<pid>`` is this package's law with
+the measured velocity, output first, without anti-windup.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,18 +20,15 @@ from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
+from batchpid.motors.guard import Guard, check_guard
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
+from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.mujoco.solver import SOLVERS
 from batchpid.sim.engine.sapien.body_inertias import body_inertias
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.inertia import nearest_physical
-
-LINEAR = 1
-"""Interpolation between the samples of a delay."""
-INPUTS = 7
-"""Inputs of each actuator, in its order in ``ctrl``: position, velocity, feedforward (bits of ``mjtCtrlInput``)."""
 
 
 def to_mjcf(
@@ -48,6 +37,7 @@ def to_mjcf(
     dt: float,
     *,
     actuators: Actuators | None = None,
+    guard: Guard | None = None,
     inertia: ArrayLike | None = None,
     physics: str = "accurate",
 ) -> Exported:
@@ -55,7 +45,8 @@ def to_mjcf(
 
     Bodies are the rigid bodies that are simulated here, with repaired inertias, convex shapes, pairs that do not
     collide, joint limits, damping, Coulomb friction and armature; followers are tied to their leaders by constraints.
-    Each ``pid`` actuator has three inputs in ``ctrl``: position, velocity and feedforward.
+    Each actuator of the law has three inputs in ``ctrl``: position, velocity and feedforward. The keyframe "home" holds
+    the robot's start pose: pose, position inputs, and setpoints whose rate is limited.
 
     Parameters
     ----------
@@ -64,8 +55,10 @@ def to_mjcf(
     dt
         Time step of the simulation, and so of the control [s].
     actuators
-        Motors of one env. Written are armature, friction, effort limit and command delay, with ``pid`` as a delay of
-        the inputs; of motors alone also strength, bias and lag.
+        Motors of one env. Written are armature, friction, effort limit, torque-speed line, lag and command delay, with
+        the law as a delay of the inputs; of motors alone also strength and bias.
+    guard
+        Limits of the law's setpoints, of one env: position and rate are written.
     inertia
         As in :func:`batchpid.export.to_ros2_control`, of all joints.
     physics
@@ -74,11 +67,16 @@ def to_mjcf(
     Raises
     ------
     InvalidArgumentError
-        Params or actuators for several envs, gains per inertia without ``inertia``, or unknown physics.
+        Params, actuators or guard for several envs, gains per inertia without ``inertia``, a guard without params, or
+        unknown physics.
     RobotError
         MuJoCo cannot build the robot.
     """
     law = make_params(robot.dof, 0.0, measurement_rate="measured") if params is None else params
+    if guard is not None:
+        check_guard(guard, 1, robot.joint_names)
+        if params is None:
+            raise InvalidArgumentError("guard", "limits setpoints of a law", remedy="pass params, or leave it out")
     found = Drive(law, robot.joint_names, dt, inertia, actuators, integrates=True, two_sided=True)
     spec = SceneSpec(
         robot.urdf,
@@ -99,14 +97,23 @@ def to_mjcf(
         found += _set_inertia(scene.body(name), inertias[link], link)
     friction = added_friction(own_friction(spec), found.actuators)
     _set_joints(scene, robot, found, friction)
-    _set_actuators(scene, robot, found, params is not None)
+    motors = MjcfActuators(found, robot.independent, params is not None, guard, robot.continuous)
+    for at in np.flatnonzero(np.isfinite(motors.effort_range).any(1)):
+        joint = scene.joint(robot.joint_names[at])
+        joint.actfrclimited, joint.actfrcrange = True, np.clip(motors.effort_range[at], -FAR, FAR)
     try:
         scene.compile()
+        root = _exact(scene)
+        _add_actuators(root, motors)
+        etree.indent(root)
+        model = mujoco.MjModel.from_xml_string(etree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
-    _compare(found, robot, friction, params is not None)
+    _add_keyframe(root, model, robot, motors)
+    etree.indent(root)
+    _compare(found, robot, friction)
     head = "".join(f"<!-- differs: {' '.join(each.split()).replace('--', '- -')} -->\n" for each in found)
-    return Exported(f"{head}{_exact(scene)}", tuple(found))
+    return Exported(f"{head}{etree.tostring(root, encoding='unicode')}\n", tuple(found))
 
 
 def _set_inertia(body: Any, inertia: Any, link: str) -> Iterable[str]:
@@ -142,45 +149,40 @@ def _set_joints(scene: Any, robot: RobotDescription, found: Drive, friction: Any
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
 
 
-def _set_actuators(scene: Any, robot: RobotDescription, found: Drive, controls: bool) -> None:
-    kp, ki, kd, limit = found.value("kp"), found.value("ki"), found.value("kd"), found.integral_limit
-    low, high = found.value("effort_min", -math.inf), found.value("effort_max", math.inf)
-    motor, delay = found.motor("effort_limit", math.inf), found.motor("command_delay")
-    strength, bias, lag = found.motor("strength", 1.0), found.motor("bias"), found.motor("lag")
-    low, high = np.maximum(low, -motor), np.minimum(high, motor)
-    for at in np.flatnonzero(robot.independent):
-        name = robot.joint_names[at]
-        actuator = scene.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        if controls:
-            integrates = ki[at] > 0 and limit[at] > 0
-            imax = limit[at] / ki[at] if integrates and math.isfinite(limit[at]) else -1.0
-            actuator.set_to_pid(kp=kp[at], kv=kd[at], ki=ki[at] if integrates else 0.0, imax=imax, ctrlspec=INPUTS)
-        else:
-            actuator.gainprm[0], actuator.biasprm[0] = strength[at], bias[at]
-            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-            if lag[at]:
-                actuator.dyntype, actuator.dynprm[0] = mujoco.mjtDyn.mjDYN_FILTEREXACT, lag[at]
-                actuator.actearly = True
-        if delay[at]:
-            actuator.delay, actuator.interp = delay[at], LINEAR
-            actuator.nsample = math.ceil(delay[at] / found.dt) + 2
-        if math.isfinite(low[at]) or math.isfinite(high[at]):
-            if low[at] >= high[at]:
-                problem = "must be below effort_max for MuJoCo"
-                raise InvalidArgumentError("effort_min", problem, joint=name, value=low[at], remedy="widen the limits")
-            actuator.forcelimited = True
-            actuator.forcerange = np.clip([low[at], high[at]], -1e10, 1e10)
+def _add_actuators(root: Any, motors: MjcfActuators) -> None:
+    """Add the actuators to the XML."""
+    section = etree.SubElement(root, "actuator")
+    for tag, attributes in motors.elements:
+        etree.SubElement(section, tag, attributes)
 
 
-def _compare(found: Drive, robot: RobotDescription, friction: Any, controls: bool) -> None:
-    """Add the differences of MuJoCo's PID, friction and constraints."""
-    if controls:
-        found.compare_integral(first=False)
-        found.delays_setpoint()
-    has = {"armature", "viscous", "coulomb", "command_delay", *(() if controls else ("strength", "bias", "lag"))}
-    found.lack_motors(has)
-    if not controls and (both := (found.motor("lag") > 0) & np.isfinite(found.motor("effort_limit", math.inf))).any():
-        found.append(f"lag: before effort_limit, not after it: {found.listed(found.motor('lag'), both)} s")
+def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfActuators) -> None:
+    """Add the keyframe "home": the start pose as position and setpoint, held by the motors against gravity."""
+    data = mujoco.MjData(model)
+    for at, name in enumerate(robot.joint_names):
+        data.qpos[model.joint(name).qposadr] = robot.start[at]
+    mujoco.mj_forward(model, data)
+    holding = np.array([[data.qfrc_bias[model.joint(name).dofadr[0]] for name in robot.joint_names]])
+    if robot.coupling is not None:
+        holding = robot.coupling.efforts(holding)
+    ctrl, act = np.zeros(model.nu), np.zeros(model.na)
+    for actuator in range(model.nactuator):
+        at = robot.joint_names.index(model.actuator(actuator).name)
+        first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
+        if motors.controls:
+            ctrl[model.actuator_ctrladr[actuator]] = robot.start[at]
+        if motors.has_rate[at]:  # the setpoint is the first of the states
+            act[first] = robot.start[at]
+        if motors.has_lag[at]:  # the current, or the filtered input, is the last
+            constant = model.actuator_gainprm[actuator, 1] if motors.is_dcmotor[at] else 1.0
+            act[first + count - 1] = holding[0, at] / constant
+    columns = {"qpos": data.qpos, "ctrl": ctrl, "act": act}
+    figures = {key: " ".join(repr(float(each)) for each in row) for key, row in columns.items() if row.any()}
+    etree.SubElement(etree.SubElement(root, "keyframe"), "key", {"name": "home", **figures})
+
+
+def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
+    """Add the differences of MuJoCo's friction and constraints."""
     if friction.coulomb is not None and np.any(friction.coulomb):
         found.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
     if robot.coupling is not None:
@@ -188,7 +190,7 @@ def _compare(found: Drive, robot: RobotDescription, friction: Any, controls: boo
         found.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
 
 
-def _exact(scene: Any) -> str:
+def _exact(scene: Any) -> Any:
     """Return the XML of a compiled scene with all digits, of which MuJoCo writes six."""
     root = etree.fromstring(scene.to_xml().encode())
     _write(root.find("option"), {"timestep": scene.option.timestep, "gravity": scene.option.gravity})
@@ -201,20 +203,13 @@ def _exact(scene: Any) -> str:
             _write(geom, {"size": given.size, "pos": given.pos, "quat": given.quat})
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
-        fields = ("axis", "range", "armature", "damping", "frictionloss")
-        _write(element, {field: getattr(joint, field) for field in fields})
-    for element in root.iterfind("actuator/*"):
-        actuator = scene.actuator(element.get("name"))
-        _write(
-            element,
-            {field: getattr(actuator, field) for field in ("gainprm", "biasprm", "dynprm", "forcerange", "delay")},
-        )
+        fields = ("axis", "range", "actuatorfrcrange", "armature", "damping", "frictionloss")
+        _write(element, {field: getattr(joint, field.replace("actuatorfrc", "actfrc")) for field in fields})
     for element, given in zip(root.findall("equality/joint"), scene.equalities, strict=True):
         _write(element, {"polycoef": given.data})
     for element in root.iterfind("asset/mesh"):
         _write(element, {"vertex": scene.mesh(element.get("name")).uservert})
-    etree.indent(root)
-    return etree.tostring(root, encoding="unicode") + "\n"
+    return root
 
 
 def _write(element: Any, figures: dict[str, Any]) -> None:

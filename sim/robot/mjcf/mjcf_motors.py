@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_laws import Line, line_of, servo_of, setpoint_range, unread
 from batchpid.sim.robot.mjcf.mjcf_names import Names
 
 Couplings = dict[str, tuple[str, float, float]]
@@ -37,7 +38,13 @@ class Motors(NamedTuple):
     """Gains of servos; joints without servo are left out."""
     ki: dict[str, float]
     imax: dict[str, float]
-    """Limits of the integral of the error [rad s or m s] of <pid>; joints without one are left out."""
+    """Limits of the integral of the error [rad s or m s]; joints without one are left out."""
+    rate: dict[str, float]
+    """Limits of the setpoint's rate [rad/s or m/s]; joints without one are left out."""
+    saturation_effort: dict[str, float]
+    no_load_speed: dict[str, float]
+    lag: dict[str, float]
+    """Torque-speed lines and time constants [s] of DC motors; joints without one are left out."""
 
 
 def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplings:
@@ -78,8 +85,10 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     kp: dict[str, float] = defaultdict(float)
     kv: dict[str, float] = defaultdict(float)
     ki: dict[str, float] = defaultdict(float)
-    imax: dict[str, float] = {}
-    driven: set[str] = set()
+    most: dict[str, float] = defaultdict(float)  # limits of the integrals as efforts
+    rate: dict[str, float] = {}
+    lines: dict[str, Line] = {}
+    driven: dict[str, int] = defaultdict(int)
     pull: dict[int, float] = {}  # what limited tendons leave to their further actuators
     for actuator in range(len(model.actuator_trntype)):  # nu counts inputs, of which <pid> has up to three
         arms = _arms(model, actuator, names)
@@ -94,35 +103,49 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
         for name, arm in leading.items():
             armature[name] += arm**2 * _field(model, "actuator_armature", actuator)
             damping[name] += arm**2 * _field(model, "actuator_damping", actuator)
-        driven |= leading.keys()
-        if len(leading) > 1:
+        for name in leading:
+            driven[name] += 1
+        first, single = next(iter(leading)), len(leading) == 1
+        if not single:
             text = f"actuator {label!r} pulls several joints: each has a motor of its own here, as strong as all"
             findings += [Finding("warning", "actuator", text, "control them together", name) for name in leading]
-        integrates = len(leading) == 1 and _is_pid(model, actuator)
-        if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE and not integrates:
-            text = f"actuator {label!r} has dynamics of its own, which are not simulated"
-            findings.append(Finding("warning", "actuator", text, "give lag= to make_actuators", next(iter(leading))))
+        servo = servo_of(model, actuator)
+        findings += [
+            Finding("warning", "actuator", f"actuator {label!r} {text}", remedy, first, detail=detail)
+            for text, remedy, detail in unread(model, actuator, servo)
+        ]
+        if line := line_of(model, actuator):
+            for name, arm in leading.items():
+                damping[name] += arm**2 * line.damping
+            if single:
+                arm = abs(leading[first])
+                lines[first] = line._replace(stall=arm * line.stall, speed=line.speed / arm)
         if (delay := _field(model, "actuator_delay", actuator)) > 0:
             text = f"actuator {label!r} has a delay, which is not simulated"
             remedy = "give command_delay= to make_actuators"
-            findings.append(Finding("warning", "actuator", text, remedy, next(iter(leading)), detail=f"{delay:g} s"))
-        force = _force_limit(model, actuator, next(iter(leading)), findings)
+            findings.append(Finding("warning", "actuator", text, remedy, first, detail=f"{delay:g} s"))
+        force = _force_limit(model, actuator, first, findings)
         tendon = int(model.actuator_trnid[actuator, 0])
         if model.actuator_trntype[actuator] == _TRN.mjTRN_TENDON and model.tendon_actfrclimited[tendon]:
             if tendon not in pull:
-                pull[tendon] = _magnitude(model.tendon_actfrcrange[tendon], next(iter(leading)), findings)
+                pull[tendon] = _magnitude(model.tendon_actfrcrange[tendon], first, findings)
             force = min(force, pull[tendon])
             pull[tendon] -= force
-        stiffness, rate = -model.actuator_biasprm[actuator, 1:3]
         for name, arm in leading.items():
             limits[name] += abs(arm) * force
-            if model.actuator_biastype[actuator] == _BIAS.mjBIAS_AFFINE and len(leading) == 1:
-                kp[name] += max(float(arm**2 * stiffness), 0.0)
-                kv[name] += max(float(arm**2 * rate), 0.0)
-            if integrates:
-                ki[name] += arm**2 * float(model.actuator_gainprm[actuator, 0])
-                if (most := float(model.actuator_dynprm[actuator, 0])) > 0:
-                    imax[name] = most / abs(arm)
+            if servo is not None and single:
+                kp[name] += max(arm**2 * servo.kp, 0.0)
+                kv[name] += max(arm**2 * servo.kv, 0.0)
+                ki[name] += arm**2 * servo.ki
+                most[name] += abs(arm) * servo.ki * servo.imax if servo.ki else 0.0
+                findings += _narrower(model, names, name, setpoint_range(model, actuator, servo), arm)
+                if servo.rate:
+                    rate[name] = min(rate.get(name, math.inf), servo.rate / abs(arm))
+    for name in [name for name in lines if driven[name] > 1]:
+        del lines[name]
+        text = "a DC motor is one of several actuators of the joint: its torque-speed line and lag are not simulated"
+        findings.append(Finding("warning", "actuator", text, "give them to make_actuators for the joint", name))
+    imax = {name: most[name] / gain for name, gain in ki.items() if gain and math.isfinite(most[name])}
     own, armature = armature, {name: value * (name not in couplings) for name, value in armature.items()}
     for follower in couplings:
         for leader, multiplier in _leading({follower: 1.0}, couplings).items():
@@ -135,15 +158,25 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             text = "no actuator of the file moves the joint: it is controlled as all others"
             findings.append(Finding("warning", "actuator", text, "give it gains of 0 to let it move freely", name))
     findings += _tendons(model)
-    return Motors(dict(limits), armature, damping, dict(kp), dict(kv), dict(ki), imax)
+    stall = {name: line.stall for name, line in lines.items() if math.isfinite(line.stall)}
+    speed = {name: lines[name].speed for name in stall}
+    lag = {name: line.lag for name, line in lines.items() if line.lag}
+    return Motors(dict(limits), armature, damping, dict(kp), dict(kv), dict(ki), imax, rate, stall, speed, lag)
 
 
-def _is_pid(model: Any, actuator: int) -> bool:
-    """Return whether an actuator is MuJoCo's <pid> (3.15 and later) without a limit of the setpoint's rate."""
-    kind = getattr(mujoco.mjtDyn, "mjDYN_PID", None)
-    return bool(
-        kind is not None and model.actuator_dyntype[actuator] == kind and model.actuator_dynprm[actuator, 1] <= 0
+def _narrower(model: Any, names: Names, name: str, ends: tuple[float, float], arm: float) -> list[Finding]:
+    """Return a finding if a servo limits the setpoint of a joint to less than the joint's range."""
+    joint = next(joint for joint, each in names.joints.items() if each == name)
+    low, high = sorted(end / arm for end in ends)
+    lower, upper = model.jnt_range[joint] if model.jnt_limited[joint] else (-math.inf, math.inf)
+    margin = 1e-3 * (upper - lower) if math.isfinite(upper - lower) else 0.0
+    if low <= lower + margin and high >= upper - margin:
+        return []
+    text, remedy = (
+        "the setpoint is not limited to the range that the servo has in the file",
+        "pass make_guard(lower=...)",
     )
+    return [Finding("note", "actuator", text, remedy, name, detail=f"{low:g} to {high:g}")]
 
 
 def _field(model: Any, name: str, index: int) -> float:
@@ -154,7 +187,8 @@ def _field(model: Any, name: str, index: int) -> float:
 def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
     """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by name; else None."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
-    gear = float(model.actuator_gear[actuator, 0])
+    outputs = getattr(model, "actuator_outadr", None)  # of an orientation servo three, each with a gear
+    gear = float(model.actuator_gear[actuator if outputs is None else int(outputs[actuator]), 0])
     if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
         return {names.joints[target]: gear} if target in names.joints else None
     if kind != _TRN.mjTRN_TENDON:

@@ -135,6 +135,8 @@ class Tree:
         limit = etree.SubElement(element, "limit", lower=repr(lower), upper=repr(upper))
         if np.isfinite(motors.effort_limit[name]):
             limit.set("effort", repr(motors.effort_limit[name]))
+        if name in motors.rate:
+            limit.set("velocity", repr(float(motors.rate[name])))
         damping, friction = model.dof_damping[dof] + motors.damping[name], model.dof_frictionloss[dof]
         etree.SubElement(element, "dynamics", damping=repr(float(damping)), friction=repr(float(friction)))
         if name in couplings:

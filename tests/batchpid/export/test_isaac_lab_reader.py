@@ -127,3 +127,53 @@ def test_what_cannot_be_read_is_refused_by_name(before, after, named):
     assert before in MINE
     with pytest.raises(InvalidArgumentError, match=named):
         from_isaac_lab(MINE.replace(before, after), JOINTS)
+
+
+CFG = "ImplicitActuatorCfg(joint_names_expr=['j'], stiffness={}, damping=1)"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"K = 7\ndef f(K):\n    return {CFG.format('K')}",
+        f"K = 7\nfor K in (1, 2):\n    x = {CFG.format('K')}",
+        f"K = 7\nx = [{CFG.format('K')} for K in (1, 2)]",
+        f"K = 7\nfrom other import K\nx = {CFG.format('K')}",
+        f"K = 7\nfrom other import *\nx = {CFG.format('K')}",
+        f"K = 7\ndef K(): pass\nx = {CFG.format('K')}",
+        f"K = 7\ndel K\nx = {CFG.format('K')}",
+        f"D = {{'j': 1}}\nD['j'] = 5\nx = {CFG.format('D')}",
+        f"D = {{'j': 1}}\nD.update(j=5)\nx = {CFG.format('D')}",
+        f"D = {{'j': 1}}\nE = D\nE['j'] = 5\nx = {CFG.format('D')}",
+        f"x = {CFG.format('other.pi')}",
+    ],
+)
+def test_a_number_that_may_be_another_is_refused(text):
+    with pytest.raises(InvalidArgumentError, match="is not a number"):
+        from_isaac_lab(text, ["j"])
+
+
+def test_numbers_of_an_assignment_are_those_before_it():
+    found = from_isaac_lab(
+        f"K = 7\nD = {{'j': K}}\nK = {CFG.format('K')}\nx = {CFG.format('D').replace('j', 'k', 1)}", ["j"]
+    )
+    assert found.params.kp[0, 0] == 7
+
+
+def test_what_changes_a_configuration_is_told():
+    """Arguments that no class has, keys that no joint matches, and changes after the call."""
+    text = f"""
+x = {CFG.format("{'j': 1, 'j1O': 2}").replace(")", ", gear=3)")}
+y = x.replace(stiffness=3)
+setattr(x, "damping", 4)
+x.effort_limit = 5
+"""
+    differences = from_isaac_lab(text, ["j"]).differences
+    for said in (
+        "gear: not read",
+        "stiffness: no joint matches 'j1O'",
+        "line 3: not read",
+        "line 4: not",
+        "line 5: not",
+    ):
+        assert sum(said in each for each in differences) == 1, said

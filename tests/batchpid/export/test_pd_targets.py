@@ -167,6 +167,13 @@ def test_delays_are_whole_steps_of_the_setpoint():
     assert f"{math.degrees(w * 0.0101):.2g} degrees" in late
 
 
+def test_a_delay_of_no_step_leaves_the_line_of_the_motors():
+    motors = make_actuators(3, command_delay=0.4 * DT, saturation_effort=9.0, no_load_speed=20.0)
+    text, differences = to_isaac_lab(bp.make_params(3, 1.0, **PD), JOINTS, DT, actuators=motors)
+    assert [cls for cls, _ in configurations(text)] == ["DCMotorCfg"]
+    assert [each.partition(":")[0] for each in differences] == ["command_delay"]
+
+
 def test_names_are_no_patterns():
     text = to_isaac_lab(bp.make_params(2, [1.0, 2.0], **PD), ["a.b", "a+b"], DT).text
     assert (figure(text, "stiffness", "a.b"), figure(text, "stiffness", "a+b")) == (1.0, 2.0)

@@ -268,6 +268,7 @@ def test_files_by_hand_are_read_with_their_defaults():
         ("d: 2.0, ", "", "feedforward"),
         ("gains:", "gain:", "holds no controller"),
         ("p: 10.0", "p: -10.0", "kp"),
+        ("joints: [wrist]", "joints: [wrist]\n    command_joints: [hand]", "command_joints"),
     ],
 )
 def test_what_cannot_be_read_is_refused_by_name(before, after, named):

@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from tqdm import tqdm
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.export import to_ros2_control
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.identification.excitation import excite
 
@@ -72,7 +75,28 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         (("identify", robot), "logs: are missing"),
         (("identify", robot, recording), "fit its setpoints"),
         (("identify", robot, recording, "--evaluations", 0), "evaluations"),
+        (("identify", robot, recording, "--params", "nothing.yaml"), "params: is neither a name nor a file of gains"),
     ):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
         assert status != 0
         assert message in error
+
+
+@pytest.mark.filterwarnings("ignore:.*u_clamp")
+def test_params_are_any_gains(batchpid, log, tmp_path, monkeypatch):
+    """Params of batchpid, by name, or of other programs."""
+    robot, recording, gains = log
+    seen = []
+
+    def stop(*_, params, **__):
+        seen.append(params)
+        raise InvalidArgumentError("params", "were read", remedy="none")
+
+    monkeypatch.setattr("batchpid.sim.identification.identification.identify", stop)
+    own = bp.load_params(gains)[0]
+    (other := tmp_path / "controllers.yaml").write_text(to_ros2_control(own, ["hinge"], 0.001).text)
+    for words in (gains, other, "designed"):
+        status, _, error = batchpid("identify", robot, recording, "--params", words)
+        assert (status, "were read" in error) == (2, True)
+    np.testing.assert_array_equal([each.kp[0] for each in seen[:2]], [own.kp[0]] * 2)
+    assert seen[2].gain_units is not None

@@ -14,6 +14,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
+from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.tuning.moves import random_moves
@@ -93,14 +94,18 @@ def test_the_actuators_compute_the_law_with_limits_and_feedforward():
     assert 100 < saturated < 2600
 
 
-def test_the_file_moves_as_the_runner_does():
+@pytest.mark.parametrize("effects", [{}, {"saturation_effort": 60.0, "no_load_speed": 9.0}, {"lag": 0.003}])
+def test_the_file_moves_as_the_runner_does(effects):
     loaded = Robot.load("panda")
-    params = plain(loaded, effort_limit=loaded.effort_limit)
-    model = model_of(to_mjcf(loaded, params, DT))
+    params = plain(loaded, **({} if effects else {"effort_limit": loaded.effort_limit}))
+    motors = bp.make_actuators(9, **effects)
+    exported = to_mjcf(loaded, params, DT, actuators=motors)
+    assert exported.differences == ()
+    model = model_of(exported)
     data, goal = mujoco.MjData(model), 0.5 * (loaded.start + loaded.settings.target)
-    data.qpos[:] = loaded.start
+    mujoco.mj_resetDataKeyframe(model, data, 0)
     options = {"workers": 0, "timestep": DT, "substeps": 1, "engine": "mujoco", "compensate": "gravity+coriolis"}
-    with Runner(loaded, 1, params=params, **options) as runner:
+    with Runner(loaded, 1, params=params, actuators=motors, **options) as runner:
         runner.reset()
         for _ in range(200):
             reached = runner.step(goal).qpos[0]
@@ -181,6 +186,151 @@ def test_the_motors_alone_deliver_what_the_actuators_do():
     assert [each.partition(":")[0] for each in both] == ["lag", "friction"]
 
 
+LINE = {"saturation_effort": 6.0, "no_load_speed": 1.5}
+
+
+def arm_motion(step, joints=9):
+    """Return inputs that move the arm, saturate its motors and wind its integral."""
+    phase = np.arange(joints)
+    wanted, rate = 0.5 * np.sign(np.sin(0.02 * step + phase)) + 0.4 * np.sin(0.05 * step), np.cos(0.03 * step + phase)
+    return wanted, rate, 0.5 * np.sin(0.02 * step) * np.ones(joints)
+
+
+@pytest.mark.parametrize(
+    "effects", [{}, LINE, LINE | {"lag": 0.004}, {"lag": 0.004}], ids=["pid", "line", "both", "lag"]
+)
+@pytest.mark.parametrize("guarded", [False, True])
+def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded):
+    """The guard, the law and the motors of batchpid, step by step, are MuJoCo's actuators.
+
+    A lag beside a line is listed: MuJoCo's does not end at the line. At the keyframe motors hold the robot.
+    """
+    loaded = Robot.load("panda")
+    params = plain(loaded).replace(kp=np.linspace(5, 80, 9), ki=np.linspace(1, 30, 9))
+    params = params.replace(integral_limit=np.linspace(0.02, 0.5, 9) if effects else np.inf)
+    motors = bp.make_actuators(9, **effects) if effects else None
+    ends = {"lower": loaded.lower, "upper": loaded.upper} if not effects else {}
+    guard = bp.make_guard(9, rate=np.linspace(0.4, 1.2, 9), **ends) if guarded else None
+    exported = to_mjcf(loaded, params, DT, actuators=motors, guard=guard)
+    listed = [*(["lag"] if len(effects) == 3 else []), *(["guard"] if guarded else [])]
+    assert [each.partition(":")[0] for each in exported.differences] == listed
+    model = model_of(exported)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    np.testing.assert_array_equal(data.qpos, loaded.start)
+    mujoco.mj_forward(model, data)
+    state, holding = bp.init(params, data.qpos[None]), data.qfrc_bias[None].copy()
+    motor = None if motors is None else motor_model.init(motors, data.qpos[None], DT, effort=holding)
+    guard_state = None if guard is None else guard_model.init(guard, data.qpos[None])
+    clipped, late = 0, holding
+    for step in range(400):
+        wanted, rate, feedforward = arm_motion(step)
+        data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
+        q, v, setpoint = data.qpos[None].copy(), data.qvel[None].copy(), wanted[None]
+        if guard is not None:
+            guard_state, _ = guard_model.advance(guard, guard_state, setpoint, DT)
+            setpoint = guard_state.setpoint
+        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        state, asked = bp.step(params, state, setpoint, q, DT, **rates)
+        effort = asked
+        if motors is not None:
+            motor, effort = motor_model.deliver(motors, motor, asked, q, v, DT)
+        if len(effects) == 3:
+            line = np.clip(asked, *(6.0 * (end - v / 1.5) for end in (-1, 1)))
+            late += (1 - np.exp(-DT / 0.004)) * (line - late)
+            effort = late
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(data.actuator_force, effort[0], rtol=0, atol=1e-9)
+        clipped += (np.abs(effort - asked) > 1e-6).sum()
+    assert bool(clipped) == bool(effects)
+
+
+def test_limits_of_the_effort_act_beside_a_line():
+    """One-sided limits are the joint's own; where the law's are narrower than the motor's, overspeed is listed."""
+    loaded = Robot.load("panda")
+    motors = bp.make_actuators(9, effort_limit=4.0, **LINE)
+    even = to_mjcf(loaded, plain(loaded, effort_limit=4.0), DT, actuators=motors)
+    assert [each.partition(":")[0] for each in even.differences] == []
+    assert model_of(even).actuator_forcerange.tolist() == [[-4.0, 4.0]] * 9
+    params = plain(loaded, effort_min=-2.0, effort_max=3.0).replace(ki=0.0)
+    exported = to_mjcf(loaded, params, DT, actuators=motors)
+    (said,) = exported.differences
+    assert said.startswith("saturation_effort: beyond these speeds")
+    assert said.endswith("2 rad/s or m/s")  # 1.5 (1 + 2 / 6)
+    model = model_of(exported)
+    assert not model.actuator_forcelimited.any()
+    np.testing.assert_array_equal(model.jnt_actfrcrange, [[-2.0, 3.0]] * 9)
+    data, state, clipped = mujoco.MjData(model), motor_model.init(motors, np.zeros((1, 9)), DT), 0
+    data.qvel[:] = np.linspace(-1.9, 1.9, 9)
+    law = bp.init(params, data.qpos[None])
+    for step in range(50):
+        wanted, rate, feedforward = arm_motion(step)
+        data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
+        q, v = data.qpos[None].copy(), data.qvel[None].copy()
+        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        law, asked = bp.step(params, law, wanted[None], q, DT, **rates)
+        state, effort = motor_model.deliver(motors, state, asked, q, v, DT)
+        mujoco.mj_step(model, data)
+        slow = np.abs(v[0]) < 2.0
+        np.testing.assert_allclose(data.qfrc_actuator[slow], effort[0][slow], rtol=0, atol=1e-9)
+        clipped += (np.abs(effort - asked) > 1e-6).sum()
+    assert clipped > 10
+
+
+def test_the_motors_alone_have_their_line_and_strength():
+    loaded = Robot.load("panda")
+    effects = {"strength": np.linspace(0.7, 1.2, 9), "command_delay": 0.0015, "effort_limit": 5.0}
+    motors = bp.make_actuators(9, saturation_effort=np.r_[np.linspace(4, 9, 8), np.inf], no_load_speed=2.0, **effects)
+    exported = to_mjcf(loaded, None, DT, actuators=motors)
+    assert exported.differences == ()
+    model = model_of(exported)
+    data, state = mujoco.MjData(model), motor_model.init(motors, np.zeros((1, 9)), DT)
+    data.qvel[:] = np.linspace(-1.5, 1.5, 9)
+    clipped = 0
+    for step in range(300):
+        asked, v = 9 * np.sin(0.05 * step + np.arange(9)), data.qvel[None].copy()
+        state, effort = motor_model.deliver(motors, state, asked[None], data.qpos[None], v, DT)
+        data.ctrl[:] = asked
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(data.qfrc_actuator, effort[0], rtol=0, atol=1e-9)
+        clipped += (np.abs(effort[0]) < 4.99).sum()
+    assert 500 < clipped < 2700
+    lost = to_mjcf(loaded, None, DT, actuators=motors.replace(bias=0.5, strength=np.r_[0.0, np.ones(8)])).differences
+    assert [each.partition(":")[0] for each in lost] == ["bias", "saturation_effort"]
+
+
+def test_a_guard_is_written_or_listed():
+    loaded = Robot.load("panda")
+    params = plain(loaded).replace(kd=0.0)
+    guard = loaded.guard()
+    exported = to_mjcf(loaded, params, DT, guard=guard)
+    assert exported.differences == ()
+    model = model_of(exported)
+    positions = model.actuator_ctrlrange[::3]
+    np.testing.assert_array_equal(positions, np.stack([guard.lower[0], guard.upper[0]], 1))
+    np.testing.assert_array_equal(model.actuator_dynprm[:, 1], guard.rate[0])
+    accelerated = guard._replace(acceleration=np.full((1, 9), 2.0))
+    (said,) = to_mjcf(loaded, params, DT, guard=accelerated).differences
+    assert said.startswith("guard: the setpoint's acceleration is not limited; here 2 rad/s^2")
+    assert f"panda_joint1 {loaded.guard().rate[0, 0] ** 2 / 4:.4g}" in said
+    (said,) = to_mjcf(loaded, params, DT, guard=guard, actuators=bp.make_actuators(9, lag=0.01)).differences
+    assert said.startswith("guard: a dcmotor has no limits of the position alone: panda_joint1, ")
+    with pytest.raises(InvalidArgumentError, match="guard"):
+        to_mjcf(loaded, None, DT, guard=guard)
+
+
+def test_a_locked_joint_may_be_guarded(tmp_path):
+    """MuJoCo needs a range of some width."""
+    locked = LIMIT.replace('lower="-1"', 'lower="1"')
+    assert 'lower="1" upper="1"' in locked
+    loaded = Robot.load(
+        write(tmp_path, robot(link("x", INERTIAL), link("y", INERTIAL), joint("a", "x", "y", inner=locked)))
+    )
+    low, high = model_of(to_mjcf(loaded, plain(loaded), DT, guard=loaded.guard())).actuator_ctrlrange[0]
+    assert low == 1.0
+    assert high == np.nextafter(1.0, 2.0)
+
+
 def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
     """Under what the target has of the tuned gains: efforts at one inertia, no filter, weight or anti-windup."""
     loaded = Robot.load("panda")
@@ -215,6 +365,26 @@ def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
     assert np.abs(ours[-1] - moves.start).max() > 0.5
 
 
+def test_a_robot_read_from_its_file_is_written_with_the_same_actuators(tmp_path):
+    loaded = Robot.load("panda")
+    gains = {
+        "ki": np.linspace(1, 30, 9),
+        "integral_limit": np.linspace(0.1, 2, 9),
+        "effort_limit": np.linspace(3, 9, 9),
+    }
+    params = bp.make_params(9, np.linspace(5, 80, 9), kd=2.0, measurement_rate="measured", **gains)
+    line = {"saturation_effort": np.r_[4.0, 8.0, [np.inf] * 7], "no_load_speed": np.r_[2.0, 3.0, [np.inf] * 7]}
+    motors = bp.make_actuators(9, lag=np.r_[0, 0.007, 0.007, [0] * 6], armature=0.1, **line)
+    exported = to_mjcf(loaded, params, DT, actuators=motors, guard=loaded.guard())
+    (path := tmp_path / "arm.xml").write_text(exported.text)
+    other = Robot.load(path)
+    assert not other.repairs
+    again = to_mjcf(other, other.mjcf_gains(), DT, actuators=other.actuators, guard=other.guard())
+    actuators = [text[text.index("<actuator>") : text.index("</actuator>")] for text in (exported.text, again.text)]
+    assert actuators[0].count("<dcmotor") == 3
+    assert actuators[0] == actuators[1]
+
+
 LINKS = [link(name, INERTIAL) for name in "wxyz"]
 CHAIN = [*LINKS, *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy", "yz"), strict=True))]
 
@@ -226,8 +396,14 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     folder, inertia, rng = tmp_path_factory.mktemp("chain"), np.array([2.0, 1.0, 0.5]), np.random.default_rng(seed)
     chain = Robot.load(write(folder, robot(*CHAIN)))
     motors = {"armature": rng.uniform(0.01, 1, 3), "coulomb": rng.uniform(0, 1, 3), "viscous": rng.uniform(0, 1, 3)}
+    has_line, has_lag, has_rate = rng.random((3, 3)) < 0.4
+    line = {"saturation_effort": rng.uniform(1, 99, 3), "no_load_speed": rng.uniform(0.1, 9, 3)}
+    line = {name: np.where(has_line, value, np.inf) for name, value in line.items()}
+    lag, rate = np.where(has_lag, rng.uniform(1e-4, 0.1, 3), 0.0), np.where(has_rate, rng.uniform(0.1, 9, 3), np.inf)
+    dc, guard = has_line | has_lag, bp.make_guard(3, rate=rate)
     assert list(chain.joint_names) == JOINTS
-    exported = to_mjcf(chain, params, DT, actuators=bp.make_actuators(3, **motors), inertia=inertia)
+    own = bp.make_actuators(3, **motors, **line, lag=lag)
+    exported = to_mjcf(chain, params, DT, actuators=own, guard=guard, inertia=inertia)
     (folder / "chain.xml").write_text(exported.text)
     other = Robot.load(folder / "chain.xml")
     back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
@@ -241,11 +417,19 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
             wanted = np.where(limit > 0, wanted, 0.0)
         np.testing.assert_allclose(values(back, name), wanted, rtol=tolerance)
     np.testing.assert_allclose(np.array(values(back, "integral_max"))[kept], limit[kept], rtol=tolerance)
-    assert not np.isfinite(limit[kept]).any() or "integral_limit" in listed
+    uneven = -np.array(values(params, "integral_min")) != values(params, "integral_max")
+    assert not (np.isfinite(limit) & (~dc | uneven) & kept).any() or "integral_limit" in listed
     model = model_of(exported)
     ends = np.clip([values(params, "effort_min"), values(params, "effort_max")], -1e10, 1e10).T
-    limited = np.abs(ends).min(1) < 1e10
-    np.testing.assert_allclose(model.actuator_forcerange[limited], ends[limited], rtol=tolerance)
+    limited, of_joint = np.abs(ends).min(1) < 1e10, dc & (-ends[:, 0] != ends[:, 1])
+    np.testing.assert_allclose(
+        model.actuator_forcerange[limited & ~of_joint], ends[limited & ~of_joint], rtol=tolerance
+    )
+    np.testing.assert_allclose(model.jnt_actfrcrange[limited & of_joint], ends[limited & of_joint], rtol=tolerance)
+    np.testing.assert_allclose([joint.velocity_limit for joint in other.joints], rate, rtol=1e-12)
+    for name, was in (line | {"lag": lag}).items():
+        leaf = getattr(other.actuators, name)
+        np.testing.assert_allclose((0.0 if name == "lag" else np.inf) if leaf is None else leaf[0], was, rtol=1e-12)
     found = {"armature": other.actuators.armature[0], "coulomb": other.friction, "viscous": other.damping}
     for name, was in motors.items():
         np.testing.assert_allclose(found[name], was, rtol=1e-12)

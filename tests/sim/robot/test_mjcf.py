@@ -382,6 +382,72 @@ def test_a_pid_has_an_integral_and_may_have_several_inputs(load):
     assert any("'number 1' has a delay, which is not simulated" in str(each) for each in robot.check())
 
 
+def test_several_integrals_of_a_joint_keep_their_limits(load):
+    """The limits as efforts add up: 4 (3 0.5) and 2 (7 0.25)."""
+    one = '<pid joint="j" kp="5" ki="3" imax=".5" gear="4"/>'
+    two = '<pid joint="j" kp="1" ki="7" imax=".25" gear="-2" slewmax="3"/>'
+    robot = load(two_links(rest=f"<actuator>{one}{two}</actuator>"))
+    gains = robot.mjcf_gains()
+    np.testing.assert_allclose(np.ravel([gains.ki, gains.integral_max]), [16 * 3 + 4 * 7, 4 * 1.5 + 2 * 1.75])
+    np.testing.assert_array_equal(robot.guard().rate, [[1.5]])
+    free = load(two_links(rest=f"<actuator>{one}{two.replace('imax', 'user')}</actuator>"))
+    assert free.mjcf_gains().integral_max is None
+
+
+def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
+    motor = '<dcmotor joint="j" nominal="24 6 3" gear="-2" {}/>'  # 24 V make 6 N m at rest, 3 rad/s without load
+    controller = 'input="pos vel ff" controller="5 3 1 .5 .2 12" inductance="0 .01" saturation="4 0 0"'
+    robot = load(two_links(rest=f"<actuator>{motor.format(controller)}</actuator>"))
+    gains, motors = robot.mjcf_gains(), robot.actuators
+    np.testing.assert_array_equal(np.ravel([gains.kp, gains.ki, gains.kd]), [20, 12, 4])
+    np.testing.assert_allclose(np.ravel([gains.integral_max, gains.effort_max]), [2 * 3 * 0.2, 8])
+    np.testing.assert_allclose(motors.saturation_effort, [[6.0]])  # half the voltage, and a gear of 2
+    np.testing.assert_allclose(motors.no_load_speed, [[0.75]])
+    np.testing.assert_array_equal(np.ravel([motors.lag, robot.guard().rate]), [0.01, 0.25])
+    assert not robot.repairs
+    asked = load(two_links(rest=f"<actuator>{motor}</actuator>".format('ctrlrange="-12 24"')))
+    np.testing.assert_allclose(np.ravel([asked.actuators.saturation_effort, asked.actuators.no_load_speed]), [6, 0.75])
+    braked = load(two_links(rest=f"<actuator>{motor}</actuator>".format('input="none"')))
+    np.testing.assert_allclose(braked.damping, [4 * 6 / 3])
+    assert braked.actuators is None
+
+
+@pytest.mark.parametrize(
+    ("actuator", "said"),
+    [
+        ('<general joint="j" gainprm="5" biastype="affine" biasprm="2 -5 -1"/>', "adds a constant force"),
+        ('<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>', "has a negative gain"),
+        ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "not proportional to its input"),
+        ('<pid joint="j" kp="5" input="vel ff"/>', "is a spring"),
+        ('<dcmotor joint="j" nominal="24 6 3" cogging="1 4 0" lugre="9 1 1 1 1"/>', "cogging, friction (lugre)"),
+        (
+            '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
+            "is disabled in the file",
+        ),
+        ('<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2" gear="-2"/>', "(-2 to 1)"),
+        ('<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9"/><motor joint="j"/>', "one of several actuators"),
+    ],
+)
+def test_what_an_actuator_does_besides_is_told(load, actuator, said):
+    robot = load(two_links(rest=f"<actuator>{actuator}</actuator>"))
+    assert [said in str(each) for each in robot.repairs if each.code == "actuator"] == [True]
+
+
+def test_the_range_of_a_joint_is_no_narrower_range_of_its_setpoint(load):
+    joint = '<joint name="j" range="-90 90"/>'
+    for share, told in ((1, 0), (0.5, 1)):
+        robot = load(two_links(joint, rest=f'<actuator><pid joint="j" kp="2" inheritrange="{share}"/></actuator>'))
+        assert len(robot.repairs) == told
+
+
+def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
+    """Of the servo's three outputs each has a gear."""
+    servo = '<orientation site="s" refsite="r" kp="1"/>'
+    sites = BOX + '<site name="s"/><site name="r"/>'
+    text = two_links(rest=f'<actuator>{servo}<motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>')
+    np.testing.assert_array_equal(load(text.replace(BOX, sites, 1)).effort_limit, [6])
+
+
 @pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
 def test_armature_and_damping_of_actuators(load):
     text = two_links(rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_isaac_lab
+from batchpid.sim import Robot
 from batchpid.sim.tuning.gain_sets import gain_set
 
 
@@ -78,6 +80,26 @@ def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
     )
     (path := tmp_path / "arm.xml").write_text(to_mjcf(panda, params, 1 / 2000).text)
     assert same(gain_set(panda, str(path)).params, params)
+    other = 'forcerange="-20.0 30.0" delay="0.01" nsample="9"'
+    path.write_text(path.read_text().replace('forcerange="-20.0 20.0"', other))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert same(gain_set(panda, str(path)).params, params)
+    said = " ".join(str(each.message) for each in warned)
+    assert "the limits of the effort differ by direction" in said
+    assert "has a delay, which is not simulated" in said
     path.write_text(path.read_text().replace("panda_joint1", "joint_1"))
     with pytest.raises(InvalidArgumentError, match="panda_joint1"):
         gain_set(panda, str(path))
+
+
+def test_continuous_joints_of_an_mjcf_file_are_told(tmp_path):
+    pytest.importorskip("mujoco", "3.17")
+    geom = '<geom size=".1"/>'
+    inner = f'<body pos="0 0 1"><joint name="b" range="-9 9"/>{geom}</body>'
+    body = f'<body><joint name="a"/>{geom}{inner}</body>'
+    actuators = "".join(f'<position joint="{each}" kp="3"/>' for each in "ab")
+    text = f"<mujoco><worldbody>{body}</worldbody><actuator>{actuators}</actuator></mujoco>"
+    (path := tmp_path / "r.xml").write_text(text)
+    with pytest.warns(UserWarning, match="continuous: .* does not: a$"):
+        gain_set(Robot.load(path), str(path))
