@@ -1,5 +1,5 @@
 // Kinematics, dynamics and operational space of many robots of one kind, row by row. The equations stand in
-// batchpid/task_space: tree_kinematics.py, tree_dynamics.py, symmetric.py and projections.py.
+// batchpid/task_space: tree_kinematics.py, tree_dynamics.py, symmetric.py, projections.py and inverse_kinematics.py.
 
 #include <algorithm>
 #include <cmath>
@@ -9,87 +9,22 @@
 #include "batchpid/native/buffer.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
+#include "batchpid/native/pose_search.h"
 #include "batchpid/native/rigid_body.h"
+#include "batchpid/native/tables.h"
+#include "batchpid/native/tool.h"
 
 using namespace batchpid;
 
 namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
-constexpr int AXES = 6, POSE = 7, SWEEPS = 12;
+constexpr int SWEEPS = 12;
 constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
                                  // the rounding of the matrix itself
 char const *const TREE = "batchpid.KinematicTree";
 
 enum Decoupling { FULL, PARTIAL, NONE };
-
-// Constants of a tree; the axes of joints are the x axes of their bodies.
-struct Tree {
-  BodyRow<double> const *bodies() const { return reinterpret_cast<BodyRow<double> const *>(rows.data()); }
-
-  std::int64_t dof;
-  std::vector<std::int32_t> tree;
-  std::vector<double> rows, armature;
-  Vector<Lanes> gravity;
-};
-
-// Array (rows, columns), or (1, columns) for all rows; without data if it is left out.
-struct Table {
-  double *data = nullptr;
-  std::int64_t columns = 0, rows = 0;
-
-  explicit operator bool() const { return data != nullptr; }
-  double *row(std::int64_t at) const { return data + (rows == 1 ? 0 : at) * columns; }
-  // Copy columns of the rows from `first` on; the last row stands for those that there are not.
-  void load(std::int64_t first, std::int64_t count, Lanes *out) const {
-    double const *const end = data + (rows - 1) * columns, *from[WIDTH];
-    for (int k = 0; k < WIDTH; ++k) from[k] = first + k < rows ? data + (first + k) * columns : end;
-    for (std::int64_t c = 0; c < count; ++c) {
-      for (int k = 0; k < WIDTH; ++k) out[c].of[k] = from[k][c];
-    }
-  }
-  void load(std::int64_t first, Lanes *out) const { load(first, columns, out); }
-  void store(std::int64_t first, std::int64_t count, Lanes const *values) const {
-    if (data == nullptr) return;
-    double *const to = data + first * columns;
-    if (first + WIDTH <= rows) {
-      for (std::int64_t c = 0; c < count; ++c) {
-        for (int k = 0; k < WIDTH; ++k) to[k * columns + c] = values[c].of[k];
-      }
-    } else {
-      for (std::int64_t c = 0; c < count; ++c) scatter(values[c], data, columns, c, first, rows);
-    }
-  }
-  void store(std::int64_t first, Lanes const *values) const { store(first, columns, values); }
-};
-
-// Arrays of Python as tables of doubles; None is a table without data.
-class Tables {
- public:
-  // Open an input of 1 row or `rows`, or an output of `rows`.
-  bool open(PyObject *object, std::int64_t columns, std::int64_t rows, bool output) {
-    Table &table = tables_[count_];
-    Buffer &buffer = buffers_[count_++];
-    if (object == Py_None) return true;
-    Py_ssize_t const given = PyObject_Size(object);
-    if (given < 0) return false;
-    std::int64_t const own = given == 1 && !output ? 1 : rows;
-    int const flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (output ? PyBUF_WRITABLE : 0);
-    if (!buffer.open(object, own * columns, sizeof(double), flags)) return false;
-    if (!buffer.is_double()) {
-      PyErr_SetString(PyExc_ValueError, "an array is not float64");
-      return false;
-    }
-    table = Table{buffer.as<double>(), columns, own};
-    return true;
-  }
-  Table const &operator[](int at) const { return tables_[at]; }
-
- private:
-  Buffer buffers_[20];
-  Table tables_[20];
-  int count_ = 0;
-};
 
 Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
 
@@ -117,29 +52,8 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
 }
 
-// Write the unit quaternion (w, x, y, z), w >= 0, of a rotation with these columns: wxyz_of in frames.py.
-void write_quaternion(double const (&x)[3], double const (&y)[3], double const (&z)[3], double *out) {
-  double const squares[4] = {1 + x[0] + y[1] + z[2], 1 + x[0] - y[1] - z[2], 1 - x[0] + y[1] - z[2],
-                             1 - x[0] - y[1] + z[2]};
-  double const wx = y[2] - z[1], wy = z[0] - x[2], wz = x[1] - y[0];
-  double const xy = x[1] + y[0], xz = x[2] + z[0], yz = y[2] + z[1];
-  double const rows[4][4] = {
-      {squares[0], wx, wy, wz}, {wx, squares[1], xy, xz}, {wy, xy, squares[2], yz}, {wz, xz, yz, squares[3]}};
-  int best = 0;
-  for (int k = 1; k < 4; ++k) best = squares[k] > squares[best] ? k : best;
-  double const *q = rows[best];
-  double const length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int k = 0; k < 4; ++k) out[k] = q[0] < 0 ? -q[k] / length : q[k] / length;
-}
-
 // Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
 enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
-
-void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
-  out[0] = v.x;
-  out[stride] = v.y;
-  out[2 * stride] = v.z;
-}
 
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
 FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, std::int64_t rows, Tables const &table) {
@@ -154,51 +68,26 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     table[QPOS].load(first, q.data());
     if (table[QVEL]) table[QVEL].load(first, v.data());
-    for (std::int64_t i = 0; i < dof; ++i) {
-      for (int k = 0; k < WIDTH; ++k) {
-        cosine[i].of[k] = std::cos(q[i].of[k]);
-        sine[i].of[k] = std::sin(q[i].of[k]);
-      }
-    }
+    write_cosines(dof, q.data(), cosine.data(), sine.data());
     place_bodies(dof, above, tree.bodies(), cosine.data(), sine.data(), q.data(), bodies.data());
+    if (table[BIAS] || table[MASS_MATRIX]) weigh_bodies(dof, tree.bodies(), bodies.data());
     if (table[QVEL]) move_bodies(dof, above, bodies.data(), v.data(), still, motions.data());
     if (table[TOOL]) {
-      Lanes frame[12];
+      Lanes frame[FRAME];
       table[TOOL].load(first, frame);
-      Vector<Lanes> columns[4];  // of the tool's frame: axes and place
-      for (int k = 0; k < 4; ++k) {
-        columns[k] = {frame[k], frame[4 + k], frame[8 + k]};
-        if (body < 0) continue;
-        columns[k] = in_axes(bodies[body].axes, columns[k].x, columns[k].y, columns[k].z);
-        if (k == 3) columns[k] = bodies[body].origin + columns[k];
-      }
-      Vector<Lanes> const place = columns[3];
+      Tool const tool(frame, body < 0 ? nullptr : &bodies[body]);
+      Vector<Lanes> const place = tool.place();
       if (table[TOOL_POSE]) {
-        put(place, frame);
-        table[TOOL_POSE].store(first, 3, frame);
-        for (int k = 0; k < WIDTH && first + k < rows; ++k) {
-          double axes[3][3];
-          for (int c = 0; c < 3; ++c) {
-            axes[c][0] = columns[c].x.of[k];
-            axes[c][1] = columns[c].y.of[k];
-            axes[c][2] = columns[c].z.of[k];
-          }
-          write_quaternion(axes[0], axes[1], axes[2], table[TOOL_POSE].row(first + k) + 3);
-        }
+        for (int k = 0; k < WIDTH && first + k < rows; ++k) tool.write_pose(k, table[TOOL_POSE].row(first + k));
       }
       if (table[JACOBIAN]) {
         for (std::int64_t j = body; j >= 0; j = above[2 * j]) {
-          Vector<Lanes> const w = turning(bodies[j], above[2 * j + 1]);
-          put(moving(bodies[j], above[2 * j + 1]) + cross(w, place), &jacobian[j], dof);
-          put(w, &jacobian[j + 3 * dof], dof);
+          write_column(bodies[j], above[2 * j + 1], place, &jacobian[j], dof);
         }
         table[JACOBIAN].store(first, jacobian.data());
       }
       if (table[JACOBIAN_RATE]) {
-        BodyMotion<Lanes> const base{}, &at = body < 0 ? base : motions[body];
-        Vector<Lanes> const inward = cross(at.turning, at.moving + cross(at.turning, place));
-        put(at.moving_change + cross(at.turning_change, place) + inward, frame);
-        put(at.turning_change, frame + 3);
+        write_rate(body < 0 ? BodyMotion<Lanes>{} : motions[body], place, frame);
         table[JACOBIAN_RATE].store(first, frame);
       }
     }
@@ -225,7 +114,7 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
   if (tree == nullptr) return nullptr;
   std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]), dof = tree->dof;
-  std::int64_t const sizes[KINEMATICS] = {dof, dof, 12, POSE, AXES * dof, AXES, dof * dof, dof};
+  std::int64_t const sizes[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
   Tables table;
   for (int i = 0; i < KINEMATICS; ++i) {
     if (!table.open(arguments[3 + i], sizes[i], rows, i > TOOL)) return nullptr;
@@ -481,25 +370,6 @@ PyObject *projections(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-double length_of(double const *v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
-
-// Write the error (6,) from a pose to a goal: pose_error in frames.py.
-void write_error(double const *goal, double const *pose, double *out) {
-  for (int k = 0; k < 3; ++k) out[k] = goal[k] - pose[k];
-  double const *g = goal + 4, *q = pose + 4, gw = goal[3], qw = pose[3];
-  double w = gw * qw + (g[0] * q[0] + g[1] * q[1] + g[2] * q[2]);
-  double v[3];
-  for (int k = 0; k < 3; ++k) {
-    int const next = (k + 1) % 3, last = (k + 2) % 3;
-    v[k] = qw * g[k] - gw * q[k] - (g[next] * q[last] - g[last] * q[next]);
-  }
-  double const sign = w < 0 ? -1.0 : 1.0;
-  w = sign * w;
-  double const length = length_of(v);
-  double const scale = length < 1e-12 * w ? 2 / w : 2 * std::atan2(length, w) / length;
-  for (int k = 0; k < 3; ++k) out[3 + k] = sign * v[k] * scale;
-}
-
 // errors(rows, dof, goal, pose, position_limit, rotation_limit, jacobian, qvel, error, near, twist)
 PyObject *errors(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
@@ -527,6 +397,22 @@ PyObject *errors(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
+// search(tree, body, rows, iterations, *arrays)
+PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Tree const *tree = tree_of(arguments[0]);
+  if (tree == nullptr) return nullptr;
+  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
+  std::int64_t const iterations = PyLong_AsLong(arguments[3]), dof = tree->dof;
+  if (PyErr_Occurred()) return nullptr;
+  std::int64_t const sizes[SEARCH] = {POSE, FRAME, dof, dof, 2, dof, 2, 1};
+  Tables table;
+  for (int i = 0; i < SEARCH; ++i) {
+    if (!table.open(arguments[4 + i], sizes[i], rows, i > LARGEST)) return nullptr;
+  }
+  search_poses(*tree, body, rows, iterations, table);
+  Py_RETURN_NONE;
+}
+
 template <class Function>
 PyCFunction method(Function function) {
   return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
@@ -537,6 +423,7 @@ PyMethodDef METHODS[] = {
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"projections", method(projections), METH_FASTCALL, nullptr},
     {"errors", method(errors), METH_FASTCALL, nullptr},
+    {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

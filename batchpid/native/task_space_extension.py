@@ -20,19 +20,22 @@ PROJECTIONS = (
     *("force", "task", "posture", "base", "task_of_others", "posture_of_others", "near_singular"),
 )
 """Arrays of ``projections``; those after the smallest eigenvalue are results."""
+SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
+"""Arrays of ``search`` in pose_search.h; those after the tolerances are results, and searches start at ``qpos``."""
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
 BUFFER, LANES, RIGID_BODY = (f"batchpid/native/{name}" for name in ("buffer.h", "lanes.h", "rigid_body.h"))
+_HEADERS = tuple(f"batchpid/native/{name}" for name in ("extension.h", "pose_search.h", "tables.h", "tool.h"))
 
 
 def _tables() -> tuple[Any, ...]:
-    return list(BODY.items()), KINEMATICS, PROJECTIONS, DECOUPLING
+    return list(BODY.items()), KINEMATICS, PROJECTIONS, SEARCH, DECOUPLING
 
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", "batchpid/native/extension.h", BUFFER, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, LANES, RIGID_BODY),
     (*ROUNDED, "-Wno-psabi"),
     _tables,
 )

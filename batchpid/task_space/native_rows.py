@@ -71,16 +71,38 @@ def kinematics(
         return None
     own = _native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
-    tool = own.tools[index]
-    if point is not None:
-        tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
-        tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
     shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
     found = {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     results = [found.get(name) for name in KINEMATICS[3:]]
-    _call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool.reshape(-1, 12), *results)
+    _call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, _tool(own, index, point), *results)
     return tuple(found.values())
+
+
+def search(
+    tree: KinematicTree, index: int, point: Any, goal: Any, start: Any, tolerance: Any, iterations: int
+) -> list[Float64] | None:
+    """Return positions (n, dof), errors (n, 2) and numbers of steps (n, 1) of searches for poses (n, 7) of a link.
+
+    The tool is at a ``point`` (3,) of the link ``index``; ``start`` is (n, dof), ``tolerance`` (2,).
+    """
+    if (native := in_use()) is None:
+        return None
+    own, rows = _native_tree(native, tree), len(start)
+    found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
+    limits = np.atleast_2d(tree.lower), np.atleast_2d(tree.upper)
+    arrays = goal, _tool(own, index, point), *limits, tolerance[None]
+    _call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
+    return found
+
+
+def _tool(own: _NativeTree, index: int, point: Any) -> Float64:
+    """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
+    tool = own.tools[index]
+    if point is not None:
+        tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
+        tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
+    return tool.reshape(-1, 12)
 
 
 def _native_tree(native: Any, tree: KinematicTree) -> _NativeTree:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from unittest import mock
 
 import numpy as np
@@ -99,6 +100,36 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
     for key in ("task", "posture"):  # the share of an effort of 1e-15 N m may be 0 or 1
         parts = [getattr(terms, f"{key}_share")[:, None] * getattr(terms, key) for terms in (found, wanted)]
         assert_same(*parts, 10 * tolerance)
+
+
+@settings(max_examples=60)
+@given(
+    name=st.sampled_from(TREES),
+    rows=st.integers(1, 9),
+    seed=st.integers(0, 2**31),
+    distance=st.sampled_from([0.02, 0.3, 3.0]),
+    iterations=st.integers(1, 3),
+    pointed=st.booleans(),
+    narrow=st.booleans(),
+)
+def test_inverse_kinematics(name, rows, seed, distance, iterations, pointed, narrow):
+    """A few steps of a search; in many steps rounding leads to other solutions."""
+    tree, tool, rng = tree_of(name), tool_of(name), np.random.default_rng(seed)
+    qpos, _ = states(tree, rows, seed)
+    start = qpos + distance * rng.uniform(-1, 1, qpos.shape)
+    if narrow:  # joints stop at their limits
+        middle = states(tree, 1, seed + 1)[0][0]
+        tree = dataclasses.replace(tree, lower=middle - 0.3, upper=middle + 0.3)
+    point = rng.normal(size=3) if pointed else None
+    pose = ts.link_poses(tree, qpos, [tool], point=point)[:, 0]
+    options = {"point": point, "starts": 1, "iterations": iterations, "on_failure": "return"}
+    found, wanted = both(lambda: ts.inverse_kinematics(tree, tool, pose, start, **options))
+    # A step amplifies rounding by the inverse of its damping at most, which is the error's.
+    size = wanted.position_error**2 + wanted.rotation_error**2
+    tolerance = 1e-13 / (1e-8 + 0.05 * size.min(initial=1.0))
+    for leaf in ("qpos", "position_error", "rotation_error"):
+        assert_same(getattr(found, leaf), getattr(wanted, leaf), tolerance)
+    np.testing.assert_array_equal(found.iterations, wanted.iterations)
 
 
 def test_a_row_is_the_same_in_any_company():
