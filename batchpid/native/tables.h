@@ -64,8 +64,10 @@ class Tables {
   Table const &operator[](int at) const { return tables_[at]; }
 
  private:
-  Buffer buffers_[20];
-  Table tables_[20];
+  static constexpr int MOST = 48;
+
+  Buffer buffers_[MOST];
+  Table tables_[MOST];
   int count_ = 0;
 };
 

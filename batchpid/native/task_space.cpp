@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <vector>
 
@@ -123,28 +124,55 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `projections`: PROJECTIONS in task_space_extension.py.
-enum Projections {
-  CHAIN,
+// Arrays of `law`: LAW in task_space_extension.py.
+enum Law {
+  TASK_POSE,
   TASK_JACOBIAN,
   TASK_RATE,
   TASK_MASS,
   TASK_BIAS,
+  CHAIN,
+  SETPOINT,
+  LAW_QPOS,
+  LAW_QVEL,
+  TWIST,
   ACCELERATION,
-  POSTURE_ACCELERATION,
   WRENCH,
   FEEDFORWARD,
+  POSTURE,
+  INTEGRAL,
+  KP,  // coefficients: fields of OSCCoefficients
+  KD,
+  C,
+  ACCELERATION_SHARE,
+  KI_DT,
+  KI_DT2,
+  POSTURE_KP,
+  POSTURE_KD,
+  LIMIT_KP,
+  LIMIT_KD,
+  LIMIT_MARGIN,
+  LIMIT_LOW,
+  LIMIT_HIGH,
+  INTEGRAL_LIMIT,
+  POSITION_LIMIT,
+  ROTATION_LIMIT,
+  SMALLEST,
   SELECTED,
   FORCE_AXES,
-  SMALLEST,
+  EFFORT_MIN,
+  EFFORT_MAX,
+  EFFORT,  // results
+  NEXT_INTEGRAL,
+  TASK_ERROR,
   FORCE,
-  TASK,
-  POSTURE,
-  BASE,
-  TASK_OF_OTHERS,
-  POSTURE_OF_OTHERS,
+  TASK_EFFORT,
+  POSTURE_EFFORT,
+  UNSATURATED,
+  TASK_SHARE,
+  POSTURE_SHARE,
   NEAR_SINGULAR,
-  PROJECTIONS
+  LAW
 };
 
 // Write the eigenvalues (6,) and, as columns, the eigenvectors of symmetric matrices, of which the upper triangle is used
@@ -246,25 +274,117 @@ Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size) {
   return sum;
 }
 
-FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, Decoupling decoupling,
-                                          Tables const &table) {
+// Inputs of a law for WIDTH rows. A row that stands for all is loaded once.
+class Given {
+ public:
+  Given(Tables const &table, int count) : table_(table), count_(count) {
+    std::size_t size = 0;
+    for (int i = 0; i < count; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
+    of_.resize(size);
+    Lanes *next = of_.data();
+    for (int i = 0; i < count; ++i) {
+      if (!table[i]) continue;
+      at_[i] = next;
+      next += table[i].columns;
+      if (table[i].rows == 1) table[i].load(0, at_[i]);
+    }
+  }
+  void load(std::int64_t first) {
+    for (int i = 0; i < count_; ++i) {
+      if (table_[i] && table_[i].rows > 1) table_[i].load(first, at_[i]);
+    }
+  }
+  // The columns of an array; null if it is left out.
+  Lanes *operator[](int i) const { return at_[i]; }
+
+ private:
+  Tables const &table_;
+  int count_;
+  Lanes *at_[LAW] = {};
+  std::vector<Lanes> of_;
+};
+
+// Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
+Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
+                   Lanes const *high) {
+  Lanes const infinite = std::numeric_limits<double>::infinity();
+  Lanes share = 1.0;
+  for (std::int64_t i = 0; i < dof; ++i) {
+    Lanes const least = low == nullptr ? -infinite : low[i], most = high == nullptr ? infinite : high[i];
+    Lanes const able = at_least_mask(base[i], least) * at_least_mask(most, base[i]);
+    Lanes const room = at_least(where_positive(effort[i], most - at[i], at[i] - least), 0.0);
+    Lanes const size = absolute(effort[i]);
+    Lanes const limited = where_positive(size - room, able, Lanes{});
+    share = at_most(where_positive(limited, room / where_positive(limited, size, 1.0), 1.0), share);
+  }
+  return share;
+}
+
+FOR_EACH_PROCESSOR void write_law(std::int64_t rows, std::int64_t dof, Decoupling decoupling, bool in_tool_axes,
+                                  Tables const &table) {
   auto const n = static_cast<std::size_t>(dof);
   std::vector<std::int64_t> chain, others;
   for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain : others).push_back(i);
   auto const links = static_cast<std::int64_t>(chain.size());
-  std::vector<Lanes> jacobian(AXES * n), mass(n * n), factor(n * n), white(AXES * n), a_n(n), both(2 * n);
-  std::vector<Lanes> base(n), feedforward(n), task(n), posture(n), of_task(n), of_posture(n);  // 0 for joints that have no part in it
-  Lanes mobility[AXES * AXES], task_inertia[AXES * AXES], null_inertia[AXES * AXES], axes[AXES], allowed[AXES];
-  Lanes acceleration[AXES], force[AXES], drop[AXES], added[AXES];
+  Given given(table, EFFORT);
+  enum { FACTOR, WHITE, BOTH, A_N, BASE, TASK, NULL_SPACE, OF_TASK, OF_NULL, SUM, WHOLE, WORK };
+  std::vector<Lanes> storage(n * (n + AXES + 2 + WORK - A_N));  // 0 for joints that have no part in an effort
+  Lanes *work[WORK] = {storage.data(), storage.data() + n * n, storage.data() + n * (n + AXES)};
+  for (int i = A_N; i < WORK; ++i) work[i] = storage.data() + n * static_cast<std::size_t>(n + AXES + 2 + i - A_N);
+  Lanes *factor = work[FACTOR], *white = work[WHITE], *both = work[BOTH], *a_n = work[A_N], *base = work[BASE];
+  Lanes *task = work[TASK], *posture = work[NULL_SPACE], *of_task = work[OF_TASK], *of_posture = work[OF_NULL];
+  Lanes *sum = work[SUM], *whole = work[WHOLE];
+  Lanes mobility[AXES * AXES], task_inertia[AXES * AXES], null_inertia[AXES * AXES], allowed[AXES];
+  Lanes error[AXES], near_error[AXES], twist[AXES], turned[2][AXES], a[AXES], moved[AXES], force[AXES], drop[AXES];
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    table[TASK_JACOBIAN].load(first, jacobian.data());
-    table[TASK_MASS].load(first, mass.data());
+    given.load(first);
+    Lanes *jacobian = given[TASK_JACOBIAN], *rate = given[TASK_RATE];
+    Lanes const *mass = given[TASK_MASS], *axes = given[SELECTED], *qpos = given[LAW_QPOS], *qvel = given[LAW_QVEL];
+    Lanes const *target = given[TWIST], *target_rate = given[ACCELERATION];
+
+    for (int k = 0; k < WIDTH; ++k) {  // e
+      std::int64_t const row = std::min(first + k, rows - 1);
+      double e[AXES];
+      write_error(table[SETPOINT].row(row), table[TASK_POSE].row(row), e);
+      for (int axis = 0; axis < AXES; ++axis) error[axis].of[k] = e[axis];
+    }
+    for (int half = 0; half < AXES; half += 3) {
+      Lanes const *e = error + half, length = root(e[0] * e[0] + e[1] * e[1] + e[2] * e[2]);
+      Lanes const limit = *given[half == 0 ? POSITION_LIMIT : ROTATION_LIMIT];
+      Lanes const scale = where_positive(length - limit, limit / length, 1.0);
+      for (int k = 0; k < 3; ++k) near_error[half + k] = scale * e[k];
+    }
+    for (int axis = 0; axis < AXES; ++axis) twist[axis] = along(jacobian + axis * dof, qvel, dof);  // J q'
+    if (in_tool_axes) {
+      Turn const turn(given[TASK_POSE] + 3);
+      if (target != nullptr) target = std::copy(target, target + AXES, turned[0]) - AXES;
+      if (target_rate != nullptr) target_rate = std::copy(target_rate, target_rate + AXES, turned[1]) - AXES;
+      for (Lanes *vector : {error, near_error, twist, rate, turned[0], turned[1]}) turn.reverse(vector, 1);
+      for (std::int64_t j = 0; j < dof; ++j) turn.reverse(jacobian + j, dof);
+    }
+
+    Lanes const *kp = given[KP], *kd = given[KD], *integral = given[INTEGRAL];
+    for (int axis = 0; axis < AXES; ++axis) {
+      a[axis] = kp[axis] * near_error[axis] - kd[axis] * twist[axis];
+      if (target != nullptr) a[axis] += given[C][axis] * target[axis];
+      if (target_rate != nullptr) a[axis] += given[ACCELERATION_SHARE][axis] * target_rate[axis];
+      if (integral != nullptr) a[axis] += integral[axis];
+    }
+    for (std::int64_t j = 0; j < dof; ++j) {
+      a_n[j] = given[POSTURE_KP][j] * (given[POSTURE][j] - qpos[j]) - given[POSTURE_KD][j] * qvel[j];
+      if (given[LIMIT_KP] == nullptr) continue;
+      Lanes const low = given[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given[LIMIT_HIGH][j];
+      Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0);
+      Lanes const damped = given[LIMIT_KD][j] * qvel[j] * absolute(depth) / given[LIMIT_MARGIN][j];
+      a_n[j] += given[CHAIN][j] * (given[LIMIT_KP][j] * depth - damped);
+    }
+
     for (std::int64_t i = 0; i < links; ++i) {
       for (std::int64_t j = 0; j <= i; ++j) factor[i * links + j] = mass[chain[i] * dof + chain[j]];
       for (int axis = 0; axis < AXES; ++axis) white[i * AXES + axis] = jacobian[axis * dof + chain[i]];
     }
-    cholesky(links, factor.data());
-    solve_lower<AXES>(links, factor.data(), white.data());  // L^-1 J^T
+    cholesky(links, factor);
+    solve_lower<AXES>(links, factor, white);  // L^-1 J^T
     std::fill(mobility, mobility + AXES * AXES, Lanes{});
     for (std::int64_t i = 0; i < links; ++i) {
       Lanes const *row = &white[i * AXES];
@@ -276,14 +396,13 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
       for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
     }
 
-    Table const &selected = table[SELECTED], &force_axes = table[FORCE_AXES];
-    bool const select = bool(selected), force_too = select && force_axes;
-    if (select) selected.load(first, axes);
-    if (force_too) force_axes.load(first, added);
-    for (int axis = 0; axis < AXES; ++axis) allowed[axis] = force_too ? at_least(axes[axis], added[axis]) : axes[axis];
-    Lanes s0, near{};
-    table[SMALLEST].load(first, &s0);
-    selected_inverse(mobility, select ? allowed : nullptr, s0, null_inertia, near);
+    bool const force_too = axes != nullptr && given[FORCE_AXES] != nullptr;
+    for (int axis = 0; axis < AXES && axes != nullptr; ++axis) {
+      allowed[axis] = force_too ? at_least(axes[axis], given[FORCE_AXES][axis]) : axes[axis];
+    }
+    Lanes const s0 = *given[SMALLEST];
+    Lanes near{};
+    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia, near);
     Lanes *inertia = null_inertia;
     if (decoupling == PARTIAL || (decoupling == FULL && force_too)) {
       if (decoupling == PARTIAL) {
@@ -293,30 +412,22 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
           }
         }
       }
-      selected_inverse(mobility, select ? axes : nullptr, s0, task_inertia, near);
+      selected_inverse(mobility, axes, s0, task_inertia, near);
       inertia = task_inertia;
     }
 
-    table[ACCELERATION].load(first, acceleration);
-    if (decoupling != NONE) {
-      table[TASK_RATE].load(first, added);
-      for (int axis = 0; axis < AXES; ++axis) acceleration[axis] -= added[axis];
-    }
-    if (table[WRENCH]) table[WRENCH].load(first, added);
+    for (int axis = 0; axis < AXES; ++axis) moved[axis] = decoupling == NONE ? a[axis] : a[axis] - rate[axis];
     for (int axis = 0; axis < AXES; ++axis) {
-      force[axis] = decoupling != NONE ? along(inertia + axis * AXES, acceleration, AXES)
-                    : select           ? axes[axis] * acceleration[axis]
-                                       : acceleration[axis];
-      if (table[WRENCH]) force[axis] += added[axis];
+      force[axis] = decoupling != NONE ? along(inertia + axis * AXES, moved, AXES)
+                    : axes != nullptr  ? axes[axis] * moved[axis]
+                                       : moved[axis];
+      if (given[WRENCH] != nullptr) force[axis] += given[WRENCH][axis];
     }
-    table[FORCE].store(first, force);
-
-    table[POSTURE_ACCELERATION].load(first, a_n.data());
     for (int axis = 0; axis < AXES; ++axis) {  // J a_n of the chain
-      acceleration[axis] = {};
-      for (std::int64_t i : chain) acceleration[axis] += jacobian[axis * dof + i] * a_n[i];
+      moved[axis] = {};
+      for (std::int64_t i : chain) moved[axis] += jacobian[axis * dof + i] * a_n[i];
     }
-    for (int axis = 0; axis < AXES; ++axis) drop[axis] = along(null_inertia + axis * AXES, acceleration, AXES);
+    for (int axis = 0; axis < AXES; ++axis) drop[axis] = along(null_inertia + axis * AXES, moved, AXES);
 
     for (std::int64_t c = 0; c < links; ++c) {
       std::int64_t const i = chain[c];
@@ -329,18 +440,14 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
       task[i] = both[2 * c] = x;
       posture[i] = both[2 * c + 1] = y;
     }
-    table[TASK].store(first, task.data());
-    table[POSTURE].store(first, posture.data());
-    table[TASK_BIAS].load(first, base.data());
-    if (table[FEEDFORWARD]) table[FEEDFORWARD].load(first, feedforward.data());
     for (std::int64_t i = 0; i < dof; ++i) {
+      base[i] = given[TASK_BIAS][i];
       for (std::int64_t j : others) base[i] += mass[i * dof + j] * a_n[j];
-      if (table[FEEDFORWARD]) base[i] += feedforward[i];
+      if (given[FEEDFORWARD] != nullptr) base[i] += given[FEEDFORWARD][i];
     }
-    table[BASE].store(first, base.data());
     if (!others.empty()) {  // M_oc M_cc^-1 of task and posture
-      solve_lower<2>(links, factor.data(), both.data());
-      solve_upper<2>(links, factor.data(), both.data());
+      solve_lower<2>(links, factor, both);
+      solve_upper<2>(links, factor, both);
     }
     for (std::int64_t i : others) {
       of_task[i] = of_posture[i] = {};
@@ -349,51 +456,92 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
         of_posture[i] += mass[i * dof + chain[c]] * both[2 * c + 1];
       }
     }
-    table[TASK_OF_OTHERS].store(first, of_task.data());
-    table[POSTURE_OF_OTHERS].store(first, of_posture.data());
+
+    Lanes const *low = given[EFFORT_MIN], *high = given[EFFORT_MAX];
+    Lanes const s1 = share_within(dof, task, base, base, low, high);
+    for (std::int64_t i = 0; i < dof; ++i) sum[i] = base[i] + s1 * task[i];
+    Lanes const s2 = share_within(dof, posture, sum, base, low, high);
+    Lanes held = near;
+    for (std::int64_t i = 0; i < dof; ++i) {
+      Lanes const rest = s1 * of_task[i] + s2 * of_posture[i];
+      whole[i] = base[i] + task[i] + posture[i] + rest;
+      sum[i] = sum[i] + s2 * posture[i] + rest;
+      if (low != nullptr) sum[i] = at_least(sum[i], low[i]);
+      if (high != nullptr) sum[i] = at_most(sum[i], high[i]);
+      held = where_positive(differs_mask(sum[i], whole[i]), 1.0, held);
+    }
+    table[EFFORT].store(first, sum);
+    if (integral != nullptr) {
+      Lanes next[AXES];
+      for (int axis = 0; axis < AXES; ++axis) {
+        next[axis] = integral[axis] + given[KI_DT][axis] * near_error[axis];
+        if (given[KI_DT2] != nullptr && target != nullptr) next[axis] -= given[KI_DT2][axis] * target[axis];
+        Lanes const limit = given[INTEGRAL_LIMIT][axis], grows = held * where_positive(a[axis] * near_error[axis], 1.0, 0.0);
+        next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -limit), limit));
+      }
+      table[NEXT_INTEGRAL].store(first, next);
+    }
+    table[TASK_ERROR].store(first, error);
+    table[FORCE].store(first, force);
+    table[TASK_EFFORT].store(first, task);
+    table[POSTURE_EFFORT].store(first, posture);
+    table[UNSATURATED].store(first, whole);
+    table[TASK_SHARE].store(first, &s1);
+    table[POSTURE_SHARE].store(first, &s2);
     table[NEAR_SINGULAR].store(first, &near);
   }
 }
 
-// projections(rows, dof, decoupling, *arrays)
-PyObject *projections(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
-  long const decoupling = PyLong_AsLong(arguments[2]);
-  if (PyErr_Occurred()) return nullptr;
-  std::int64_t const sizes[PROJECTIONS] = {dof, AXES * dof, AXES, dof * dof, dof, AXES, dof, AXES, dof, AXES,
-                                           AXES, 1, AXES, dof, dof, dof, dof, dof, 1};
-  Tables table;
-  for (int i = 0; i < PROJECTIONS; ++i) {
-    if (!table.open(arguments[3 + i], sizes[i], i == CHAIN ? 1 : rows, i > SMALLEST)) return nullptr;
+// Columns of an array of `law`.
+std::int64_t law_columns(int array, std::int64_t dof) {
+  switch (array) {
+    case TASK_POSE:
+    case SETPOINT:
+      return POSE;
+    case TASK_JACOBIAN:
+      return AXES * dof;
+    case TASK_MASS:
+      return dof * dof;
+    case POSITION_LIMIT:
+    case ROTATION_LIMIT:
+    case SMALLEST:
+    case TASK_SHARE:
+    case POSTURE_SHARE:
+    case NEAR_SINGULAR:
+      return 1;
+    case TASK_RATE:
+    case TWIST:
+    case ACCELERATION:
+    case WRENCH:
+    case INTEGRAL:
+    case KP:
+    case KD:
+    case C:
+    case ACCELERATION_SHARE:
+    case KI_DT:
+    case KI_DT2:
+    case INTEGRAL_LIMIT:
+    case SELECTED:
+    case FORCE_AXES:
+    case NEXT_INTEGRAL:
+    case TASK_ERROR:
+    case FORCE:
+      return AXES;
+    default:
+      return dof;
   }
-  write_projections(rows, dof, static_cast<Decoupling>(decoupling), table);
-  Py_RETURN_NONE;
 }
 
-// errors(rows, dof, goal, pose, position_limit, rotation_limit, jacobian, qvel, error, near, twist)
-PyObject *errors(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+// law(rows, dof, decoupling, in_tool_axes, *arrays)
+PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
+  long const decoupling = PyLong_AsLong(arguments[2]), in_tool_axes = PyLong_AsLong(arguments[3]);
   if (PyErr_Occurred()) return nullptr;
-  std::int64_t const sizes[9] = {POSE, POSE, 1, 1, AXES * dof, dof, AXES, AXES, AXES};
   Tables table;
-  for (int i = 0; i < 9; ++i) {
-    if (!table.open(arguments[2 + i], sizes[i], rows, i > 5)) return nullptr;
+  for (int i = 0; i < LAW; ++i) {
+    if (!table.open(arguments[4 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return nullptr;
   }
-  for (std::int64_t row = 0; row < rows; ++row) {
-    double *error = table[6].row(row), *near = table[7].row(row), *twist = table[8].row(row);
-    write_error(table[0].row(row), table[1].row(row), error);
-    for (int half = 0; half < 2; ++half) {
-      double const length = length_of(error + 3 * half), limit = *table[2 + half].row(row);
-      double const scale = length > limit ? limit / length : 1.0;
-      for (int k = 3 * half; k < 3 * half + 3; ++k) near[k] = scale * error[k];
-    }
-    double const *jacobian = table[4].row(row), *qvel = table[5].row(row);
-    for (int axis = 0; axis < AXES; ++axis) {
-      double sum = 0.0;
-      for (std::int64_t j = 0; j < dof; ++j) sum += jacobian[axis * dof + j] * qvel[j];
-      twist[axis] = sum;
-    }
-  }
+  write_law(rows, dof, static_cast<Decoupling>(decoupling), in_tool_axes != 0, table);
   Py_RETURN_NONE;
 }
 
@@ -421,8 +569,7 @@ PyCFunction method(Function function) {
 PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
-    {"projections", method(projections), METH_FASTCALL, nullptr},
-    {"errors", method(errors), METH_FASTCALL, nullptr},
+    {"law", method(law), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

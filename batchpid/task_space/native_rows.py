@@ -11,24 +11,26 @@ import math
 import os
 import warnings
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import SWITCH, program_status
+from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.task_space_extension import BODY, DECOUPLING, KINEMATICS, TASK_SPACE
-from batchpid.native.tracing import trace
+from batchpid.native.task_space_extension import BODY, DECOUPLING, KINEMATICS, LAW, TASK_SPACE
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 Float64 = NDArray[np.float64]
 
 _SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
+
+
+_RESULTS = LAW[LAW.index("effort") :]
+_LAW_SIZES = {"next_integral": 6, "error": 6, "force": 6, "task_share": 1, "posture_share": 1, "near_singular": 1}
 
 
 class _NativeTree(NamedTuple):
@@ -132,58 +134,22 @@ def _turn(axis: Float64) -> Float64:
     return np.column_stack([axis, across, np.cross(axis, across)])
 
 
-def errors(goal: Any, pose: Any, limits: tuple[Any, Any], jacobian: Any, qvel: Any) -> list[Float64] | None:
-    """Return the errors of poses (envs, 6), the same with limited norms, and the twists J q' (envs, 6).
+def law(
+    decoupling: str, in_tool_axes: bool, dynamics: Any, inputs: tuple[Any, ...], coefficients: Any, wanted: Any
+) -> list[Float64] | None:
+    """Return results of a step of the law of operational_space.py, of the names ``wanted`` in LAW.
 
-    ``limits`` are the largest norms (1 | envs, 1) of the position and of the rotation vector.
+    ``dynamics``, ``inputs`` and ``coefficients`` are the arrays before them in LAW, in its order.
     """
-    arrays = goal, pose, *limits, jacobian, qvel
-    native = _for_rows(qvel, *arrays)
+    arrays = *dynamics, *inputs, *coefficients
+    qpos = inputs[1]
+    native = _for_rows(qpos, *arrays)
     if native is None:
         return None
-    rows, dof = qvel.shape
-    found = [np.empty((rows, 6)) for _ in range(3)]
-    _call(native.errors, rows, dof, *arrays, *found)
-    return found
-
-
-def projections(decoupling: str, chain: Any, arrays: tuple[Any, ...]) -> list[Any] | None:
-    """Return the arrays of :class:`batchpid.task_space.projections.Projections`.
-
-    ``arrays`` are those between the chain and the results in PROJECTIONS of task_space_extension.py.
-    """
-    native = _for_rows(arrays[3], chain, *arrays)
-    if native is None:
-        return None
-    rows, dof = arrays[3].shape
-    found = [np.empty((rows, size)) for size in (6, dof, dof, dof, dof, dof, 1)]
-    _call(native.projections, rows, dof, DECOUPLING.index(decoupling), chain, *arrays, *found)
-    found[-1] = found[-1][:, 0] > 0
-    return found
-
-
-def elementwise(function: Callable[..., list[Any]], *arrays: Any) -> list[Any]:
-    """Return ``function(*arrays)``, elementwise over arrays (envs | 1, columns) of NumPy as a traced program.
-
-    The program is the function itself, with its rounding: a minimum over columns is repeated in all of them.
-    """
-    shapes = [array.shape for array in arrays if type(array) is np.ndarray and array.ndim == 2]
-    given = tuple([array is not None for array in arrays])
-    if len(shapes) < sum(given) or not program_status().active:
-        return function(*arrays)
-    arrays = tuple([array for array in arrays if array is not None])
-    if any([array.dtype != np.float64 for array in arrays]):
-        arrays = tuple(map(_contiguous, arrays))
-    return list(_program(function, given, max(shapes))(*arrays))
-
-
-@lru_cache(maxsize=256)
-def _program(function: Callable[..., list[Any]], given: tuple[bool, ...], shape: tuple[int, int]) -> ArrayProgram:
-    def traced(*symbols: Any) -> list[Any]:
-        rest = iter(symbols)
-        return function(*(next(rest) if one else None for one in given))
-
-    return ArrayProgram(trace(traced, 0, sum(given)), (), sum(given), shape, threads=1)
+    (rows, dof), sizes = qpos.shape, _LAW_SIZES
+    found = {name: np.empty((rows, sizes.get(name, dof))) for name in wanted}
+    _call(native.law, rows, dof, DECOUPLING.index(decoupling), in_tool_axes, *arrays, *map(found.get, _RESULTS))
+    return list(found.values())
 
 
 def _for_rows(like: Any, *arrays: Any) -> Any:

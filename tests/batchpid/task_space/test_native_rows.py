@@ -72,14 +72,20 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     frame=st.sampled_from(["world", "tool"]),
     smallest=st.sampled_from([0.02, 0.5, 10.0]),
     extras=st.integers(0, 15),
+    limit=st.sampled_from([200.0, None]),
+    learns=st.booleans(),
+    avoids=st.booleans(),
 )
-def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
+def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras, limit, learns, avoids):
     tree, tool = tree_of(name), tool_of(name)
     qpos, qvel = states(tree, rows, seed)
     goal = ts.link_poses(tree, states(tree, rows, seed + 1)[0], [tool])[:, 0]
     rng = np.random.default_rng(seed)
     forces = None if forces is None else np.array(forces) & ~np.array(axes or [True] * 6)
-    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": 200.0}
+    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": limit}
+    options |= {"integral_gain": 50.0, "integral_limit": 1.0} if learns else {}
+    options |= {"limit_margin": 0.5} if avoids else {}
+    options |= {"discretization": "implicit"} if seed % 2 and kind != "none" else {}
     stiffness = rng.uniform(50, 200, (1 if seed % 3 else rows, 6))
     params = ts.make_osc_params(tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options)
     names = "twist", "acceleration", "wrench", "feedforward"
@@ -88,8 +94,14 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
         for bit, key in enumerate(names)
         if extras >> bit & 1
     }
-    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
-    found, wanted = both(lambda: ts.step_terms(params, state, goal, qpos, qvel, 1e-3, tree=tree, link=tool, **given)[1])
+    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape), rng.normal(size=(rows, 6)) if learns else None)
+    inputs = params, state, goal, qpos, qvel, 1e-3
+    (new, found), (plain, wanted) = both(lambda: ts.step_terms(*inputs, tree=tree, link=tool, **given))
+    after, effort = ts.step(*inputs, tree=tree, link=tool, **given)
+    np.testing.assert_array_equal(effort, found.effort)
+    if learns:
+        np.testing.assert_array_equal(after.integral, new.integral)
+        assert_same(new.integral, plain.integral, 1e-12)
     np.testing.assert_array_equal(found.near_singular, wanted.near_singular)
     # The inverse amplifies the rounding of A, which is relative to its norm, by 1/s0 at most.
     d = ts.task_dynamics(tree, qpos, qvel, tool)
