@@ -64,7 +64,7 @@ class Tables {
   Table const &operator[](int at) const { return tables_[at]; }
 
  private:
-  static constexpr int MOST = 48;
+  static constexpr int MOST = 52;
 
   Buffer buffers_[MOST];
   Table tables_[MOST];

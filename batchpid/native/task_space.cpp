@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "batchpid/native/buffer.h"
+#include "batchpid/native/call.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/pose_search.h"
@@ -110,16 +111,21 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   }
 }
 
+bool open_kinematics(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
+  std::int64_t const sizes[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
+  for (int i = 0; i < KINEMATICS; ++i) {
+    if (!table.open(arrays[i], sizes[i], rows, i > TOOL)) return false;
+  }
+  return true;
+}
+
 // kinematics(tree, body, rows, *arrays)
 PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
   if (tree == nullptr) return nullptr;
-  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]), dof = tree->dof;
-  std::int64_t const sizes[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
+  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
   Tables table;
-  for (int i = 0; i < KINEMATICS; ++i) {
-    if (!table.open(arguments[3 + i], sizes[i], rows, i > TOOL)) return nullptr;
-  }
+  if (!open_kinematics(table, arguments + 3, rows, tree->dof)) return nullptr;
   write_kinematics(*tree, body, rows, table);
   Py_RETURN_NONE;
 }
@@ -139,6 +145,8 @@ enum Law {
   ACCELERATION,
   WRENCH,
   FEEDFORWARD,
+  DAMPING,
+  ADDED_INERTIA,
   POSTURE,
   INTEGRAL,
   KP,  // coefficients: fields of OSCCoefficients
@@ -339,9 +347,11 @@ FOR_EACH_PROCESSOR void write_law(std::int64_t rows, std::int64_t dof, Decouplin
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     given.load(first);
     Lanes *jacobian = given[TASK_JACOBIAN], *rate = given[TASK_RATE];
-    Lanes const *mass = given[TASK_MASS], *axes = given[SELECTED], *qpos = given[LAW_QPOS], *qvel = given[LAW_QVEL];
+    Lanes *mass = given[TASK_MASS];
+    Lanes const *axes = given[SELECTED], *qpos = given[LAW_QPOS], *qvel = given[LAW_QVEL];
     Lanes const *target = given[TWIST], *target_rate = given[ACCELERATION];
 
+    for (std::int64_t i = 0; i < dof && given[ADDED_INERTIA] != nullptr; ++i) mass[i * dof + i] += given[ADDED_INERTIA][i];
     for (int k = 0; k < WIDTH; ++k) {  // e
       std::int64_t const row = std::min(first + k, rows - 1);
       double e[AXES];
@@ -444,6 +454,7 @@ FOR_EACH_PROCESSOR void write_law(std::int64_t rows, std::int64_t dof, Decouplin
       base[i] = given[TASK_BIAS][i];
       for (std::int64_t j : others) base[i] += mass[i * dof + j] * a_n[j];
       if (given[FEEDFORWARD] != nullptr) base[i] += given[FEEDFORWARD][i];
+      if (given[DAMPING] != nullptr) base[i] += given[DAMPING][i] * qvel[i];
     }
     if (!others.empty()) {  // M_oc M_cc^-1 of task and posture
       solve_lower<2>(links, factor, both);
@@ -532,17 +543,61 @@ std::int64_t law_columns(int array, std::int64_t dof) {
   }
 }
 
+bool open_law(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
+  for (int i = 0; i < LAW; ++i) {
+    if (!table.open(arrays[i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
+  }
+  return true;
+}
+
 // law(rows, dof, decoupling, in_tool_axes, *arrays)
 PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
   long const decoupling = PyLong_AsLong(arguments[2]), in_tool_axes = PyLong_AsLong(arguments[3]);
   if (PyErr_Occurred()) return nullptr;
   Tables table;
-  for (int i = 0; i < LAW; ++i) {
-    if (!table.open(arguments[4 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return nullptr;
-  }
+  if (!open_law(table, arguments + 4, rows, dof)) return nullptr;
   write_law(rows, dof, static_cast<Decoupling>(decoupling), in_tool_axes != 0, table);
   Py_RETURN_NONE;
+}
+
+// Kinematics and law of some robots on fixed arrays.
+struct BoundLaw : Call {
+  Tree tree;
+  std::int64_t body, rows;
+  Decoupling decoupling;
+  bool in_tool_axes;
+  Tables kinematics, law;
+
+  static void run_both(Call const &call) {
+    auto const &bound = static_cast<BoundLaw const &>(call);
+    write_kinematics(bound.tree, bound.body, bound.rows, bound.kinematics);
+    write_law(bound.rows, bound.tree.dof, bound.decoupling, bound.in_tool_axes, bound.law);
+  }
+};
+
+char const *const BOUND = "batchpid.BoundLaw";
+
+// bind(tree, body, rows, decoupling, in_tool_axes, *arrays of kinematics, *arrays of law) -> (object, address of Call)
+PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Tree const *tree = tree_of(arguments[0]);
+  if (tree == nullptr) return nullptr;
+  auto bound = std::make_unique<BoundLaw>();
+  bound->run = BoundLaw::run_both;
+  bound->tree = *tree;
+  bound->body = PyLong_AsLong(arguments[1]);
+  bound->rows = PyLong_AsLong(arguments[2]);
+  bound->decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[3]));
+  bound->in_tool_axes = PyLong_AsLong(arguments[4]) != 0;
+  if (PyErr_Occurred() || !open_kinematics(bound->kinematics, arguments + 5, bound->rows, tree->dof) ||
+      !open_law(bound->law, arguments + 5 + KINEMATICS, bound->rows, tree->dof)) {
+    return nullptr;
+  }
+  PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
+  PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
+    delete static_cast<BoundLaw *>(PyCapsule_GetPointer(object, BOUND));
+  });
+  return Py_BuildValue("NN", capsule, address);
 }
 
 // search(tree, body, rows, iterations, *arrays)
@@ -570,6 +625,7 @@ PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
+    {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

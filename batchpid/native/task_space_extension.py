@@ -16,7 +16,8 @@ KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass
 results."""
 LAW = (
     *("pose", "jacobian", "jacobian_rate", "mass_matrix", "bias", "chain"),
-    *("setpoint", "qpos", "qvel", "twist", "acceleration", "wrench", "feedforward", "posture", "integral"),
+    *("setpoint", "qpos", "qvel", "twist", "acceleration", "wrench", "feedforward"),
+    *("damping", "added_inertia", "posture", "integral"),
     *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
     *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
     *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
@@ -30,7 +31,9 @@ SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "ste
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, LANES, RIGID_BODY = (f"batchpid/native/{name}" for name in ("buffer.h", "lanes.h", "rigid_body.h"))
+BUFFER, CALL, LANES, RIGID_BODY = (
+    f"batchpid/native/{name}" for name in ("buffer.h", "call.h", "lanes.h", "rigid_body.h")
+)
 _HEADERS = tuple(f"batchpid/native/{name}" for name in ("extension.h", "pose_search.h", "tables.h", "tool.h"))
 
 
@@ -40,7 +43,7 @@ def _tables() -> tuple[Any, ...]:
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, LANES, RIGID_BODY),
     (*ROUNDED, "-Wno-psabi"),
     _tables,
 )

@@ -1,4 +1,4 @@
-"""Kinematics and projections of NumPy arrays in native code, for any number of rows: task_space.cpp.
+"""Kinematics and inverse kinematics of NumPy arrays in native code, for any number of rows: task_space.cpp.
 
 Each function takes float64 arrays and returns None where native code is not used: switched off (``BATCHPID_NATIVE=0``),
 not built, or for arrays of another library. The caller then computes the same in NumPy, the definition; results differ
@@ -20,17 +20,13 @@ from numpy.typing import NDArray
 
 from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.task_space_extension import BODY, DECOUPLING, KINEMATICS, LAW, TASK_SPACE
+from batchpid.native.task_space_extension import BODY, KINEMATICS, TASK_SPACE
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 Float64 = NDArray[np.float64]
 
 _SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
-
-
-_RESULTS = LAW[LAW.index("effort") :]
-_LAW_SIZES = {"next_integral": 6, "error": 6, "force": 6, "task_share": 1, "posture_share": 1, "near_singular": 1}
 
 
 class _NativeTree(NamedTuple):
@@ -71,14 +67,19 @@ def kinematics(
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
     if native is None:
         return None
-    own = _native_tree(native, tree)
+    own = native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
-    shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
-    found = {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
+    found = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     results = [found.get(name) for name in KINEMATICS[3:]]
-    _call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, _tool(own, index, point), *results)
+    call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results)
     return tuple(found.values())
+
+
+def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:
+    """Return arrays for the results ``wanted`` of :func:`kinematics`."""
+    shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
+    return {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
 
 
 def search(
@@ -90,15 +91,15 @@ def search(
     """
     if (native := in_use()) is None:
         return None
-    own, rows = _native_tree(native, tree), len(start)
+    own, rows = native_tree(native, tree), len(start)
     found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
     limits = np.atleast_2d(tree.lower), np.atleast_2d(tree.upper)
-    arrays = goal, _tool(own, index, point), *limits, tolerance[None]
-    _call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
+    arrays = goal, tool(own, index, point), *limits, tolerance[None]
+    call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
     return found
 
 
-def _tool(own: _NativeTree, index: int, point: Any) -> Float64:
+def tool(own: _NativeTree, index: int, point: Any) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
     tool = own.tools[index]
     if point is not None:
@@ -107,7 +108,7 @@ def _tool(own: _NativeTree, index: int, point: Any) -> Float64:
     return tool.reshape(-1, 12)
 
 
-def _native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
+def native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
     """Return the constants of a tree for the extension, where the axis of each joint is the x axis of its body."""
     if (own := _trees.get(tree)) is not None:
         return own
@@ -134,31 +135,13 @@ def _turn(axis: Float64) -> Float64:
     return np.column_stack([axis, across, np.cross(axis, across)])
 
 
-def law(
-    decoupling: str, in_tool_axes: bool, dynamics: Any, inputs: tuple[Any, ...], coefficients: Any, wanted: Any
-) -> list[Float64] | None:
-    """Return results of a step of the law of operational_space.py, of the names ``wanted`` in LAW.
-
-    ``dynamics``, ``inputs`` and ``coefficients`` are the arrays before them in LAW, in its order.
-    """
-    arrays = *dynamics, *inputs, *coefficients
-    qpos = inputs[1]
-    native = _for_rows(qpos, *arrays)
-    if native is None:
-        return None
-    (rows, dof), sizes = qpos.shape, _LAW_SIZES
-    found = {name: np.empty((rows, sizes.get(name, dof))) for name in wanted}
-    _call(native.law, rows, dof, DECOUPLING.index(decoupling), in_tool_axes, *arrays, *map(found.get, _RESULTS))
-    return list(found.values())
-
-
-def _for_rows(like: Any, *arrays: Any) -> Any:
+def for_rows(like: Any, *arrays: Any) -> Any:
     """Return the extension for arrays of NumPy, where ``like`` is (envs, columns)."""
     plain = all([array is None or isinstance(array, np.ndarray) for array in arrays])
     return in_use() if plain and like.ndim == 2 else None
 
 
-def _call(function: Callable[..., None], *arguments: Any) -> None:
+def call(function: Callable[..., None], *arguments: Any) -> None:
     """Call a function of the extension, which takes contiguous arrays of float64 only; others are converted."""
     try:
         function(*arguments)

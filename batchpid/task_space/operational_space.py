@@ -43,11 +43,11 @@ import numpy as np
 
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space import native_rows
+from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
-from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
 from batchpid.task_space.projections import Projections, projections
 from batchpid.task_space.symmetric import product, quiet
@@ -194,9 +194,8 @@ def _native(
     k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics, inputs: tuple[Any, ...], wanted: tuple[str, ...]
 ) -> tuple[OSCState, list[Any]] | None:
     """Return the state after a step in native code and the results ``wanted``; None if it is not used."""
-    kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
-    arrays, wanted = (*inputs, *state), wanted if state.integral is None else (*wanted, "next_integral")
-    found = native_rows.law(kind, k.frame is not None, dynamics, arrays, k[:-2], wanted)
+    arrays, wanted = (*inputs, None, None, *state), wanted if state.integral is None else (*wanted, "next_integral")
+    found = native_law.law(k, dynamics, arrays, wanted)
     if found is None:
         return None
     return (state, found) if state.integral is None else (state._replace(integral=found.pop()), found)
