@@ -82,7 +82,7 @@ class PoseSearch {
         free_[j] = where_positive(beyond, Lanes{}, free_[j]);
         stopped += beyond;
       }
-      if (!(stopped.of[0] + stopped.of[1] + stopped.of[2] + stopped.of[3] > 0)) break;
+      if (!any_positive(stopped)) break;
     }
     accelerate(place);
     for (std::int64_t j = 0; j < size; ++j) {

@@ -199,10 +199,11 @@ void eigen(Lanes (&a)[AXES][AXES], Lanes (&vectors)[AXES][AXES]) {
       for (int q = p + 1; q < AXES; ++q) {
         Lanes const off = a[p][q];
         Lanes const turns = absolute(off) - clear;
+        if (!any_positive(turns)) continue;
+        turned = true;
         Lanes const cot = (a[q][q] - a[p][p]) / where_positive(turns, 2.0 * off, 1.0);
         Lanes const sum = absolute(cot) + root(cot * cot + 1.0);
         Lanes const t = where_positive(turns, where_positive(-cot, -1.0, 1.0) / sum, 0.0);
-        for (int k = 0; k < WIDTH; ++k) turned = turned || turns.of[k] > 0;
         Lanes const c = 1.0 / root(t * t + 1.0), s = t * c;
         a[p][p] -= t * off;
         a[q][q] += t * off;
@@ -323,6 +324,7 @@ Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes
     Lanes const room = at_least(where_positive(effort[i], most - at[i], at[i] - least), 0.0);
     Lanes const size = absolute(effort[i]);
     Lanes const limited = where_positive(size - room, able, Lanes{});
+    if (!any_positive(limited)) continue;
     share = at_most(where_positive(limited, room / where_positive(limited, size, 1.0), 1.0), share);
   }
   return share;
