@@ -84,6 +84,11 @@ Vector<N> in_axes(Vector<N> const (&axes)[3], T x, T y, T z) {
   return x * axes[0] + y * axes[1] + z * axes[2];
 }
 
+template <class N, class T>
+Vector<N> along_axes(Vector<N> const (&axes)[3], T const (&v)[3]) {
+  return in_axes(axes, double(v[0]), double(v[1]), double(v[2]));
+}
+
 template <class N>
 Vector<N> turning(BodyState<N> const &body, bool slides) {
   return slides ? Vector<N>{} : body.axes[0];
@@ -93,7 +98,7 @@ Vector<N> moving(BodyState<N> const &body, bool slides) {
   return slides ? body.axes[0] : cross(body.origin, body.axes[0]);
 }
 
-// Write the states of the bodies at a pose. tree (dof, 2): the joint above, or -1; whether it slides.
+// Write the frames of the bodies at a pose. tree (dof, 2): the joint above, or -1; whether it slides.
 template <class N, class T>
 void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, N const *cosine, N const *sine,
                   N const *qpos, BodyState<N> *body) {
@@ -103,12 +108,11 @@ void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *
     BodyState<N> const &above = tree[2 * j] < 0 ? base : body[tree[2 * j]];
     BodyRow<T> const &row = rows[j];
     BodyState<N> &at = body[j];
-    auto const in = [](auto const &axes, auto const(&v)[3]) { return in_axes(axes, double(v[0]), double(v[1]), double(v[2])); };
     for (int k = 0; k < 3; ++k) {
       double const column[3] = {double(row.rotation[0][k]), double(row.rotation[1][k]), double(row.rotation[2][k])};
-      at.axes[k] = in(above.axes, column);
+      at.axes[k] = along_axes(above.axes, column);
     }
-    at.origin = above.origin + in(above.axes, row.position);
+    at.origin = above.origin + along_axes(above.axes, row.position);
     if (tree[2 * j + 1]) {
       at.origin = at.origin + qpos[j] * at.axes[0];
     } else {
@@ -116,9 +120,18 @@ void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *
       at.axes[1] = cosine[j] * y + sine[j] * z;
       at.axes[2] = cosine[j] * z + -sine[j] * y;
     }
-    at.inertia = point_mass(N(double(row.mass)), at.origin + in(at.axes, row.center));
+  }
+}
+
+// Write the inertia of each body, from its frame.
+template <class N, class T>
+void weigh_bodies(std::int64_t dof, BodyRow<T> const *rows, BodyState<N> *body) {
+  for (std::int64_t j = 0; j < dof; ++j) {
+    BodyRow<T> const &row = rows[j];
+    BodyState<N> &at = body[j];
+    at.inertia = point_mass(N(double(row.mass)), at.origin + along_axes(at.axes, row.center));
     for (int k = 0; k < 3; ++k) {  // R T R^T: the sum of (T column k in the base's axes) times axis k
-      Vector<N> const turned = in(at.axes, row.tensor[k]);
+      Vector<N> const turned = along_axes(at.axes, row.tensor[k]);
       Vector<N> *tensor = at.inertia.tensor;
       tensor[0] = tensor[0] + turned.x * at.axes[k];
       tensor[1] = tensor[1] + turned.y * at.axes[k];
@@ -158,6 +171,7 @@ void mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *r
     sine[j] = std::sin(angle[j]);
   }
   place_bodies(dof, tree, rows, cosine.data(), sine.data(), angle.data(), bodies.data());
+  weigh_bodies(dof, rows, bodies.data());
   composite_mass_matrix(dof, tree, bodies.data(), matrix);
 }
 

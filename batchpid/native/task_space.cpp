@@ -1,95 +1,32 @@
 // Kinematics, dynamics and operational space of many robots of one kind, row by row. The equations stand in
-// batchpid/task_space: tree_kinematics.py, tree_dynamics.py, symmetric.py and projections.py.
+// batchpid/task_space: tree_kinematics.py, tree_dynamics.py, symmetric.py, projections.py and inverse_kinematics.py.
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <vector>
 
 #include "batchpid/native/buffer.h"
+#include "batchpid/native/call.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
+#include "batchpid/native/pose_search.h"
 #include "batchpid/native/rigid_body.h"
+#include "batchpid/native/tables.h"
+#include "batchpid/native/tool.h"
 
 using namespace batchpid;
 
 namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
-constexpr int AXES = 6, POSE = 7, SWEEPS = 12;
+constexpr int SWEEPS = 12;
 constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
                                  // the rounding of the matrix itself
 char const *const TREE = "batchpid.KinematicTree";
 
 enum Decoupling { FULL, PARTIAL, NONE };
-
-// Constants of a tree; the axes of joints are the x axes of their bodies.
-struct Tree {
-  BodyRow<double> const *bodies() const { return reinterpret_cast<BodyRow<double> const *>(rows.data()); }
-
-  std::int64_t dof;
-  std::vector<std::int32_t> tree;
-  std::vector<double> rows, armature;
-  Vector<Lanes> gravity;
-};
-
-// Array (rows, columns), or (1, columns) for all rows; without data if it is left out.
-struct Table {
-  double *data = nullptr;
-  std::int64_t columns = 0, rows = 0;
-
-  explicit operator bool() const { return data != nullptr; }
-  double *row(std::int64_t at) const { return data + (rows == 1 ? 0 : at) * columns; }
-  // Copy columns of the rows from `first` on; the last row stands for those that there are not.
-  void load(std::int64_t first, std::int64_t count, Lanes *out) const {
-    double const *const end = data + (rows - 1) * columns, *from[WIDTH];
-    for (int k = 0; k < WIDTH; ++k) from[k] = first + k < rows ? data + (first + k) * columns : end;
-    for (std::int64_t c = 0; c < count; ++c) {
-      for (int k = 0; k < WIDTH; ++k) out[c].of[k] = from[k][c];
-    }
-  }
-  void load(std::int64_t first, Lanes *out) const { load(first, columns, out); }
-  void store(std::int64_t first, std::int64_t count, Lanes const *values) const {
-    if (data == nullptr) return;
-    double *const to = data + first * columns;
-    if (first + WIDTH <= rows) {
-      for (std::int64_t c = 0; c < count; ++c) {
-        for (int k = 0; k < WIDTH; ++k) to[k * columns + c] = values[c].of[k];
-      }
-    } else {
-      for (std::int64_t c = 0; c < count; ++c) scatter(values[c], data, columns, c, first, rows);
-    }
-  }
-  void store(std::int64_t first, Lanes const *values) const { store(first, columns, values); }
-};
-
-// Arrays of Python as tables of doubles; None is a table without data.
-class Tables {
- public:
-  // Open an input of 1 row or `rows`, or an output of `rows`.
-  bool open(PyObject *object, std::int64_t columns, std::int64_t rows, bool output) {
-    Table &table = tables_[count_];
-    Buffer &buffer = buffers_[count_++];
-    if (object == Py_None) return true;
-    Py_ssize_t const given = PyObject_Size(object);
-    if (given < 0) return false;
-    std::int64_t const own = given == 1 && !output ? 1 : rows;
-    int const flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (output ? PyBUF_WRITABLE : 0);
-    if (!buffer.open(object, own * columns, sizeof(double), flags)) return false;
-    if (!buffer.is_double()) {
-      PyErr_SetString(PyExc_ValueError, "an array is not float64");
-      return false;
-    }
-    table = Table{buffer.as<double>(), columns, own};
-    return true;
-  }
-  Table const &operator[](int at) const { return tables_[at]; }
-
- private:
-  Buffer buffers_[20];
-  Table tables_[20];
-  int count_ = 0;
-};
 
 Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
 
@@ -117,29 +54,8 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
 }
 
-// Write the unit quaternion (w, x, y, z), w >= 0, of a rotation with these columns: wxyz_of in frames.py.
-void write_quaternion(double const (&x)[3], double const (&y)[3], double const (&z)[3], double *out) {
-  double const squares[4] = {1 + x[0] + y[1] + z[2], 1 + x[0] - y[1] - z[2], 1 - x[0] + y[1] - z[2],
-                             1 - x[0] - y[1] + z[2]};
-  double const wx = y[2] - z[1], wy = z[0] - x[2], wz = x[1] - y[0];
-  double const xy = x[1] + y[0], xz = x[2] + z[0], yz = y[2] + z[1];
-  double const rows[4][4] = {
-      {squares[0], wx, wy, wz}, {wx, squares[1], xy, xz}, {wy, xy, squares[2], yz}, {wz, xz, yz, squares[3]}};
-  int best = 0;
-  for (int k = 1; k < 4; ++k) best = squares[k] > squares[best] ? k : best;
-  double const *q = rows[best];
-  double const length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int k = 0; k < 4; ++k) out[k] = q[0] < 0 ? -q[k] / length : q[k] / length;
-}
-
 // Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
 enum Kinematics { QPOS, QVEL, TOOL, TOOL_POSE, JACOBIAN, JACOBIAN_RATE, MASS_MATRIX, BIAS, KINEMATICS };
-
-void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
-  out[0] = v.x;
-  out[stride] = v.y;
-  out[2 * stride] = v.z;
-}
 
 // Write results that are asked for; `body` is the body of the tool, or -1 for the base.
 FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, std::int64_t rows, Tables const &table) {
@@ -154,51 +70,26 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     table[QPOS].load(first, q.data());
     if (table[QVEL]) table[QVEL].load(first, v.data());
-    for (std::int64_t i = 0; i < dof; ++i) {
-      for (int k = 0; k < WIDTH; ++k) {
-        cosine[i].of[k] = std::cos(q[i].of[k]);
-        sine[i].of[k] = std::sin(q[i].of[k]);
-      }
-    }
+    write_cosines(dof, q.data(), cosine.data(), sine.data());
     place_bodies(dof, above, tree.bodies(), cosine.data(), sine.data(), q.data(), bodies.data());
+    if (table[BIAS] || table[MASS_MATRIX]) weigh_bodies(dof, tree.bodies(), bodies.data());
     if (table[QVEL]) move_bodies(dof, above, bodies.data(), v.data(), still, motions.data());
     if (table[TOOL]) {
-      Lanes frame[12];
+      Lanes frame[FRAME];
       table[TOOL].load(first, frame);
-      Vector<Lanes> columns[4];  // of the tool's frame: axes and place
-      for (int k = 0; k < 4; ++k) {
-        columns[k] = {frame[k], frame[4 + k], frame[8 + k]};
-        if (body < 0) continue;
-        columns[k] = in_axes(bodies[body].axes, columns[k].x, columns[k].y, columns[k].z);
-        if (k == 3) columns[k] = bodies[body].origin + columns[k];
-      }
-      Vector<Lanes> const place = columns[3];
+      Tool const tool(frame, body < 0 ? nullptr : &bodies[body]);
+      Vector<Lanes> const place = tool.place();
       if (table[TOOL_POSE]) {
-        put(place, frame);
-        table[TOOL_POSE].store(first, 3, frame);
-        for (int k = 0; k < WIDTH && first + k < rows; ++k) {
-          double axes[3][3];
-          for (int c = 0; c < 3; ++c) {
-            axes[c][0] = columns[c].x.of[k];
-            axes[c][1] = columns[c].y.of[k];
-            axes[c][2] = columns[c].z.of[k];
-          }
-          write_quaternion(axes[0], axes[1], axes[2], table[TOOL_POSE].row(first + k) + 3);
-        }
+        for (int k = 0; k < WIDTH && first + k < rows; ++k) tool.write_pose(k, table[TOOL_POSE].row(first + k));
       }
       if (table[JACOBIAN]) {
         for (std::int64_t j = body; j >= 0; j = above[2 * j]) {
-          Vector<Lanes> const w = turning(bodies[j], above[2 * j + 1]);
-          put(moving(bodies[j], above[2 * j + 1]) + cross(w, place), &jacobian[j], dof);
-          put(w, &jacobian[j + 3 * dof], dof);
+          write_column(bodies[j], above[2 * j + 1], place, &jacobian[j], dof);
         }
         table[JACOBIAN].store(first, jacobian.data());
       }
       if (table[JACOBIAN_RATE]) {
-        BodyMotion<Lanes> const base{}, &at = body < 0 ? base : motions[body];
-        Vector<Lanes> const inward = cross(at.turning, at.moving + cross(at.turning, place));
-        put(at.moving_change + cross(at.turning_change, place) + inward, frame);
-        put(at.turning_change, frame + 3);
+        write_rate(body < 0 ? BodyMotion<Lanes>{} : motions[body], place, frame);
         table[JACOBIAN_RATE].store(first, frame);
       }
     }
@@ -220,42 +111,76 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   }
 }
 
+bool open_kinematics(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
+  std::int64_t const sizes[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
+  for (int i = 0; i < KINEMATICS; ++i) {
+    if (!table.open(arrays[i], sizes[i], rows, i > TOOL)) return false;
+  }
+  return true;
+}
+
 // kinematics(tree, body, rows, *arrays)
 PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
   if (tree == nullptr) return nullptr;
-  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]), dof = tree->dof;
-  std::int64_t const sizes[KINEMATICS] = {dof, dof, 12, POSE, AXES * dof, AXES, dof * dof, dof};
+  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
   Tables table;
-  for (int i = 0; i < KINEMATICS; ++i) {
-    if (!table.open(arguments[3 + i], sizes[i], rows, i > TOOL)) return nullptr;
-  }
+  if (!open_kinematics(table, arguments + 3, rows, tree->dof)) return nullptr;
   write_kinematics(*tree, body, rows, table);
   Py_RETURN_NONE;
 }
 
-// Arrays of `projections`: PROJECTIONS in task_space_extension.py.
-enum Projections {
-  CHAIN,
+// Arrays of `law`: LAW in task_space_extension.py.
+enum Law {
+  TASK_POSE,
   TASK_JACOBIAN,
   TASK_RATE,
   TASK_MASS,
   TASK_BIAS,
+  CHAIN,
+  SETPOINT,
+  LAW_QPOS,
+  LAW_QVEL,
+  TWIST,
   ACCELERATION,
-  POSTURE_ACCELERATION,
   WRENCH,
   FEEDFORWARD,
+  DAMPING,
+  ADDED_INERTIA,
+  POSTURE,
+  INTEGRAL,
+  KP,  // coefficients: fields of OSCCoefficients
+  KD,
+  C,
+  ACCELERATION_SHARE,
+  KI_DT,
+  KI_DT2,
+  POSTURE_KP,
+  POSTURE_KD,
+  LIMIT_KP,
+  LIMIT_KD,
+  LIMIT_MARGIN,
+  LIMIT_LOW,
+  LIMIT_HIGH,
+  INTEGRAL_LIMIT,
+  POSITION_LIMIT,
+  ROTATION_LIMIT,
+  SMALLEST,
   SELECTED,
   FORCE_AXES,
-  SMALLEST,
+  EFFORT_MIN,
+  EFFORT_MAX,
+  EFFORT,  // results
+  NEXT_INTEGRAL,
+  TASK_ERROR,
   FORCE,
-  TASK,
-  POSTURE,
-  BASE,
-  TASK_OF_OTHERS,
-  POSTURE_OF_OTHERS,
+  TASK_EFFORT,
+  POSTURE_EFFORT,
+  UNSATURATED,
+  TASK_SHARE,
+  POSTURE_SHARE,
   NEAR_SINGULAR,
-  PROJECTIONS
+  LAW
 };
 
 // Write the eigenvalues (6,) and, as columns, the eigenvectors of symmetric matrices, of which the upper triangle is used
@@ -274,10 +199,11 @@ void eigen(Lanes (&a)[AXES][AXES], Lanes (&vectors)[AXES][AXES]) {
       for (int q = p + 1; q < AXES; ++q) {
         Lanes const off = a[p][q];
         Lanes const turns = absolute(off) - clear;
+        if (!any_positive(turns)) continue;
+        turned = true;
         Lanes const cot = (a[q][q] - a[p][p]) / where_positive(turns, 2.0 * off, 1.0);
         Lanes const sum = absolute(cot) + root(cot * cot + 1.0);
         Lanes const t = where_positive(turns, where_positive(-cot, -1.0, 1.0) / sum, 0.0);
-        for (int k = 0; k < WIDTH; ++k) turned = turned || turns.of[k] > 0;
         Lanes const c = 1.0 / root(t * t + 1.0), s = t * c;
         a[p][p] -= t * off;
         a[q][q] += t * off;
@@ -357,25 +283,120 @@ Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size) {
   return sum;
 }
 
-FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, Decoupling decoupling,
-                                          Tables const &table) {
+// Inputs of a law for WIDTH rows. A row that stands for all is loaded once.
+class Given {
+ public:
+  Given(Tables const &table, int count) : table_(table), count_(count) {
+    std::size_t size = 0;
+    for (int i = 0; i < count; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
+    of_.resize(size);
+    Lanes *next = of_.data();
+    for (int i = 0; i < count; ++i) {
+      if (!table[i]) continue;
+      at_[i] = next;
+      next += table[i].columns;
+      if (table[i].rows == 1) table[i].load(0, at_[i]);
+    }
+  }
+  void load(std::int64_t first) {
+    for (int i = 0; i < count_; ++i) {
+      if (table_[i] && table_[i].rows > 1) table_[i].load(first, at_[i]);
+    }
+  }
+  // The columns of an array; null if it is left out.
+  Lanes *operator[](int i) const { return at_[i]; }
+
+ private:
+  Tables const &table_;
+  int count_;
+  Lanes *at_[LAW] = {};
+  std::vector<Lanes> of_;
+};
+
+// Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
+Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
+                   Lanes const *high) {
+  Lanes const infinite = std::numeric_limits<double>::infinity();
+  Lanes share = 1.0;
+  for (std::int64_t i = 0; i < dof; ++i) {
+    Lanes const least = low == nullptr ? -infinite : low[i], most = high == nullptr ? infinite : high[i];
+    Lanes const able = at_least_mask(base[i], least) * at_least_mask(most, base[i]);
+    Lanes const room = at_least(where_positive(effort[i], most - at[i], at[i] - least), 0.0);
+    Lanes const size = absolute(effort[i]);
+    Lanes const limited = where_positive(size - room, able, Lanes{});
+    if (!any_positive(limited)) continue;
+    share = at_most(where_positive(limited, room / where_positive(limited, size, 1.0), 1.0), share);
+  }
+  return share;
+}
+
+FOR_EACH_PROCESSOR void write_law(std::int64_t rows, std::int64_t dof, Decoupling decoupling, bool in_tool_axes,
+                                  Tables const &table) {
   auto const n = static_cast<std::size_t>(dof);
   std::vector<std::int64_t> chain, others;
   for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain : others).push_back(i);
   auto const links = static_cast<std::int64_t>(chain.size());
-  std::vector<Lanes> jacobian(AXES * n), mass(n * n), factor(n * n), white(AXES * n), a_n(n), both(2 * n);
-  std::vector<Lanes> base(n), feedforward(n), task(n), posture(n), of_task(n), of_posture(n);  // 0 for joints that have no part in it
-  Lanes mobility[AXES * AXES], task_inertia[AXES * AXES], null_inertia[AXES * AXES], axes[AXES], allowed[AXES];
-  Lanes acceleration[AXES], force[AXES], drop[AXES], added[AXES];
+  Given given(table, EFFORT);
+  enum { FACTOR, WHITE, BOTH, A_N, BASE, TASK, NULL_SPACE, OF_TASK, OF_NULL, SUM, WHOLE, WORK };
+  std::vector<Lanes> storage(n * (n + AXES + 2 + WORK - A_N));  // 0 for joints that have no part in an effort
+  Lanes *work[WORK] = {storage.data(), storage.data() + n * n, storage.data() + n * (n + AXES)};
+  for (int i = A_N; i < WORK; ++i) work[i] = storage.data() + n * static_cast<std::size_t>(n + AXES + 2 + i - A_N);
+  Lanes *factor = work[FACTOR], *white = work[WHITE], *both = work[BOTH], *a_n = work[A_N], *base = work[BASE];
+  Lanes *task = work[TASK], *posture = work[NULL_SPACE], *of_task = work[OF_TASK], *of_posture = work[OF_NULL];
+  Lanes *sum = work[SUM], *whole = work[WHOLE];
+  Lanes mobility[AXES * AXES], task_inertia[AXES * AXES], null_inertia[AXES * AXES], allowed[AXES];
+  Lanes error[AXES], near_error[AXES], twist[AXES], turned[2][AXES], a[AXES], moved[AXES], force[AXES], drop[AXES];
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    table[TASK_JACOBIAN].load(first, jacobian.data());
-    table[TASK_MASS].load(first, mass.data());
+    given.load(first);
+    Lanes *jacobian = given[TASK_JACOBIAN], *rate = given[TASK_RATE];
+    Lanes *mass = given[TASK_MASS];
+    Lanes const *axes = given[SELECTED], *qpos = given[LAW_QPOS], *qvel = given[LAW_QVEL];
+    Lanes const *target = given[TWIST], *target_rate = given[ACCELERATION];
+
+    for (std::int64_t i = 0; i < dof && given[ADDED_INERTIA] != nullptr; ++i) mass[i * dof + i] += given[ADDED_INERTIA][i];
+    for (int k = 0; k < WIDTH; ++k) {  // e
+      std::int64_t const row = std::min(first + k, rows - 1);
+      double e[AXES];
+      write_error(table[SETPOINT].row(row), table[TASK_POSE].row(row), e);
+      for (int axis = 0; axis < AXES; ++axis) error[axis].of[k] = e[axis];
+    }
+    for (int half = 0; half < AXES; half += 3) {
+      Lanes const *e = error + half, length = root(e[0] * e[0] + e[1] * e[1] + e[2] * e[2]);
+      Lanes const limit = *given[half == 0 ? POSITION_LIMIT : ROTATION_LIMIT];
+      Lanes const scale = where_positive(length - limit, limit / length, 1.0);
+      for (int k = 0; k < 3; ++k) near_error[half + k] = scale * e[k];
+    }
+    for (int axis = 0; axis < AXES; ++axis) twist[axis] = along(jacobian + axis * dof, qvel, dof);  // J q'
+    if (in_tool_axes) {
+      Turn const turn(given[TASK_POSE] + 3);
+      if (target != nullptr) target = std::copy(target, target + AXES, turned[0]) - AXES;
+      if (target_rate != nullptr) target_rate = std::copy(target_rate, target_rate + AXES, turned[1]) - AXES;
+      for (Lanes *vector : {error, near_error, twist, rate, turned[0], turned[1]}) turn.reverse(vector, 1);
+      for (std::int64_t j = 0; j < dof; ++j) turn.reverse(jacobian + j, dof);
+    }
+
+    Lanes const *kp = given[KP], *kd = given[KD], *integral = given[INTEGRAL];
+    for (int axis = 0; axis < AXES; ++axis) {
+      a[axis] = kp[axis] * near_error[axis] - kd[axis] * twist[axis];
+      if (target != nullptr) a[axis] += given[C][axis] * target[axis];
+      if (target_rate != nullptr) a[axis] += given[ACCELERATION_SHARE][axis] * target_rate[axis];
+      if (integral != nullptr) a[axis] += integral[axis];
+    }
+    for (std::int64_t j = 0; j < dof; ++j) {
+      a_n[j] = given[POSTURE_KP][j] * (given[POSTURE][j] - qpos[j]) - given[POSTURE_KD][j] * qvel[j];
+      if (given[LIMIT_KP] == nullptr) continue;
+      Lanes const low = given[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given[LIMIT_HIGH][j];
+      Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0);
+      Lanes const damped = given[LIMIT_KD][j] * qvel[j] * absolute(depth) / given[LIMIT_MARGIN][j];
+      a_n[j] += given[CHAIN][j] * (given[LIMIT_KP][j] * depth - damped);
+    }
+
     for (std::int64_t i = 0; i < links; ++i) {
       for (std::int64_t j = 0; j <= i; ++j) factor[i * links + j] = mass[chain[i] * dof + chain[j]];
       for (int axis = 0; axis < AXES; ++axis) white[i * AXES + axis] = jacobian[axis * dof + chain[i]];
     }
-    cholesky(links, factor.data());
-    solve_lower<AXES>(links, factor.data(), white.data());  // L^-1 J^T
+    cholesky(links, factor);
+    solve_lower<AXES>(links, factor, white);  // L^-1 J^T
     std::fill(mobility, mobility + AXES * AXES, Lanes{});
     for (std::int64_t i = 0; i < links; ++i) {
       Lanes const *row = &white[i * AXES];
@@ -387,14 +408,13 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
       for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
     }
 
-    Table const &selected = table[SELECTED], &force_axes = table[FORCE_AXES];
-    bool const select = bool(selected), force_too = select && force_axes;
-    if (select) selected.load(first, axes);
-    if (force_too) force_axes.load(first, added);
-    for (int axis = 0; axis < AXES; ++axis) allowed[axis] = force_too ? at_least(axes[axis], added[axis]) : axes[axis];
-    Lanes s0, near{};
-    table[SMALLEST].load(first, &s0);
-    selected_inverse(mobility, select ? allowed : nullptr, s0, null_inertia, near);
+    bool const force_too = axes != nullptr && given[FORCE_AXES] != nullptr;
+    for (int axis = 0; axis < AXES && axes != nullptr; ++axis) {
+      allowed[axis] = force_too ? at_least(axes[axis], given[FORCE_AXES][axis]) : axes[axis];
+    }
+    Lanes const s0 = *given[SMALLEST];
+    Lanes near{};
+    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia, near);
     Lanes *inertia = null_inertia;
     if (decoupling == PARTIAL || (decoupling == FULL && force_too)) {
       if (decoupling == PARTIAL) {
@@ -404,30 +424,22 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
           }
         }
       }
-      selected_inverse(mobility, select ? axes : nullptr, s0, task_inertia, near);
+      selected_inverse(mobility, axes, s0, task_inertia, near);
       inertia = task_inertia;
     }
 
-    table[ACCELERATION].load(first, acceleration);
-    if (decoupling != NONE) {
-      table[TASK_RATE].load(first, added);
-      for (int axis = 0; axis < AXES; ++axis) acceleration[axis] -= added[axis];
-    }
-    if (table[WRENCH]) table[WRENCH].load(first, added);
+    for (int axis = 0; axis < AXES; ++axis) moved[axis] = decoupling == NONE ? a[axis] : a[axis] - rate[axis];
     for (int axis = 0; axis < AXES; ++axis) {
-      force[axis] = decoupling != NONE ? along(inertia + axis * AXES, acceleration, AXES)
-                    : select           ? axes[axis] * acceleration[axis]
-                                       : acceleration[axis];
-      if (table[WRENCH]) force[axis] += added[axis];
+      force[axis] = decoupling != NONE ? along(inertia + axis * AXES, moved, AXES)
+                    : axes != nullptr  ? axes[axis] * moved[axis]
+                                       : moved[axis];
+      if (given[WRENCH] != nullptr) force[axis] += given[WRENCH][axis];
     }
-    table[FORCE].store(first, force);
-
-    table[POSTURE_ACCELERATION].load(first, a_n.data());
     for (int axis = 0; axis < AXES; ++axis) {  // J a_n of the chain
-      acceleration[axis] = {};
-      for (std::int64_t i : chain) acceleration[axis] += jacobian[axis * dof + i] * a_n[i];
+      moved[axis] = {};
+      for (std::int64_t i : chain) moved[axis] += jacobian[axis * dof + i] * a_n[i];
     }
-    for (int axis = 0; axis < AXES; ++axis) drop[axis] = along(null_inertia + axis * AXES, acceleration, AXES);
+    for (int axis = 0; axis < AXES; ++axis) drop[axis] = along(null_inertia + axis * AXES, moved, AXES);
 
     for (std::int64_t c = 0; c < links; ++c) {
       std::int64_t const i = chain[c];
@@ -440,18 +452,15 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
       task[i] = both[2 * c] = x;
       posture[i] = both[2 * c + 1] = y;
     }
-    table[TASK].store(first, task.data());
-    table[POSTURE].store(first, posture.data());
-    table[TASK_BIAS].load(first, base.data());
-    if (table[FEEDFORWARD]) table[FEEDFORWARD].load(first, feedforward.data());
     for (std::int64_t i = 0; i < dof; ++i) {
+      base[i] = given[TASK_BIAS][i];
       for (std::int64_t j : others) base[i] += mass[i * dof + j] * a_n[j];
-      if (table[FEEDFORWARD]) base[i] += feedforward[i];
+      if (given[FEEDFORWARD] != nullptr) base[i] += given[FEEDFORWARD][i];
+      if (given[DAMPING] != nullptr) base[i] += given[DAMPING][i] * qvel[i];
     }
-    table[BASE].store(first, base.data());
     if (!others.empty()) {  // M_oc M_cc^-1 of task and posture
-      solve_lower<2>(links, factor.data(), both.data());
-      solve_upper<2>(links, factor.data(), both.data());
+      solve_lower<2>(links, factor, both);
+      solve_upper<2>(links, factor, both);
     }
     for (std::int64_t i : others) {
       of_task[i] = of_posture[i] = {};
@@ -460,70 +469,152 @@ FOR_EACH_PROCESSOR void write_projections(std::int64_t rows, std::int64_t dof, D
         of_posture[i] += mass[i * dof + chain[c]] * both[2 * c + 1];
       }
     }
-    table[TASK_OF_OTHERS].store(first, of_task.data());
-    table[POSTURE_OF_OTHERS].store(first, of_posture.data());
+
+    Lanes const *low = given[EFFORT_MIN], *high = given[EFFORT_MAX];
+    Lanes const s1 = share_within(dof, task, base, base, low, high);
+    for (std::int64_t i = 0; i < dof; ++i) sum[i] = base[i] + s1 * task[i];
+    Lanes const s2 = share_within(dof, posture, sum, base, low, high);
+    Lanes held = near;
+    for (std::int64_t i = 0; i < dof; ++i) {
+      Lanes const rest = s1 * of_task[i] + s2 * of_posture[i];
+      whole[i] = base[i] + task[i] + posture[i] + rest;
+      sum[i] = sum[i] + s2 * posture[i] + rest;
+      if (low != nullptr) sum[i] = at_least(sum[i], low[i]);
+      if (high != nullptr) sum[i] = at_most(sum[i], high[i]);
+      held = where_positive(differs_mask(sum[i], whole[i]), 1.0, held);
+    }
+    table[EFFORT].store(first, sum);
+    if (integral != nullptr) {
+      Lanes next[AXES];
+      for (int axis = 0; axis < AXES; ++axis) {
+        next[axis] = integral[axis] + given[KI_DT][axis] * near_error[axis];
+        if (given[KI_DT2] != nullptr && target != nullptr) next[axis] -= given[KI_DT2][axis] * target[axis];
+        Lanes const limit = given[INTEGRAL_LIMIT][axis], grows = held * where_positive(a[axis] * near_error[axis], 1.0, 0.0);
+        next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -limit), limit));
+      }
+      table[NEXT_INTEGRAL].store(first, next);
+    }
+    table[TASK_ERROR].store(first, error);
+    table[FORCE].store(first, force);
+    table[TASK_EFFORT].store(first, task);
+    table[POSTURE_EFFORT].store(first, posture);
+    table[UNSATURATED].store(first, whole);
+    table[TASK_SHARE].store(first, &s1);
+    table[POSTURE_SHARE].store(first, &s2);
     table[NEAR_SINGULAR].store(first, &near);
   }
 }
 
-// projections(rows, dof, decoupling, *arrays)
-PyObject *projections(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
-  long const decoupling = PyLong_AsLong(arguments[2]);
-  if (PyErr_Occurred()) return nullptr;
-  std::int64_t const sizes[PROJECTIONS] = {dof, AXES * dof, AXES, dof * dof, dof, AXES, dof, AXES, dof, AXES,
-                                           AXES, 1, AXES, dof, dof, dof, dof, dof, 1};
-  Tables table;
-  for (int i = 0; i < PROJECTIONS; ++i) {
-    if (!table.open(arguments[3 + i], sizes[i], i == CHAIN ? 1 : rows, i > SMALLEST)) return nullptr;
+// Columns of an array of `law`.
+std::int64_t law_columns(int array, std::int64_t dof) {
+  switch (array) {
+    case TASK_POSE:
+    case SETPOINT:
+      return POSE;
+    case TASK_JACOBIAN:
+      return AXES * dof;
+    case TASK_MASS:
+      return dof * dof;
+    case POSITION_LIMIT:
+    case ROTATION_LIMIT:
+    case SMALLEST:
+    case TASK_SHARE:
+    case POSTURE_SHARE:
+    case NEAR_SINGULAR:
+      return 1;
+    case TASK_RATE:
+    case TWIST:
+    case ACCELERATION:
+    case WRENCH:
+    case INTEGRAL:
+    case KP:
+    case KD:
+    case C:
+    case ACCELERATION_SHARE:
+    case KI_DT:
+    case KI_DT2:
+    case INTEGRAL_LIMIT:
+    case SELECTED:
+    case FORCE_AXES:
+    case NEXT_INTEGRAL:
+    case TASK_ERROR:
+    case FORCE:
+      return AXES;
+    default:
+      return dof;
   }
-  write_projections(rows, dof, static_cast<Decoupling>(decoupling), table);
+}
+
+bool open_law(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
+  for (int i = 0; i < LAW; ++i) {
+    if (!table.open(arrays[i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
+  }
+  return true;
+}
+
+// law(rows, dof, decoupling, in_tool_axes, *arrays)
+PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
+  long const decoupling = PyLong_AsLong(arguments[2]), in_tool_axes = PyLong_AsLong(arguments[3]);
+  if (PyErr_Occurred()) return nullptr;
+  Tables table;
+  if (!open_law(table, arguments + 4, rows, dof)) return nullptr;
+  write_law(rows, dof, static_cast<Decoupling>(decoupling), in_tool_axes != 0, table);
   Py_RETURN_NONE;
 }
 
-double length_of(double const *v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+// Kinematics and law of some robots on fixed arrays.
+struct BoundLaw : Call {
+  Tree tree;
+  std::int64_t body, rows;
+  Decoupling decoupling;
+  bool in_tool_axes;
+  Tables kinematics, law;
 
-// Write the error (6,) from a pose to a goal: pose_error in frames.py.
-void write_error(double const *goal, double const *pose, double *out) {
-  for (int k = 0; k < 3; ++k) out[k] = goal[k] - pose[k];
-  double const *g = goal + 4, *q = pose + 4, gw = goal[3], qw = pose[3];
-  double w = gw * qw + (g[0] * q[0] + g[1] * q[1] + g[2] * q[2]);
-  double v[3];
-  for (int k = 0; k < 3; ++k) {
-    int const next = (k + 1) % 3, last = (k + 2) % 3;
-    v[k] = qw * g[k] - gw * q[k] - (g[next] * q[last] - g[last] * q[next]);
+  static void run_both(Call const &call) {
+    auto const &bound = static_cast<BoundLaw const &>(call);
+    write_kinematics(bound.tree, bound.body, bound.rows, bound.kinematics);
+    write_law(bound.rows, bound.tree.dof, bound.decoupling, bound.in_tool_axes, bound.law);
   }
-  double const sign = w < 0 ? -1.0 : 1.0;
-  w = sign * w;
-  double const length = length_of(v);
-  double const scale = length < 1e-12 * w ? 2 / w : 2 * std::atan2(length, w) / length;
-  for (int k = 0; k < 3; ++k) out[3 + k] = sign * v[k] * scale;
+};
+
+char const *const BOUND = "batchpid.BoundLaw";
+
+// bind(tree, body, rows, decoupling, in_tool_axes, *arrays of kinematics, *arrays of law) -> (object, address of Call)
+PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Tree const *tree = tree_of(arguments[0]);
+  if (tree == nullptr) return nullptr;
+  auto bound = std::make_unique<BoundLaw>();
+  bound->run = BoundLaw::run_both;
+  bound->tree = *tree;
+  bound->body = PyLong_AsLong(arguments[1]);
+  bound->rows = PyLong_AsLong(arguments[2]);
+  bound->decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[3]));
+  bound->in_tool_axes = PyLong_AsLong(arguments[4]) != 0;
+  if (PyErr_Occurred() || !open_kinematics(bound->kinematics, arguments + 5, bound->rows, tree->dof) ||
+      !open_law(bound->law, arguments + 5 + KINEMATICS, bound->rows, tree->dof)) {
+    return nullptr;
+  }
+  PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
+  PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
+    delete static_cast<BoundLaw *>(PyCapsule_GetPointer(object, BOUND));
+  });
+  return Py_BuildValue("NN", capsule, address);
 }
 
-// errors(rows, dof, goal, pose, position_limit, rotation_limit, jacobian, qvel, error, near, twist)
-PyObject *errors(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
+// search(tree, body, rows, iterations, *arrays)
+PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  Tree const *tree = tree_of(arguments[0]);
+  if (tree == nullptr) return nullptr;
+  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
+  std::int64_t const iterations = PyLong_AsLong(arguments[3]), dof = tree->dof;
   if (PyErr_Occurred()) return nullptr;
-  std::int64_t const sizes[9] = {POSE, POSE, 1, 1, AXES * dof, dof, AXES, AXES, AXES};
+  std::int64_t const sizes[SEARCH] = {POSE, FRAME, dof, dof, 2, dof, 2, 1};
   Tables table;
-  for (int i = 0; i < 9; ++i) {
-    if (!table.open(arguments[2 + i], sizes[i], rows, i > 5)) return nullptr;
+  for (int i = 0; i < SEARCH; ++i) {
+    if (!table.open(arguments[4 + i], sizes[i], rows, i > LARGEST)) return nullptr;
   }
-  for (std::int64_t row = 0; row < rows; ++row) {
-    double *error = table[6].row(row), *near = table[7].row(row), *twist = table[8].row(row);
-    write_error(table[0].row(row), table[1].row(row), error);
-    for (int half = 0; half < 2; ++half) {
-      double const length = length_of(error + 3 * half), limit = *table[2 + half].row(row);
-      double const scale = length > limit ? limit / length : 1.0;
-      for (int k = 3 * half; k < 3 * half + 3; ++k) near[k] = scale * error[k];
-    }
-    double const *jacobian = table[4].row(row), *qvel = table[5].row(row);
-    for (int axis = 0; axis < AXES; ++axis) {
-      double sum = 0.0;
-      for (std::int64_t j = 0; j < dof; ++j) sum += jacobian[axis * dof + j] * qvel[j];
-      twist[axis] = sum;
-    }
-  }
+  search_poses(*tree, body, rows, iterations, table);
   Py_RETURN_NONE;
 }
 
@@ -535,8 +626,9 @@ PyCFunction method(Function function) {
 PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
-    {"projections", method(projections), METH_FASTCALL, nullptr},
-    {"errors", method(errors), METH_FASTCALL, nullptr},
+    {"law", method(law), METH_FASTCALL, nullptr},
+    {"bind", method(bind), METH_FASTCALL, nullptr},
+    {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -14,25 +14,36 @@ BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
 KINEMATICS = ("qpos", "qvel", "tool", "pose", "jacobian", "jacobian_rate", "mass_matrix", "bias")
 """Arrays of ``kinematics`` in task_space.cpp, after the tree and the body of the tool; those after the tool are
 results."""
-PROJECTIONS = (
-    *("chain", "jacobian", "jacobian_rate", "mass_matrix", "bias", "acceleration", "posture_acceleration", "wrench"),
-    *("feedforward", "axes", "force_axes", "smallest_eigenvalue"),
-    *("force", "task", "posture", "base", "task_of_others", "posture_of_others", "near_singular"),
+LAW = (
+    *("pose", "jacobian", "jacobian_rate", "mass_matrix", "bias", "chain"),
+    *("setpoint", "qpos", "qvel", "twist", "acceleration", "wrench", "feedforward"),
+    *("damping", "added_inertia", "posture", "integral"),
+    *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
+    *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
+    *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
+    *("effort_min", "effort_max"),
+    *("effort", "next_integral", "error", "force", "task", "posture_effort", "unsaturated"),
+    *("task_share", "posture_share", "near_singular"),
 )
-"""Arrays of ``projections``; those after the smallest eigenvalue are results."""
+"""Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
+SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
+"""Arrays of ``search`` in pose_search.h; those after the tolerances are results, and searches start at ``qpos``."""
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, LANES, RIGID_BODY = (f"batchpid/native/{name}" for name in ("buffer.h", "lanes.h", "rigid_body.h"))
+BUFFER, CALL, LANES, RIGID_BODY = (
+    f"batchpid/native/{name}" for name in ("buffer.h", "call.h", "lanes.h", "rigid_body.h")
+)
+_HEADERS = tuple(f"batchpid/native/{name}" for name in ("extension.h", "pose_search.h", "tables.h", "tool.h"))
 
 
 def _tables() -> tuple[Any, ...]:
-    return list(BODY.items()), KINEMATICS, PROJECTIONS, DECOUPLING
+    return list(BODY.items()), KINEMATICS, LAW, SEARCH, DECOUPLING
 
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", "batchpid/native/extension.h", BUFFER, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, LANES, RIGID_BODY),
     (*ROUNDED, "-Wno-psabi"),
     _tables,
 )

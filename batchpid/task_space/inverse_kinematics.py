@@ -2,11 +2,17 @@ r"""Inverse kinematics by damped least squares, with joint limits and several st
 
 With the error e (position, rotation vector) of a pose, the Jacobian J, and E = e^T e / 2, a step is::
 
-    dq = J^T (J J^T + (1e-5 + 0.1 E) 1)^-1 e
+    J# = J^T (J J^T + (1e-8 + 0.1 E) 1)^-1
+    v  = J# e
+    a  = -J# J' v                            acceleration along v, at most 0.75 |v| long
+    dq = v + a / 2
 
 T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on
-Robotics 27 (2011). Joints that a step would carry past a limit go to that limit, and the others make up for the rest of
-the error: an active set. A search that ends away from the pose is followed by others, from other poses.
+Robotics 27 (2011): damping in proportion to the error. M. K. Transtrum and J. P. Sethna, "Improvements to the
+Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885 (2012): the acceleration, which
+takes the curvature of the tool's path into account. Joints that v would carry past a limit go to that limit, and the
+others make up for the rest of the error: an active set. A search that ends away from the pose is followed by others,
+from other poses.
 """
 
 from __future__ import annotations
@@ -24,12 +30,13 @@ from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
-from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, tool_frame
+from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, tool_frame, velocities_of
 
 Float64 = NDArray[np.float64]
 
 ON_FAILURE = ("warn", "raise", "return")
-_DAMPING, _DAMPING_PER_ERROR = 1e-5, 0.1
+_DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
+_LARGEST_ACCELERATION = 0.75  # relative to the velocity
 _PASSES = 4  # of the active set; joints that reach a limit in later ones are clipped
 
 
@@ -108,10 +115,12 @@ def inverse_kinematics(
     goal, rows = _goals_and_starts(tree, pose, start)
     at = None if point is None else broadcast("point", point, (3,), "give x, y, z in the link's frame [m]")
     search = _Search(tree, index, at, tolerance, iterations)
-    rng = np.random.default_rng(integer("seed", seed, 0, 2**63))
-    shares = rng.uniform(size=(starts - 1, tree.dof))
+    integer("seed", seed, 0, 2**63)
     with quiet():
         best = search.solve(goal, rows)
+        if best.success.all():
+            return best
+        shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
         for first, last in ((0, 4), (4, starts - 1)):  # most poses are reached from one of the first five
             left, drawn = np.flatnonzero(~best.success), shares[first:last]
             if len(left) and len(drawn):
@@ -142,60 +151,74 @@ class _Search:
 
     def solve(self, goal: Float64, qpos: Float64) -> IKResult:
         """Return where a search from ``qpos`` (n, dof) ends."""
+        arrays = goal, qpos, self._tolerance, self._iterations
+        found = native_rows.search(self._tree, self._index, self._point, *arrays)
+        if found is None:
+            found = self._solve(goal, qpos)
+        nearest, lengths, steps = found
+        near, start = lengths <= self._tolerance, np.zeros(len(goal), np.intp)
+        success, count = near[:, 0] & near[:, 1], steps[:, 0].astype(np.intp)
+        return IKResult(nearest, lengths[:, 0], lengths[:, 1], success, start, count)
+
+    def _solve(self, goal: Float64, qpos: Float64) -> list[Float64]:
+        """Return what :func:`native_rows.search` returns, in NumPy."""
         count = len(goal)
-        found = IKResult(
-            qpos.copy(),
-            np.full(count, np.inf),
-            np.full(count, np.inf),
-            np.zeros(count, bool),
-            np.zeros(count, np.intp),
-            np.zeros(count, np.intp),
-        )
+        nearest, lengths, steps = [qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1))]
         going, q = np.arange(count), qpos
         for step in range(self._iterations + 1):
-            error, matrix = self._error(goal[going], q)
-            lengths = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
-            better = _size(lengths, self._tolerance) < _size(_lengths(found, going), self._tolerance)
+            at = _At(self._tree, self._index, self._point, q)
+            error = pose_error(goal[going], at.pose)
+            found = np.sqrt((error * error).reshape(-1, 2, 3).sum(-1))
+            better = _size(found, self._tolerance) < _size(lengths[going], self._tolerance)
             rows = going[better]
-            found.qpos[rows], found.iterations[rows] = q[better], step
-            found.position_error[rows], found.rotation_error[rows] = lengths[better].T
-            found.success[rows] = (lengths[better] <= self._tolerance).all(1)
-            if step == self._iterations:
-                break
-            stay = ~found.success[going]
-            going, q = going[stay], q[stay]
+            nearest[rows], lengths[rows], steps[rows] = q[better], found[better], step
+            stay = ~(found <= self._tolerance).all(1)
+            going, q = going[stay], _stepped(self._tree, at, q, error)[stay]
             if not len(going):
                 break
-            q = self._stepped(q, error[stay], matrix[stay])
-        return found
+        return [nearest, lengths, steps]
 
-    def _error(self, goal: Float64, qpos: Float64) -> tuple[Float64, Float64]:
-        """Return the errors (n, 6) and Jacobians (n, 6, dof)."""
-        tree, bodies = self._tree, self._tree.bodies
-        found = native_rows.kinematics(tree, ("pose", "jacobian"), qpos, None, self._index, self._point)
-        if found is not None:
-            return pose_error(goal, found[0]), found[1]
-        motions = motions_of(tree, bodies, qpos, np)
-        tool = tool_frame(tree, bodies, motions.frames, self._index, self._point)
-        return pose_error(goal, pose_of(tool)), jacobian_at(tree, bodies, motions, self._index, tool[..., 3])
 
-    def _stepped(self, qpos: Float64, error: Float64, matrix: Float64) -> Float64:
-        """Return the positions after a step within the limits."""
-        damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
-        free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
-        for _ in range(_PASSES):
-            part = np.where(free[:, None], matrix, 0.0)
-            rest = error - product(matrix, np.where(free, 0.0, move))
-            right = np.concatenate([part, rest[..., None]], axis=-1)
-            factor = whitened(gram(part.swapaxes(-1, -2), part.swapaxes(-1, -2)) + damping * np.eye(6), right)
-            move = np.where(free, gram(factor[..., :-1], factor[..., -1:])[..., 0], move)
-            within = np.clip(qpos + move, self._tree.lower, self._tree.upper) - qpos
-            beyond = free & (within != move) & (qpos + move != qpos + within)
-            move = np.where(beyond, within, move)
-            free &= ~beyond
-            if not beyond.any():
-                break
-        return np.clip(qpos + move, self._tree.lower, self._tree.upper)
+class _At:
+    """Tool at given positions (n, dof)."""
+
+    def __init__(self, tree: KinematicTree, index: int, point: Float64 | None, qpos: Float64) -> None:
+        self._tree, self._index = tree, index
+        self._motions = motions_of(tree, tree.bodies, qpos, np)
+        tool = tool_frame(tree, tree.bodies, self._motions.frames, index, point)
+        self.pose, self._place = pose_of(tool), tool[..., 3]
+        self.jacobian = jacobian_at(tree, tree.bodies, self._motions, index, self._place)
+
+    def rate(self, qvel: Float64) -> Float64:
+        """Return J' q' (n, 6)."""
+        return rate_at(self._tree, velocities_of(self._tree, self._motions, qvel, np), self._index, self._place)
+
+
+def _stepped(tree: KinematicTree, at: _At, qpos: Float64, error: Float64) -> Float64:
+    """Return the positions (n, dof) after a step within the limits."""
+    damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
+    free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
+    for _ in range(_PASSES):
+        part = np.where(free[:, None], at.jacobian, 0.0)
+        rest = error - product(at.jacobian, np.where(free, 0.0, move))
+        move = np.where(free, _damped(part, damping, rest), move)
+        target = qpos + move
+        within = np.clip(target, tree.lower, tree.upper)
+        beyond = free & (target != within)
+        move, free = np.where(beyond, within - qpos, move), free & ~beyond
+        if not beyond.any():
+            break
+    acceleration = -_damped(part, damping, at.rate(move))
+    size, most = (np.sqrt((x * x).sum(-1, keepdims=True)) for x in (acceleration, _LARGEST_ACCELERATION * move))
+    share = np.where(size > most, most / size, 1.0) / 2
+    return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), tree.lower, tree.upper)
+
+
+def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
+    """Return J^T (J J^T + damping 1)^-1 v (n, dof) of the columns ``part`` (n, 6, dof) of J."""
+    rows = part.swapaxes(-1, -2)
+    factor = whitened(gram(rows, rows) + damping * np.eye(6), np.concatenate([part, vector[..., None]], axis=-1))
+    return gram(factor[..., :-1], factor[..., -1:])[..., 0]
 
 
 def _goals_and_starts(tree: KinematicTree, pose: ArrayLike, start: ArrayLike) -> tuple[Float64, Float64]:

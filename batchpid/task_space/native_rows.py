@@ -1,4 +1,4 @@
-"""Kinematics and projections of NumPy arrays in native code, for any number of rows: task_space.cpp.
+"""Kinematics and inverse kinematics of NumPy arrays in native code, for any number of rows: task_space.cpp.
 
 Each function takes float64 arrays and returns None where native code is not used: switched off (``BATCHPID_NATIVE=0``),
 not built, or for arrays of another library. The caller then computes the same in NumPy, the definition; results differ
@@ -11,18 +11,16 @@ import math
 import os
 import warnings
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import SWITCH, program_status
+from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.task_space_extension import BODY, DECOUPLING, KINEMATICS, TASK_SPACE
-from batchpid.native.tracing import trace
+from batchpid.native.task_space_extension import BODY, KINEMATICS, TASK_SPACE
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 Float64 = NDArray[np.float64]
@@ -69,21 +67,48 @@ def kinematics(
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
     if native is None:
         return None
-    own = _native_tree(native, tree)
+    own = native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
+    found = empty(wanted, leading, dof)
+    inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
+    results = [found.get(name) for name in KINEMATICS[3:]]
+    call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results)
+    return tuple(found.values())
+
+
+def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:
+    """Return arrays for the results ``wanted`` of :func:`kinematics`."""
+    shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
+    return {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
+
+
+def search(
+    tree: KinematicTree, index: int, point: Any, goal: Any, start: Any, tolerance: Any, iterations: int
+) -> list[Float64] | None:
+    """Return positions (n, dof), errors (n, 2) and numbers of steps (n, 1) of searches for poses (n, 7) of a link.
+
+    The tool is at a ``point`` (3,) of the link ``index``; ``start`` is (n, dof), ``tolerance`` (2,).
+    """
+    if (native := in_use()) is None:
+        return None
+    own, rows = native_tree(native, tree), len(start)
+    found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
+    limits = np.atleast_2d(tree.lower), np.atleast_2d(tree.upper)
+    arrays = goal, tool(own, index, point), *limits, tolerance[None]
+    call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
+    return found
+
+
+def tool(own: _NativeTree, index: int, point: Any) -> Float64:
+    """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
     tool = own.tools[index]
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
         tool[..., 3] += (tool[..., :3] * point[..., None, :]).sum(-1)
-    shapes = {name: tuple([dof if size < 0 else size for size in _SIZES[name]]) for name in wanted}
-    found = {name: np.empty((*leading, *shape)) for name, shape in shapes.items()}
-    inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    results = [found.get(name) for name in KINEMATICS[3:]]
-    _call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool.reshape(-1, 12), *results)
-    return tuple(found.values())
+    return tool.reshape(-1, 12)
 
 
-def _native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
+def native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
     """Return the constants of a tree for the extension, where the axis of each joint is the x axis of its body."""
     if (own := _trees.get(tree)) is not None:
         return own
@@ -110,67 +135,13 @@ def _turn(axis: Float64) -> Float64:
     return np.column_stack([axis, across, np.cross(axis, across)])
 
 
-def errors(goal: Any, pose: Any, limits: tuple[Any, Any], jacobian: Any, qvel: Any) -> list[Float64] | None:
-    """Return the errors of poses (envs, 6), the same with limited norms, and the twists J q' (envs, 6).
-
-    ``limits`` are the largest norms (1 | envs, 1) of the position and of the rotation vector.
-    """
-    arrays = goal, pose, *limits, jacobian, qvel
-    native = _for_rows(qvel, *arrays)
-    if native is None:
-        return None
-    rows, dof = qvel.shape
-    found = [np.empty((rows, 6)) for _ in range(3)]
-    _call(native.errors, rows, dof, *arrays, *found)
-    return found
-
-
-def projections(decoupling: str, chain: Any, arrays: tuple[Any, ...]) -> list[Any] | None:
-    """Return the arrays of :class:`batchpid.task_space.projections.Projections`.
-
-    ``arrays`` are those between the chain and the results in PROJECTIONS of task_space_extension.py.
-    """
-    native = _for_rows(arrays[3], chain, *arrays)
-    if native is None:
-        return None
-    rows, dof = arrays[3].shape
-    found = [np.empty((rows, size)) for size in (6, dof, dof, dof, dof, dof, 1)]
-    _call(native.projections, rows, dof, DECOUPLING.index(decoupling), chain, *arrays, *found)
-    found[-1] = found[-1][:, 0] > 0
-    return found
-
-
-def elementwise(function: Callable[..., list[Any]], *arrays: Any) -> list[Any]:
-    """Return ``function(*arrays)``, elementwise over arrays (envs | 1, columns) of NumPy as a traced program.
-
-    The program is the function itself, with its rounding: a minimum over columns is repeated in all of them.
-    """
-    shapes = [array.shape for array in arrays if type(array) is np.ndarray and array.ndim == 2]
-    given = tuple([array is not None for array in arrays])
-    if len(shapes) < sum(given) or not program_status().active:
-        return function(*arrays)
-    arrays = tuple([array for array in arrays if array is not None])
-    if any([array.dtype != np.float64 for array in arrays]):
-        arrays = tuple(map(_contiguous, arrays))
-    return list(_program(function, given, max(shapes))(*arrays))
-
-
-@lru_cache(maxsize=256)
-def _program(function: Callable[..., list[Any]], given: tuple[bool, ...], shape: tuple[int, int]) -> ArrayProgram:
-    def traced(*symbols: Any) -> list[Any]:
-        rest = iter(symbols)
-        return function(*(next(rest) if one else None for one in given))
-
-    return ArrayProgram(trace(traced, 0, sum(given)), (), sum(given), shape, threads=1)
-
-
-def _for_rows(like: Any, *arrays: Any) -> Any:
+def for_rows(like: Any, *arrays: Any) -> Any:
     """Return the extension for arrays of NumPy, where ``like`` is (envs, columns)."""
     plain = all([array is None or isinstance(array, np.ndarray) for array in arrays])
     return in_use() if plain and like.ndim == 2 else None
 
 
-def _call(function: Callable[..., None], *arguments: Any) -> None:
+def call(function: Callable[..., None], *arguments: Any) -> None:
     """Call a function of the extension, which takes contiguous arrays of float64 only; others are converted."""
     try:
         function(*arguments)

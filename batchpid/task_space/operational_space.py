@@ -43,10 +43,9 @@ import numpy as np
 
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space import native_rows
+from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.kinematic_tree import KinematicTree
-from batchpid.task_space.native_rows import elementwise
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
@@ -150,23 +149,56 @@ def advance(
     feedforward: Any = None,
 ) -> tuple[OSCState, Any]:
     """Advance the law with given coefficients and dynamics, such as an engine's; otherwise as :func:`step`."""
+    inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
+    if (found := _native(k, state, dynamics, inputs, ("effort",))) is not None:
+        return found[0], found[1][0]
     with quiet():
         sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
-        if state.integral is None:
-            return state, elementwise(_effort, *sums.parts)[0]
-        effort, whole, *_ = elementwise(_saturated, *sums.parts)
+        effort, whole, *_ = _saturated(*sums.parts)
         return _integrated(k, state, sums, effort != whole), effort
 
 
-def advance_terms(k: OSCCoefficients, state: OSCState, *inputs: Any, **named: Any) -> tuple[OSCState, OSCTerms]:
+def advance_terms(
+    k: OSCCoefficients,
+    state: OSCState,
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    dynamics: TaskDynamics,
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+) -> tuple[OSCState, OSCTerms]:
     """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
+    inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
+    if (found := _native(k, state, dynamics, inputs, _TERMS)) is not None:
+        state, (error, force, task, posture, whole, effort, s1, s2, near) = found
+        return state, OSCTerms(error, force, task, posture, whole, effort, s1[:, 0], s2[:, 0], near[:, 0] > 0)
     with quiet():
-        sums = _sums(k, state, *inputs, **named)
-        effort, whole, s1, s2 = elementwise(_saturated, *sums.parts)
+        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
+        effort, whole, s1, s2 = _saturated(*sums.parts)
         state = _integrated(k, state, sums, effort != whole)
     p = sums.projections
     shares = s1[..., 0], s2[..., 0]
     return state, OSCTerms(sums.task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular)
+
+
+_TERMS = (
+    *("error", "force", "task", "posture_effort", "unsaturated", "effort"),
+    *("task_share", "posture_share", "near_singular"),
+)
+
+
+def _native(
+    k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics, inputs: tuple[Any, ...], wanted: tuple[str, ...]
+) -> tuple[OSCState, list[Any]] | None:
+    """Return the state after a step in native code and the results ``wanted``; None if it is not used."""
+    arrays, wanted = (*inputs, None, None, *state), wanted if state.integral is None else (*wanted, "next_integral")
+    found = native_law.law(k, dynamics, arrays, wanted)
+    if found is None:
+        return None
+    return (state, found) if state.integral is None else (state._replace(integral=found.pop()), found)
 
 
 class _Motion(NamedTuple):
@@ -228,7 +260,7 @@ def _sums(
     """Return the efforts of task and posture before saturation."""
     xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
     task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
-    (a,) = elementwise(_accelerations, k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
+    a = _accelerations(k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
     a_n = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
     p = projections(k, task.dynamics, a, a_n, wrench, feedforward)
     parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
@@ -283,9 +315,6 @@ def _check_shapes(
 def _errors(k: OSCCoefficients, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
     """Return the error (envs, 6), the same with limited norms, and the twist of the tool J q', in the world."""
     limits = k.position_error_limit, k.rotation_error_limit
-    found = native_rows.errors(setpoint, d.pose, limits, d.jacobian, v)
-    if found is not None:
-        return found
     error = pose_error(setpoint, d.pose)
     near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
     return error, xp.concatenate(near, axis=-1), product(d.jacobian, v)
@@ -298,41 +327,27 @@ def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: Any, given: Any, i: Any) -> list[Any]:
+def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: Any, given: Any, i: Any) -> Any:
     """Return a (envs, 6)."""
     a = kp * e - kd * v
     a = a if twist is None else a + c * twist
     a = a if given is None else a + share * given
-    return [a if i is None else a + i]
+    return a if i is None else a + i
 
 
 def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> Any:
     """Return a_n (envs, dof)."""
-    gains, chain = (k.posture_kp, k.posture_kd), None
-    limits = k.limit_kp, k.limit_kd, k.limit_margin, k.limit_low, k.limit_high
-    if k.limit_kp is not None:
-        chain = d.chain[None]
-    return elementwise(_posture_accelerations, *gains, posture, q, v, chain, *limits)[0]
-
-
-def _posture_accelerations(
-    kp: Any, kd: Any, posture: Any, q: Any, v: Any, chain: Any, limit_kp: Any, limit_kd: Any, margin: Any, *ends: Any
-) -> list[Any]:
-    a = kp * (posture - q) - kd * v
-    if chain is None:
-        return [a]
-    xp, (low, high) = namespace(q, *ends), ends
-    depth = xp.maximum(low - q, 0.0) - xp.maximum(q - high, 0.0)
-    return [a + chain * (limit_kp * depth - limit_kd * v * xp.abs(depth) / margin)]
-
-
-def _effort(*parts: Any) -> list[Any]:
-    return _saturated(*parts)[:1]
+    xp = namespace(posture, q, v)
+    a = k.posture_kp * (posture - q) - k.posture_kd * v
+    if k.limit_kp is None:
+        return a
+    depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
+    return a + d.chain * (k.limit_kp * depth - k.limit_kd * v * xp.abs(depth) / k.limit_margin)
 
 
 def _saturated(
     base: Any, task: Any, null: Any, task_of_others: Any, null_of_others: Any, low: Any, high: Any
-) -> list[Any]:
+) -> tuple[Any, ...]:
     """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
     xp = namespace(base, task, null, task_of_others, null_of_others, low, high)
     least, most = -math.inf if low is None else low, math.inf if high is None else high
@@ -348,4 +363,4 @@ def _saturated(
     s2 = share(null, base + s1 * task)
     others = s1 * task_of_others + s2 * null_of_others
     effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
-    return [effort, base + task + null + others, s1, s2]
+    return effort, base + task + null + others, s1, s2

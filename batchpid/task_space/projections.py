@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.elementwise import namespace
-from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import TaskDynamics
@@ -38,12 +37,6 @@ def projections(
     k: OSCCoefficients, d: TaskDynamics, a: Any, a_n: Any, wrench: Any = None, feedforward: Any = None
 ) -> Projections:
     """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture."""
-    kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
-    dynamics = d.jacobian, d.jacobian_rate, d.mass_matrix, d.bias
-    options = k.axes, k.force_axes, k.smallest_eigenvalue
-    found = native_rows.projections(kind, d.chain, (*dynamics, a, a_n, wrench, feedforward, *options))
-    if found is not None:
-        return Projections(*found)
     xp = namespace(*k, *d, a, a_n, wrench, feedforward)
     j, m, chain = d.jacobian, d.mass_matrix, d.chain
     eye = xp.eye(m.shape[-1], dtype=m.dtype)

@@ -6,6 +6,7 @@ import batchpid as bp
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import xla
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
@@ -37,7 +38,9 @@ def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     if options.control == "drive":
         return f"law in {engine} (control 'drive'), {calls}"
     if options.backend == "numpy":
-        compiled = options.control == "pid" and native.status().active
+        compiled = (
+            options.control == "pid" or isinstance(options.control, OperationalSpace)
+        ) and native.status().active
         return f"law {'as a native program' if compiled else 'in NumPy'}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"

@@ -3,12 +3,15 @@
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
 arrays that hold the state from step to step. Python computes the noise of sensors, the passive force at a measured
 state, and the passive force of robots whose masses vary: with these each sim step is a call, and sensors have another
-program. Where the control step cannot be traced (a caller's controller, drives whose targets move within a tick), it
-runs in NumPy, and one native call applies the efforts, steps the engine and reads it. A sim step in which the friction
-model updates its mass matrix runs in the same way.
+program. Operational-space control is a native call before the program, which takes its effort as an input. Where the
+control step cannot be traced (a caller's controller, drives whose targets move within a tick), it runs in NumPy, and
+one native call applies the efforts, steps the engine and reads it. A sim step in which the friction model updates its
+mass matrix runs in the same way.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from batchpid.sim.loop.control_step import REFRESH_STEPS, Constants, Layout, Mea
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
 from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
 """Bits of the status of a sim step after which an env may have failed."""
@@ -40,11 +44,13 @@ class NativeExecutor(NumPyExecutor):
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._calls_force = self._reads_force and not self._steps_read_force
         has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
+        if layout.control == "custom":
+            has_own_law = options.backend == "numpy" and _is_native(self._controller, layout, constants)
         self._compiles = has_own_law and is_compiled(layout, constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
-        if not self._compiles:
+        if not self._compiles or (self._controller is not None and command.feedforward is not None):
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
         program.load(state, measured, command)
@@ -80,7 +86,8 @@ class NativeExecutor(NumPyExecutor):
 
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
-        return mapped(np.array, state)
+        own = {name: np.array(leaf) for name, leaf in state.law.items()} if isinstance(state.law, dict) else state.law
+        return mapped(np.array, state._replace(law=own))
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
@@ -118,14 +125,23 @@ class NativeExecutor(NumPyExecutor):
         """Return the program for commands with or without rate and feedforward."""
         key = command.setpoint_rate is None, command.feedforward is None
         if key not in self._ticks:
-            self._ticks[key] = TickProgram(self._pack, self._layout, self._constants, state, command, self._gravity)
+            self._ticks[key] = TickProgram(
+                self._pack, self._layout, self._constants, state, command, self._gravity, self._controller
+            )
         return self._ticks[key]
 
 
+def _is_native(controller: Any, layout: Layout, constants: Constants) -> bool:
+    """Return whether a controller runs in native code: operational-space control of robots without sensors."""
+    if not isinstance(controller, OperationalSpace) or layout.measures:
+        return False
+    return constants.known is None and controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
+
+
 def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: no own controller, targets of drives that rest, float64."""
+    """Return whether the control step can be a program: targets of drives that rest, float64."""
     rests = constants.driven is None and constants.guard is None
-    fits = layout.control in ("pid", "effort") or (layout.control == "drive" and rests)
+    fits = layout.control in ("pid", "effort", "custom") or (layout.control == "drive" and rests)
     return (
         fits
         and layout.coupling is None

@@ -23,6 +23,8 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 class TickProgram:
     """Control step of a group of envs as a program, and its arrays; with ``gravity`` it reads a passive force.
 
+    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) is a native call before the program.
+
     Attributes
     ----------
     state, measured, outputs
@@ -41,6 +43,7 @@ class TickProgram:
         state: StepState,
         command: Command,
         gravity: bool,
+        controller: Any = None,
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
@@ -51,17 +54,25 @@ class TickProgram:
         self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
         self._constants = mapped(_stacked, constants)
         self._sensors: tuple[ArrayProgram, list[Float64], list[Float64]] | None = None
+        self._control = None if controller is None else controller.bound(*self.reading)
+        if self._control is not None:
+            self.state = self.state._replace(law=self._control.state)
+            command = command._replace(setpoint=None)  # the controller's, of any size
         self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
+        if self._control is not None:
+            self.outputs = self.outputs._replace(returned=self._control.effort)
         self.before = np.zeros(shape)
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
-        inputs = (fixed, self._command, self.measured, self._seen)
+        if self._control is not None:
+            fixed = fixed._replace(law=None)
+        inputs = (fixed, self._command, self.measured, self._seen, self.outputs.returned)
         traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
-        results = [*leaves(_returned(fixed)), *leaves(self.outputs)]
+        results = [*leaves(_returned(fixed)), *leaves(self.outputs._replace(returned=None))]
         arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
         if matrix is not None:
             bodies = scene_dynamics(pack.spec).bodies
@@ -71,13 +82,22 @@ class TickProgram:
             arrays |= {"armature": constants.armature, "damping": constants.damping}
         whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
         self._tick = NativeTick(
-            program, given, results, timestep=constants.timestep, matrix_steps=steps, whole=whole, **arrays
+            program,
+            given,
+            results,
+            timestep=constants.timestep,
+            matrix_steps=steps,
+            whole=whole,
+            control=None if self._control is None else self._control.address,
+            **arrays,
         )
 
     def load(self, state: StepState, measured: Measured, command: Command) -> None:
         """Copy the arguments into the program's arrays, where they are not these arrays."""
         if state is not self.state:
             self._copy(state)
+        if self._control is not None:
+            self._control.load(command.setpoint)
         if measured is not self.measured:
             for array, value in zip(self.measured, measured, strict=True):
                 if value is not None:
@@ -121,6 +141,8 @@ class TickProgram:
                 getattr(self.outputs, name)[...] = array
 
     def _copy(self, state: StepState) -> None:
+        if self._control is not None:
+            self._control.set_state(state.law)
         _write(_copied(self.state), _copied(state))
         if state.matrix is not None:
             self.state.matrix[...] = state.matrix
@@ -132,14 +154,14 @@ class TickProgram:
 def _trace(layout: Layout, *structures: Any) -> Trace:
     """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
 
-    ``structures`` describe constants, state, command, reading, and measured positions and velocities. No update of mass
-    matrix or friction is due.
+    ``structures`` describe constants, state, command, reading, measured positions and velocities, and the effort of a
+    controller. No update of mass matrix or friction is due.
     """
 
     def function(*symbols: Symbol) -> list[Any]:
         given = iter(symbols)
-        k, before, command, measured, seen = (filled(each, given) for each in structures)
-        model = Model(when=lambda due, function, otherwise: otherwise)
+        k, before, command, measured, seen, effort = (filled(each, given) for each in structures)
+        model = Model(when=lambda due, function, otherwise: otherwise, controller=lambda law, *_: (law, effort))
         if seen is not None:
             model = model._replace(measure=lambda k, motors, *_: (motors, *seen))
         rubs = k.friction.coulomb is not None

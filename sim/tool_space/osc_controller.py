@@ -23,6 +23,8 @@ from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.tool_space.bound_osc import BoundOSC
+from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error
 from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
@@ -192,6 +194,14 @@ class OperationalSpace:
         inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
         new, effort = ts.advance(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
         return new._replace(posture=state.posture), effort
+
+    def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:
+        """Return this controller on fixed arrays (envs, dof) in native code; None where that is not possible."""
+        if type(self) is not OperationalSpace or self._friction is not None or native_rows.in_use() is None:
+            return None
+        tool = self.tree, self.link, self.point
+        given = self._parts, self._columns, self._damping, self._timestep
+        return BoundOSC(self._k, tool, *given, (qpos, qvel, passive))
 
     def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""

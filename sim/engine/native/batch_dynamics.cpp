@@ -106,6 +106,7 @@ FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, doub
     BodyState<Lanes> *bodies = work.bodies.data();
     BodyMotion<Lanes> *motions = work.motions.data();
     place_bodies(dof, above, tree.bodies(), work.cosine.data(), work.sine.data(), work.qpos.data(), bodies);
+    weigh_bodies(dof, tree.bodies(), bodies);
     move_bodies(dof, above, bodies, work.qvel.data(), tree.gravity, motions);
     BodyState<Lanes> &carrier = bodies[tree.carrier];
     Vector<Lanes> const place = carrier.origin + in_axes(carrier.axes, tree.point[0], tree.point[1], tree.point[2]);

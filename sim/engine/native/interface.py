@@ -11,7 +11,7 @@ from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
 from batchpid.native.operations import HEADERS, PROGRAM
-from batchpid.native.task_space_extension import BODY, BUFFER, LANES, RIGID_BODY
+from batchpid.native.task_space_extension import BODY, BUFFER, CALL, LANES, RIGID_BODY
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -81,7 +81,7 @@ class Tick(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
-        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping", "matrix")),
+        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping", "matrix", "control")),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),
         ("whole", ctypes.c_int32),
@@ -132,6 +132,7 @@ EXTENSIONS = {
                 "xla_call.h",
             ),
             BUFFER,
+            CALL,
             RIGID_BODY,
             *HEADERS,
         ),

@@ -29,6 +29,8 @@ class NativeTick:
         Sim steps for which a mass matrix is kept within a tick.
     whole
         Whether ``matrix`` is the whole mass matrix or its diagonal.
+    control
+        Address of a native controller (call.h), whose effort is among the inputs.
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
@@ -45,6 +47,7 @@ class NativeTick:
         timestep: float,
         matrix_steps: int = 1,
         whole: bool = False,
+        control: int | None = None,
         **arrays: NDArray[Any] | None,
     ) -> None:
         arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
@@ -58,7 +61,9 @@ class NativeTick:
         self._program = self._native.bind(program.arguments, pairs, tuple(outputs))
         addresses = {name: array.ctypes.data for name, array in given.items()}
         dof = program.shape[1]
-        self._tick = Tick(timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, **addresses)
+        self._tick = Tick(
+            timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, control=control, **addresses
+        )
         self._address = ctypes.addressof(self._tick)
         self._kept = inputs, outputs, given
 

@@ -5,6 +5,7 @@
 
 #pragma once
 
+#include "batchpid/native/call.h"
 #include "batchpid/native/make_program.h"
 #include "batchpid/native/rigid_body.h"
 #include "sim_step.h"
@@ -24,6 +25,7 @@ struct Tick {
   double const *armature;         // (dof,), or null
   double const *damping;          // (dof,), or null
   double *matrix;                 // (robots, dof, dof), or its diagonal, or null
+  Call const *control;            // native controller, whose effort is an input of the program, or null
   double timestep;
   std::int64_t dof;
   std::int32_t whole;             // the law takes the whole matrix
@@ -76,6 +78,7 @@ inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group 
     if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
       write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
     }
+    if (tick.control != nullptr) tick.control->run(*tick.control);
     run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
     std::memcpy(tick.before, tick.qpos, bytes);
     status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from trees import TOOLS, planar, robot_of, tree_of
+from trees import TOOLS, planar, robot_of, serial, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
@@ -33,21 +33,27 @@ def check(tree, link, pose, found):
 
 
 @pytest.mark.parametrize("name", list(TOOLS))
-@pytest.mark.parametrize("rows", [100, pytest.param(500, marks=pytest.mark.slow)])
-def test_reachable_poses_are_reached(name, rows):
-    tree, start = tree_of(name), robot_of(name).start
-    pose, qpos = reachable(name, rows)
+def test_reachable_poses_are_reached(name):
+    tree, start, rows = tree_of(name), robot_of(name).start, 500
+    pose, _ = reachable(name, rows)
     found = ts.inverse_kinematics(tree, TOOLS[name], pose, start, on_failure="return")
     check(tree, TOOLS[name], pose, found)
     assert found.success.mean() >= 0.995
     others = ~tree.chain(TOOLS[name])
     np.testing.assert_array_equal(found.qpos[:, others], np.tile(start[others], (rows, 1)))
-    way = np.random.default_rng(0).normal(size=qpos.shape)
+
+
+@pytest.mark.parametrize("name", [*TOOLS, "six joints"])
+def test_five_steps_suffice_from_nearby(name):
+    """From 0.3 rad away; without the acceleration, and with a bias of 1e-5 of the damping, for 98 % of them."""
+    tree, tool = (serial(), "tip") if name == "six joints" else (tree_of(name), TOOLS[name])
+    rng, chain = np.random.default_rng(5), tree.chain(tool)
+    qpos = rng.uniform(np.maximum(tree.lower, -np.pi), np.minimum(tree.upper, np.pi), (1000, tree.dof))
+    pose, way = ts.link_poses(tree, qpos, [tool])[:, 0], chain * rng.normal(size=qpos.shape)
     near = qpos + 0.3 * way / np.linalg.norm(way, axis=1, keepdims=True)
-    found = ts.inverse_kinematics(tree, TOOLS[name], pose, near, starts=1, on_failure="return")
-    check(tree, TOOLS[name], pose, found)
+    found = ts.inverse_kinematics(tree, tool, pose, near, starts=1, iterations=5, on_failure="return")
+    check(tree, tool, pose, found)
     assert found.success.mean() >= 0.99
-    assert found.iterations[found.success].mean() <= 5
 
 
 def test_a_point_of_a_link_is_a_tool():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from unittest import mock
 
 import numpy as np
@@ -71,14 +72,20 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     frame=st.sampled_from(["world", "tool"]),
     smallest=st.sampled_from([0.02, 0.5, 10.0]),
     extras=st.integers(0, 15),
+    limit=st.sampled_from([200.0, None]),
+    learns=st.booleans(),
+    avoids=st.booleans(),
 )
-def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
+def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras, limit, learns, avoids):
     tree, tool = tree_of(name), tool_of(name)
     qpos, qvel = states(tree, rows, seed)
     goal = ts.link_poses(tree, states(tree, rows, seed + 1)[0], [tool])[:, 0]
     rng = np.random.default_rng(seed)
     forces = None if forces is None else np.array(forces) & ~np.array(axes or [True] * 6)
-    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": 200.0}
+    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": limit}
+    options |= {"integral_gain": 50.0, "integral_limit": 1.0} if learns else {}
+    options |= {"limit_margin": 0.5} if avoids else {}
+    options |= {"discretization": "implicit"} if seed % 2 and kind != "none" else {}
     stiffness = rng.uniform(50, 200, (1 if seed % 3 else rows, 6))
     params = ts.make_osc_params(tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options)
     names = "twist", "acceleration", "wrench", "feedforward"
@@ -87,8 +94,14 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
         for bit, key in enumerate(names)
         if extras >> bit & 1
     }
-    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
-    found, wanted = both(lambda: ts.step_terms(params, state, goal, qpos, qvel, 1e-3, tree=tree, link=tool, **given)[1])
+    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape), rng.normal(size=(rows, 6)) if learns else None)
+    inputs = params, state, goal, qpos, qvel, 1e-3
+    (new, found), (plain, wanted) = both(lambda: ts.step_terms(*inputs, tree=tree, link=tool, **given))
+    after, effort = ts.step(*inputs, tree=tree, link=tool, **given)
+    np.testing.assert_array_equal(effort, found.effort)
+    if learns:
+        np.testing.assert_array_equal(after.integral, new.integral)
+        assert_same(new.integral, plain.integral, 1e-12)
     np.testing.assert_array_equal(found.near_singular, wanted.near_singular)
     # The inverse amplifies the rounding of A, which is relative to its norm, by 1/s0 at most.
     d = ts.task_dynamics(tree, qpos, qvel, tool)
@@ -99,6 +112,36 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras):
     for key in ("task", "posture"):  # the share of an effort of 1e-15 N m may be 0 or 1
         parts = [getattr(terms, f"{key}_share")[:, None] * getattr(terms, key) for terms in (found, wanted)]
         assert_same(*parts, 10 * tolerance)
+
+
+@settings(max_examples=60)
+@given(
+    name=st.sampled_from(TREES),
+    rows=st.integers(1, 9),
+    seed=st.integers(0, 2**31),
+    distance=st.sampled_from([0.02, 0.3, 3.0]),
+    iterations=st.integers(1, 3),
+    pointed=st.booleans(),
+    narrow=st.booleans(),
+)
+def test_inverse_kinematics(name, rows, seed, distance, iterations, pointed, narrow):
+    """A few steps of a search; in many steps rounding leads to other solutions."""
+    tree, tool, rng = tree_of(name), tool_of(name), np.random.default_rng(seed)
+    qpos, _ = states(tree, rows, seed)
+    start = qpos + distance * rng.uniform(-1, 1, qpos.shape)
+    if narrow:  # joints stop at their limits
+        middle = states(tree, 1, seed + 1)[0][0]
+        tree = dataclasses.replace(tree, lower=middle - 0.3, upper=middle + 0.3)
+    point = rng.normal(size=3) if pointed else None
+    pose = ts.link_poses(tree, qpos, [tool], point=point)[:, 0]
+    options = {"point": point, "starts": 1, "iterations": iterations, "on_failure": "return"}
+    found, wanted = both(lambda: ts.inverse_kinematics(tree, tool, pose, start, **options))
+    # A step amplifies rounding by the inverse of its damping at most, which is the error's.
+    size = wanted.position_error**2 + wanted.rotation_error**2
+    tolerance = 1e-13 / (1e-8 + 0.05 * size.min(initial=1.0))
+    for leaf in ("qpos", "position_error", "rotation_error"):
+        assert_same(getattr(found, leaf), getattr(wanted, leaf), tolerance)
+    np.testing.assert_array_equal(found.iterations, wanted.iterations)
 
 
 def test_a_row_is_the_same_in_any_company():

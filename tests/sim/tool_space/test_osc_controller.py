@@ -9,6 +9,7 @@ import pytest
 from robots import load_bundled
 from tiny_urdf import joint, link, robot, write
 
+import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot, Runner
@@ -41,6 +42,11 @@ def six(folder, dynamics=""):
 @pytest.fixture(scope="module")
 def six_joints(tmp_path_factory):
     return six(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def damped(tmp_path_factory):
+    return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8"/>')
 
 
 @pytest.fixture(scope="module")
@@ -248,3 +254,56 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
 def test_a_wrong_tool_is_refused(panda, options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         Runner(panda, 1, workers=0, **options)
+
+
+class Called(OperationalSpace):
+    """The same controller, called by Python at every sim step."""
+
+
+LOOPS = {
+    "default": {},
+    "with parts": {"twist": True, "acceleration": True, "wrench": True, "joints": ["panda_finger_joint1"]},
+    "integral": {"integral_gain": 20.0, "integral_limit": 5.0, "limit_margin": 0.2, "frame": "tool"},
+    "implicit": {"discretization": "implicit", "decoupling": "partial", "point": [0.0, 0.0, 0.1]},
+}
+MORE = [
+    {"compensate": "gravity"},
+    {"compensate": "none"},
+    {"actuators": bp.make_actuators(9, command_delay=0.001, effort_limit=60.0)},
+    {"arm": "damped", "link": "l6"},
+    {"arm": "with_friction", "link": "l6", "compensate": "gravity+coriolis"},
+]
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize(("case", "more"), [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)])
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(request, engine, case, more):
+    """Also with resets, an env that fails, a snapshot and setpoints that change."""
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
+    options, seen = {"substeps": 20, "workers": 0, "engine": engine, **more}, []
+    arm, link = request.getfixturevalue(options.pop("arm", "panda")), options.pop("link", HAND)
+    noise = 0.05 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
+    starts = (START + noise)[:, : arm.dof]
+    for kind in (OperationalSpace, Called):
+        control = kind(arm, link, **LOOPS[case])
+        rng, size = np.random.default_rng(1), control.command.size
+        goals = np.tile(control.command.neutral, (6, 5, 1))
+        goals[..., :3] += 0.05 * rng.normal(size=(6, 5, 3))
+        goals[3:, ..., 7:] += 0.05 * np.abs(rng.normal(size=(3, 5, size - 7)))
+        with Runner(arm, 5, control=control, **options) as runner:
+            runner.reset(starts)
+            parts = [runner.rollout(goals[:2])]
+            runner.reset(starts, mask=np.arange(5) == 2)
+            snapshot = runner.snapshot()
+            parts.append(runner.rollout(goals[2:]))
+            runner.restore(snapshot)
+            goals[0, 3, 3:7] = 0.0  # a quaternion without direction
+            parts.append(runner.rollout(goals))
+            seen.append(
+                [leaf for part in parts for leaf in (part.qpos, part.qvel, part.effort, part.saturated, part.ok)]
+            )
+    for native, called in zip(*seen, strict=True):
+        np.testing.assert_array_equal(native, called)
+    assert np.flatnonzero(~seen[0][-1].all(0)).tolist() == [3]

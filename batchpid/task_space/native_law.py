@@ -1,0 +1,60 @@
+"""The law of operational-space control in native code, for any number of rows: task_space.cpp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, LAW
+from batchpid.task_space import native_rows
+from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.osc_coefficients import OSCCoefficients
+from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
+
+Float64 = NDArray[np.float64]
+
+_RESULTS = LAW[LAW.index("effort") :]
+_SIZES = {"next_integral": 6, "error": 6, "force": 6, "task_share": 1, "posture_share": 1, "near_singular": 1}
+
+
+def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tuple[str, ...]) -> list[Float64] | None:
+    """Return results of a step of the law of operational_space.py, of the names ``wanted`` in LAW.
+
+    ``dynamics`` and ``inputs`` are the arrays before the coefficients in LAW, in its order.
+    """
+    arrays, qpos = (*dynamics, *inputs, *k[:-2]), inputs[1]
+    native = native_rows.for_rows(qpos, *arrays)
+    if native is None:
+        return None
+    (rows, dof), sizes = qpos.shape, _SIZES
+    found = {name: np.empty((rows, sizes.get(name, dof))) for name in wanted}
+    native_rows.call(native.law, rows, dof, *_kind(k), *arrays, *map(found.get, _RESULTS))
+    return list(found.values())
+
+
+def bind(
+    tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
+) -> tuple[Any, int] | None:
+    """Return an object that keeps ``arrays`` of LAW, and the address of a Call of call.h: a step of the law on them.
+
+    The kinematics are those of a ``point`` (3,) of ``link``, or of its origin; ``bias`` is one of the arrays. They are
+    contiguous arrays of float64.
+    """
+    if (native := native_rows.in_use()) is None:
+        return None
+    own, index, (rows, dof) = native_rows.native_tree(native, tree), tree.index(link), arrays["qpos"].shape
+    body = tree.link_bodies[index]
+    dynamics = native_rows.empty(("pose", "jacobian", "jacobian_rate", "mass_matrix"), (rows,), dof)
+    fixed = {"tool": native_rows.tool(own, index, point), "chain": np.array(tree.chains[body], np.float64)}
+    known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, **dynamics, **fixed}
+    motion = [None if name == "bias" else known[name] for name in KINEMATICS]
+    return native.bind(own.tree, body, rows, *_kind(k), *motion, *map(known.get, LAW))
+
+
+def _kind(k: OSCCoefficients) -> tuple[int, bool]:
+    """Return the number of the decoupling, and whether the coefficients are in the axes of the tool."""
+    kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
+    return DECOUPLING.index(kind), k.frame is not None
