@@ -138,7 +138,7 @@ def _compare_ticks() -> None:
         qpos, qvel, passive, before, qf = np.zeros((5, *shape))
         matrix, done = np.zeros((4, 2, 2)), 0
         program = ArrayProgram(trace(law, 1, 3), [target], 3, shape)
-        arrays = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
+        arrays: dict[str, Any] = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
         own: dict[str, Any] = {"matrix": matrix, "tree": tree, "bodies": table, "armature": armature}
         inputs = (matrix, qpos, qvel)
         tick = NativeTick(program, inputs, (qf,), timestep=1e-2, matrix_steps=every, whole=True, **arrays, **own)
