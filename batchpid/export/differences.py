@@ -104,7 +104,7 @@ class Differences(list[str]):
         return ", ".join(f"{joint} {text}" for joint, text in texts)
 
     def listed_names(self, where: Any) -> str:
-        """Return the joints of the mask ``where``, as text."""
+        """Return the names of the joints in the mask ``where``, as text."""
         return ", ".join(joint for joint, yes in zip(self.joints, where, strict=True) if yes)
 
     def lack(self, option: str, problem: str, off: float, unit: str = "") -> None:

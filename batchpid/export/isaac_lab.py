@@ -52,7 +52,7 @@ def to_isaac_lab(
         Motors, of one env: delay, torque-speed line, effort limit, armature, friction.
     model
         ``"implicit"``, ``"ideal_pd"``, ``"dc_motor"`` or ``"delayed_pd"``. Default: "delayed_pd" for motors with a
-        command delay of half a step and more, "dc_motor" for others with a torque-speed line, else "implicit".
+        command delay of more than half a step, "dc_motor" for others with a torque-speed line, else "implicit".
     name
         Of the variable, a dict of configurations: one for each set of joints with one delay or one stall effort.
     inertia

@@ -40,7 +40,7 @@ _CONSTANTS = {"pi": math.pi, "inf": math.inf}
 _MODULES = ("math", "np", "numpy", "torch")
 """Modules with these constants."""
 _OTHERS = ("joint_names_expr", "class_type", "velocity_limit_sim")
-"""Arguments of a configuration that are not figures read here."""
+"""Arguments that hold no figures, and are not differences either."""
 
 
 def from_isaac_lab(text: str, joint_names: Sequence[str], *, dt: float | None = None) -> ImportedMotors:

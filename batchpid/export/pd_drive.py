@@ -101,8 +101,8 @@ class Drive(Differences):
     def compare_integral(self, first: bool, clamps: ArrayLike = False) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.
 
-        ``first``: it integrates before the output, else after, and then beyond its limit by one step, except for the
-        joints of the mask ``clamps``.
+        ``first``: the target integrates before it computes the output. Otherwise it integrates afterwards, and passes
+        the limit by up to one step, except at the joints of the mask ``clamps``.
         """
         ki, used = self.value("ki"), np.array(strategies(self.params))
         limited = np.isfinite(self.value("effort_min", -math.inf)) | np.isfinite(self.value("effort_max", math.inf))

@@ -27,7 +27,7 @@ LAW = (
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
-"""Arrays of ``search`` in pose_search.h; those after the tolerances are results, and searches start at ``qpos``."""
+"""Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 

@@ -4,15 +4,15 @@ With the error e (position, rotation vector) of a pose, the Jacobian J, and E = 
 
     J# = J^T (J J^T + (1e-8 + 0.1 E) 1)^-1
     v  = J# e
-    a  = -J# J' v                            acceleration along v, at most 0.75 |v| long
+    a  = -J# J' v                            geodesic acceleration, shortened to 0.75 |v|
     dq = v + a / 2
 
 T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on
 Robotics 27 (2011): damping in proportion to the error. M. K. Transtrum and J. P. Sethna, "Improvements to the
-Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885 (2012): the acceleration, which
-takes the curvature of the tool's path into account. Joints that v would carry past a limit go to that limit, and the
-others make up for the rest of the error: an active set. A search that ends away from the pose is followed by others,
-from other poses.
+Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885 (2012): geodesic acceleration,
+which takes the curvature of the tool's path into account. An active set keeps the joint limits: joints that v would
+move past a limit stop at it, and the other joints take over the remaining error. If a search does not reach the pose,
+further searches begin at other poses.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Float64 = NDArray[np.float64]
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
 _LARGEST_ACCELERATION = 0.75  # relative to the velocity
-_PASSES = 4  # of the active set; joints that reach a limit in later ones are clipped
+_PASSES = 4  # of the active set; joints that pass a limit after the last are clipped
 
 
 class InverseKinematicsWarning(UserWarning):
@@ -150,7 +150,7 @@ class _Search:
         return np.where(self._chain, low + share * (high - low), rows)
 
     def solve(self, goal: Float64, qpos: Float64) -> IKResult:
-        """Return where a search from ``qpos`` (n, dof) ends."""
+        """Return the results of searches that begin at ``qpos`` (n, dof)."""
         arrays = goal, qpos, self._tolerance, self._iterations
         found = native_rows.search(self._tree, self._index, self._point, *arrays)
         if found is None:
@@ -161,7 +161,7 @@ class _Search:
         return IKResult(nearest, lengths[:, 0], lengths[:, 1], success, start, count)
 
     def _solve(self, goal: Float64, qpos: Float64) -> list[Float64]:
-        """Return what :func:`native_rows.search` returns, in NumPy."""
+        """Compute the results of :func:`native_rows.search` in NumPy."""
         count = len(goal)
         nearest, lengths, steps = [qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1))]
         going, q = np.arange(count), qpos

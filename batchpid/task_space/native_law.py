@@ -1,4 +1,4 @@
-"""The law of operational-space control in native code, for any number of rows: task_space.cpp."""
+"""Operational-space control in native code, for any number of rows: task_space.cpp."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ _SIZES = {"next_integral": 6, "error": 6, "force": 6, "task_share": 1, "posture_
 
 
 def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tuple[str, ...]) -> list[Float64] | None:
-    """Return results of a step of the law of operational_space.py, of the names ``wanted`` in LAW.
+    """Return the results ``wanted``, by their names in LAW, of a step of the law of operational_space.py.
 
-    ``dynamics`` and ``inputs`` are the arrays before the coefficients in LAW, in its order.
+    ``dynamics`` and ``inputs`` are the arrays that precede the coefficients in LAW, in that order. The result is None
+    where native code is not used.
     """
     arrays, qpos = (*dynamics, *inputs, *k[:-2]), inputs[1]
     native = native_rows.for_rows(qpos, *arrays)
@@ -38,10 +39,10 @@ def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tupl
 def bind(
     tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
-    """Return an object that keeps ``arrays`` of LAW, and the address of a Call of call.h: a step of the law on them.
+    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs a step of the law on them.
 
-    The kinematics are those of a ``point`` (3,) of ``link``, or of its origin; ``bias`` is one of the arrays. They are
-    contiguous arrays of float64.
+    ``arrays`` are contiguous float64 arrays by their names in LAW, with ``bias`` among them. The tool is at a ``point``
+    (3,) of ``link``, by default at its origin. The result is None where native code is not used.
     """
     if (native := native_rows.in_use()) is None:
         return None
@@ -55,6 +56,6 @@ def bind(
 
 
 def _kind(k: OSCCoefficients) -> tuple[int, bool]:
-    """Return the number of the decoupling, and whether the coefficients are in the axes of the tool."""
+    """Return the index in DECOUPLING, and whether the coefficients are in the axes of the tool."""
     kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
     return DECOUPLING.index(kind), k.frame is not None

@@ -85,9 +85,10 @@ def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[s
 def search(
     tree: KinematicTree, index: int, point: Any, goal: Any, start: Any, tolerance: Any, iterations: int
 ) -> list[Float64] | None:
-    """Return positions (n, dof), errors (n, 2) and numbers of steps (n, 1) of searches for poses (n, 7) of a link.
+    """Search, from ``start`` (n, dof), for joint positions that bring a tool to the poses ``goal`` (n, 7).
 
-    The tool is at a ``point`` (3,) of the link ``index``; ``start`` is (n, dof), ``tolerance`` (2,).
+    Return the nearest positions (n, dof), their errors (n, 2) and their numbers of steps (n, 1). The tool is at a
+    ``point`` (3,) of the link ``index``; ``tolerance`` is (2,).
     """
     if (native := in_use()) is None:
         return None
@@ -109,7 +110,7 @@ def tool(own: _NativeTree, index: int, point: Any) -> Float64:
 
 
 def native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
-    """Return the constants of a tree for the extension, where the axis of each joint is the x axis of its body."""
+    """Return the constants of a tree for the extension, in body frames whose x axis is the axis of the joint."""
     if (own := _trees.get(tree)) is not None:
         return own
     bodies, turns = tree.bodies, [_turn(axis) for axis in tree.bodies.axis]
@@ -136,7 +137,7 @@ def _turn(axis: Float64) -> Float64:
 
 
 def for_rows(like: Any, *arrays: Any) -> Any:
-    """Return the extension for arrays of NumPy, where ``like`` is (envs, columns)."""
+    """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
     plain = all([array is None or isinstance(array, np.ndarray) for array in arrays])
     return in_use() if plain and like.ndim == 2 else None
 

@@ -193,7 +193,7 @@ _TERMS = (
 def _native(
     k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics, inputs: tuple[Any, ...], wanted: tuple[str, ...]
 ) -> tuple[OSCState, list[Any]] | None:
-    """Return the state after a step in native code and the results ``wanted``; None if it is not used."""
+    """Return the state after a step in native code and the results ``wanted``; None where native code is not used."""
     arrays, wanted = (*inputs, None, None, *state), wanted if state.integral is None else (*wanted, "next_integral")
     found = native_law.law(k, dynamics, arrays, wanted)
     if found is None:

@@ -109,7 +109,7 @@ class IdentifyCommand:
 
 
 def _params(robot: Robot, name: str) -> Any:
-    """Return gains by name or file, of all joints of ``robot``; a params file may hold some of them."""
+    """Return the gains of a name or file, for all joints of ``robot``; a params file may have only some joints."""
     import batchpid as bp
     from batchpid.export.ros2_control_reader import is_ros2_control
     from batchpid.io import documents

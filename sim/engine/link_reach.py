@@ -1,4 +1,4 @@
-"""How far the shapes of a robot's links move when its joints do: bounds that hold at every pose."""
+"""Bounds of the motion of a robot's links per unit of motion of its joints, which hold at every pose."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class LinkExtent(NamedTuple):
 
 
 def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
-    """Return the largest speed of a point of each link per unit of each joint's speed (links, dof), parents first.
+    """Return upper bounds of the speeds of the links' shapes per unit of each joint's speed (links, dof).
 
-    That is the distance of its shapes from the joint's axis [m], or 1 for a joint that slides, and 0 for a joint that
-    does not move the link.
+    That is the largest distance of the shapes from the joint's axis [m], 1 for a sliding joint, and 0 for a joint that
+    does not move the link. ``links`` has parents first.
     """
     reach = np.zeros((len(links), dof))
     for row, link in zip(reach, links, strict=True):
@@ -43,7 +43,7 @@ def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
 
 
 def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
-    """Return how fast two links close, at most, per unit of each joint's speed, from their reach (..., dof).
+    """Return the largest closing speed of two links per unit of each joint's speed, from their reach (..., dof).
 
     A joint above both links does not change their distance.
     """
@@ -53,8 +53,8 @@ def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
 def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) -> None:
     """Write into ``reach`` (dof,) the largest distance of the shapes of ``link`` from the axis of each joint above it.
 
-    Whatever the positions of the joints between: a ball that turns about an axis stays in a ball around a point on it.
-    A second bound is the sum of the distances along the chain.
+    It holds at all positions of the joints between: a ball that turns about an axis stays within a larger ball, whose
+    center is on the axis. A second bound is the sum of the distances along the chain; the smaller one counts.
     """
     centers, radii, at = link.balls[:, :3], link.balls[:, 3], link
     farthest = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)

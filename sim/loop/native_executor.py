@@ -132,14 +132,14 @@ class NativeExecutor(NumPyExecutor):
 
 
 def _is_native(controller: Any, layout: Layout, constants: Constants) -> bool:
-    """Return whether a controller runs in native code: operational-space control of robots without sensors."""
+    """Return whether a controller is native: operational-space control without sensors or friction compensation."""
     if not isinstance(controller, OperationalSpace) or layout.measures:
         return False
     return constants.known is None and controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
 
 
 def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: targets of drives that rest, float64."""
+    """Return whether the control step can be a program: float64, no coupling, drive targets constant in a tick."""
     rests = constants.driven is None and constants.guard is None
     fits = layout.control in ("pid", "effort", "custom") or (layout.control == "drive" and rests)
     return (

@@ -23,7 +23,7 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 class TickProgram:
     """Control step of a group of envs as a program, and its arrays; with ``gravity`` it reads a passive force.
 
-    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) is a native call before the program.
+    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class TickProgram:
         self._control = None if controller is None else controller.bound(*self.reading)
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
-            command = command._replace(setpoint=None)  # the controller's, of any size
+            command = command._replace(setpoint=None)  # the controller has its own copy, of any size
         self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)

@@ -252,7 +252,7 @@ class Robot(RobotDescription):
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control.
-        Of <pid> and <dcmotor> also ki and its limit.
+        For <pid> and <dcmotor> ki and its limit are included.
 
         Raises
         ------
@@ -294,7 +294,7 @@ def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
 
 
 def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | None:
-    """Return the motors of an MJCF file, None where they are ideal."""
+    """Return the motors of an MJCF file; None if they are ideal."""
     effects = {"armature": 0.0, "saturation_effort": np.inf, "no_load_speed": np.inf, "lag": 0.0}
     columns: dict[str, Any] = {
         name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints] for name, off in effects.items()

@@ -1,4 +1,4 @@
-"""Operational-space control of a group of envs on fixed arrays, for the sim steps of a tick in native code."""
+"""Operational-space control of a group of envs as a native call on fixed arrays, within the sim steps of a tick."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class BoundOSC:
     Attributes
     ----------
     state
-        Arrays of the state by name; a call advances them.
+        Arrays of the state by name; a call updates the integral in place.
     effort
         Efforts of the last call (envs, dof).
     address
@@ -63,7 +63,7 @@ class BoundOSC:
             array[...] = state[name]
 
     def load(self, setpoint: Float64) -> None:
-        """Copy the setpoints of a tick (envs, size); the posture is that of the state, or of the setpoint."""
+        """Copy the setpoints of a tick (envs, size); joints without a column in them keep the state's posture."""
         for name, part in self._parts.items():
             self._given[name][...] = setpoint[:, part]
         self._posture[...] = np.where(self._columns > 0, setpoint[:, self._columns], self.state["posture"])

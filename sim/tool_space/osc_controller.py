@@ -196,7 +196,7 @@ class OperationalSpace:
         return new._replace(posture=state.posture), effort
 
     def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:
-        """Return this controller on fixed arrays (envs, dof) in native code; None where that is not possible."""
+        """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
         if type(self) is not OperationalSpace or self._friction is not None or native_rows.in_use() is None:
             return None
         tool = self.tree, self.link, self.point

@@ -1,6 +1,6 @@
-"""Shapes of a robot in MuJoCo, for proofs in native code that none of them touch (``clearance.h``).
+"""Tables of a robot's shapes in MuJoCo, from which native code proves that no shapes touch (``clearance.h``).
 
-Looking for contacts is a half of a sim step of a robot with meshes, and most of the time there are none.
+Collision detection takes half of a sim step of a robot with meshes, and usually finds no contact.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from batchpid.sim.engine.native.interface import Clearance
 Arrays = dict[str, NDArray[Any]]
 
 _BEYOND = 0.01
-"""Travel of a sliding joint beyond its limits for which clearances are proved [m]: limits are a little soft."""
+"""Distance by which a sliding joint may pass its limits while clearances hold [m]: MuJoCo's limits are soft."""
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _BEGINNING = 4096
-"""Bytes of ``mjModel`` in which its options are looked for; there are more."""
+"""Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is larger."""
 _GEOM = mujoco.mjtGeom
 _KINDS = {
     int(kind) for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX)
@@ -35,8 +35,8 @@ _KINDS = {
 def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs that ``Clearance`` in ``clearance.h`` lists, the same for every robot.
 
-    None if nothing can be proved: no shapes may touch, the base floats over ground, or the flag for contacts is not
-    found in this version of MuJoCo.
+    None where MuJoCo always runs its collision detection: no pair of shapes may touch, a floating base may touch the
+    ground, a kind of shape is not supported, or the flag for contacts is not found in this version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model) if flags_offset() is not None else np.empty((0, 2))
@@ -62,10 +62,11 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
 
 
 def touching_pairs(model: Any) -> NDArray[np.int32]:
-    """Return the pairs of shapes (pairs, 2), by number, for which MuJoCo looks for contacts; a plane comes first.
+    """Return the pairs of shapes (pairs, 2), by number, that MuJoCo checks for contact; a plane comes first.
 
-    See "Collision detection" in MuJoCo's documentation: not within bodies that are welded together, not between a body
-    and its parent unless that is the world, not between excluded bodies, and not where the bits of type forbid it.
+    MuJoCo leaves out pairs of planes, of bodies that are welded together, of a body and its parent unless that is the
+    world, of excluded bodies, and of shapes whose ``contype`` and ``conaffinity`` do not match ("Collision detection"
+    in MuJoCo's documentation).
     """
     pairs = np.column_stack(np.triu_indices(model.ngeom, 1))
     planes = model.geom_type == int(_GEOM.mjGEOM_PLANE)
@@ -81,7 +82,7 @@ def touching_pairs(model: Any) -> NDArray[np.int32]:
 
 
 def _reach(robot: RobotMj) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the reach of the bodies (bodies, dof), and the positions of the joints at which it holds (2, dof)."""
+    """Return the reach of the bodies (bodies, dof), and the range of joint positions in which it holds (2, dof)."""
     model, dof = robot.model, len(robot.qvel)
     places = {int(at): number for number, at in enumerate(robot.qvel)}
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
@@ -114,7 +115,7 @@ def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[n
 
 @cache
 def flags_offset() -> int | None:
-    """Return the place of ``opt.disableflags`` in ``mjModel`` [bytes], found by a change; None without exactly one."""
+    """Return the offset of ``opt.disableflags`` in ``mjModel`` [bytes], found by flipping a flag; None if ambiguous."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
     model.opt.disableflags ^= _NO_CONTACT
@@ -126,14 +127,14 @@ def flags_offset() -> int | None:
 class GroupClearance:
     """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of ``mj_kinematics``.
 
-    ``tables`` are those of :func:`shape_tables`, ``models`` and ``data`` of each robot. Native code switches the
-    contacts of a model off for the part of a sim step, so no other group may use these models. Nothing has to be done
-    when a robot is placed elsewhere: a clearance is that of the positions for which it was computed.
+    ``tables`` come from :func:`shape_tables`; ``models`` and ``data`` have one entry for each robot. Native code
+    disables the contacts of a model during part of a sim step, so no other group may use these models. A reset of a
+    robot needs no call: a jump of its positions counts as motion of its joints.
 
     Attributes
     ----------
     arrays
-        By the names of the fields in ``clearance.h``.
+        Arrays by the names of the fields in ``clearance.h``.
     """
 
     def __init__(self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int) -> None:
@@ -158,5 +159,5 @@ class GroupClearance:
 
     @property
     def address(self) -> int:
-        """Address of the fields."""
+        """Address of the ``Clearance`` structure."""
         return ctypes.addressof(self._fields)

@@ -8,15 +8,15 @@
     effort  = min(max(u, forcerange_0), forcerange_1)
     A      <- A + dt (g - q)        while |A| < imax, or towards 0
 
-``<dcmotor>`` asks for the same u, without posrange, and with min(max(A, -Imax), Imax). Its supply voltage is 1 V here,
-which with the stall effort S and the no-load speed v0 gives the torque-speed line, with the time constant T of the
-winding::
+``<dcmotor>`` has the same u, without posrange, and clamps the integral: min(max(A, -Imax), Imax). Its supply voltage is
+1 V here. The stall effort S and the no-load speed v0 give the torque-speed line, and the time constant T of the winding
+gives the lag::
 
     i       = min(max(u, S (-1 - q'/v0)), S (1 - q'/v0))
     x      <- x + (1 - exp(-dt/T)) (i - x)
     effort  = min(max(x, -saturation), saturation)
 
-A plain motor is a ``<general>`` actuator, with x = u(t - delay), or its first-order lag::
+A plain motor is a ``<general>`` actuator, where x is the delayed input u(t - delay), or that after a first-order lag::
 
     effort  = min(max(gainprm x + biasprm, forcerange_0), forcerange_1)
 
@@ -35,16 +35,16 @@ from batchpid.export.pd_drive import Drive
 from batchpid.motors.guard import Guard
 
 FAR = 1e10
-"""Range in place of an infinite one."""
+"""Finite limit in place of an infinite one."""
 _INPUTS = {"input": "pos vel ff"}
 
 
 class MjcfActuators:
     """Actuators of the joints: ``elements`` as (tag, attributes), and their differences, which are added to ``found``.
 
-    ``has_rate``, ``has_lag`` and ``is_dcmotor`` are masks (joints,) of limited setpoints, lags and DC motors;
-    ``effort_range`` is the range of the effort (joints, 2) [N m or N] that a joint needs for itself, as its actuator
-    has a symmetric one only; infinite elsewhere.
+    ``has_rate``, ``has_lag`` and ``is_dcmotor`` are masks (joints,) of joints with a rate-limited setpoint, a lag and a
+    DC motor. ``effort_range`` (joints, 2) [N m or N] holds the asymmetric effort limits of DC motors, which are
+    written to the joint because ``<dcmotor>`` has only symmetric ones; other joints have infinite limits there.
     """
 
     def __init__(
@@ -107,13 +107,13 @@ class MjcfActuators:
         kp, ki, kv, slew, imax = self._gains(at)
         figures = {"kp": kp, "kv": kv, "ki": ki, "imax": imax, "slewmax": slew}
         element = {key: _text(value) for key, value in figures.items() if value or key == "kp"} | _INPUTS
-        ends = self._lower[at], max(self._upper[at], np.nextafter(self._lower[at], math.inf))  # MuJoCo needs a width
+        ends = self._lower[at], max(self._upper[at], np.nextafter(self._lower[at], math.inf))  # MuJoCo: lower < upper
         if np.isfinite(ends).any():
             element["posrange"] = _text(*np.clip(ends, -FAR, FAR))
         return element
 
     def _dcmotor(self, at: int, low: float, high: float) -> dict[str, str]:
-        arm = 1.0 if self.controls else float(self._strength[at])  # a strength is a gear: 1 / arm of each effort
+        arm = 1.0 if self.controls else float(self._strength[at])  # the gear: efforts of the motor are divided by it
         element, voltage = {}, 0.0
         if self._line[at]:
             voltage = 1.0

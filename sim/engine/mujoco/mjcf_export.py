@@ -1,7 +1,7 @@
 """MJCF of the simulated robot, with the law or its motors in MuJoCo's own actuators.
 
-Their equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. That of ``<pid>`` is this package's law with
-the measured velocity, output first, without anti-windup.
+The equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. ``<pid>`` is this package's law with the measured
+velocity and ``integration="output_first"``, without anti-windup.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def to_mjcf(
 
     Bodies are the rigid bodies that are simulated here, with repaired inertias, convex shapes, pairs that do not
     collide, joint limits, damping, Coulomb friction and armature; followers are tied to their leaders by constraints.
-    Each actuator of the law has three inputs in ``ctrl``: position, velocity and feedforward. The keyframe "home" holds
-    the robot's start pose: pose, position inputs, and setpoints whose rate is limited.
+    Each actuator of the law has three inputs in ``ctrl``: position, velocity and feedforward. The keyframe "home" has
+    the start pose as joint positions, position inputs and rate-limited setpoints, and lags at the holding efforts.
 
     Parameters
     ----------
@@ -55,10 +55,10 @@ def to_mjcf(
     dt
         Time step of the simulation, and so of the control [s].
     actuators
-        Motors of one env. Written are armature, friction, effort limit, torque-speed line, lag and command delay, with
-        the law as a delay of the inputs; of motors alone also strength and bias.
+        Motors of one env. Their armature, friction, effort limit, torque-speed line, lag and command delay are written;
+        with the law the delay acts on the inputs. Strength and bias are written for motors alone.
     guard
-        Limits of the law's setpoints, of one env: position and rate are written.
+        Limits of the law's setpoints, for one env. Those of position and rate are written.
     inertia
         As in :func:`batchpid.export.to_ros2_control`, of all joints.
     physics
@@ -157,7 +157,7 @@ def _add_actuators(root: Any, motors: MjcfActuators) -> None:
 
 
 def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfActuators) -> None:
-    """Add the keyframe "home": the start pose as position and setpoint, held by the motors against gravity."""
+    """Add the keyframe "home": the start pose as positions and setpoints, and lags at the holding efforts."""
     data = mujoco.MjData(model)
     for at, name in enumerate(robot.joint_names):
         data.qpos[model.joint(name).qposadr] = robot.start[at]

@@ -84,7 +84,7 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
-        # A model of its own, since native code switches its contacts off and on.
+        # A copy for this pack, since native code disables and enables its contacts.
         self.models, self.rows = [copy.copy(robot.model)] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
         self._change_masses(range(self.size))

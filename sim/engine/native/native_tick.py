@@ -30,7 +30,7 @@ class NativeTick:
     whole
         Whether ``matrix`` is the whole mass matrix or its diagonal.
     control
-        Address of a native controller (call.h), whose effort is among the inputs.
+        Address of a native controller (``Call`` in call.h), whose effort is one of the program's inputs.
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,

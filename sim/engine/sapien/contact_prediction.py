@@ -56,9 +56,9 @@ class NearPair(NamedTuple):
 class ContactPredictor:
     """Predictor of contact for a robot made of ``links``, parents first, of which the ``pairs`` may touch.
 
-    ``reach`` (len(links) + 1, dof) is that of the links, as :func:`batchpid.sim.engine.link_reach.link_reach` says, and
-    0 for the world. ``arms`` (pairs, dof) is how fast the links of a pair close, at most, per unit of each joint's
-    speed.
+    ``reach`` (len(links) + 1, dof) is the result of :func:`batchpid.sim.engine.link_reach.link_reach`, with a last row
+    of 0 for the world. ``arms`` (pairs, dof) is the largest speed at which the links of a pair approach, per unit of
+    each joint's speed.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Laws of single actuators of a compiled MJCF file, in their own units.
 
-A DC motor with the constant K, the resistance R and the supply voltage V has the stall effort K V / R and the no-load
+A DC motor with motor constant K, resistance R and supply voltage V has the stall effort K V / R and the no-load
 speed V / K. (MuJoCo's documentation, "DC Motor Model".)
 """
 
@@ -28,7 +28,7 @@ class Servo(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Torque-speed line of a DC motor, infinite without one, its lag [s], and its damping without control."""
+    """Torque-speed line of a DC motor, infinite without one, its lag [s], and its damping if it has no inputs."""
 
     stall: float
     speed: float
@@ -37,7 +37,7 @@ class Line(NamedTuple):
 
 
 def servo_of(model: Any, actuator: int) -> Servo | None:
-    """Return the gains of a servo, of <pid> or of the controller of <dcmotor>; None of other actuators."""
+    """Return the gains of a servo, of <pid> or of the controller of <dcmotor>; None for other actuators."""
     gain, dynamics = model.actuator_gainprm[actuator], model.actuator_dynprm[actuator]
     if _is_dcmotor(model, actuator):
         return Servo(gain[4], gain[6], gain[5], dynamics[8] or math.inf, dynamics[7])
@@ -50,7 +50,7 @@ def servo_of(model: Any, actuator: int) -> Servo | None:
 
 
 def line_of(model: Any, actuator: int) -> Line | None:
-    """Return the torque-speed line of a DC motor at its supply voltage, None of other actuators."""
+    """Return the torque-speed line of a DC motor at its supply voltage; None for other actuators."""
     if not _is_dcmotor(model, actuator):
         return None
     resistance, constant = (float(each) for each in model.actuator_gainprm[actuator, :2])
@@ -66,7 +66,7 @@ def line_of(model: Any, actuator: int) -> Line | None:
 
 
 def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str, str, str]]:
-    """Yield what an actuator does that is not simulated: the problem, the remedy and the figures."""
+    """Yield the effects of an actuator that are not simulated, each as problem, remedy and figures."""
     bias, dynamics = model.actuator_biasprm[actuator], model.actuator_dynprm[actuator]
     if _is_dcmotor(model, actuator):
         effects = {
@@ -95,7 +95,7 @@ def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str
 
 
 def setpoint_range(model: Any, actuator: int, servo: Servo) -> tuple[float, float]:
-    """Return the range of the setpoint that a servo is limited to, in its own units; infinite without one."""
+    """Return the range to which a servo limits its setpoint, in its own units; infinite without a limit."""
     chosen = _is_pid(model, actuator) or _is_dcmotor(model, actuator)
     if servo.kp <= 0 or (chosen and not _inputs(model, actuator) & _POSITION):
         return -math.inf, math.inf
@@ -113,11 +113,11 @@ def _is_pid(model: Any, actuator: int) -> bool:
 
 
 def _is_dcmotor(model: Any, actuator: int) -> bool:
-    """Return whether an actuator is MuJoCo's <dcmotor> with gains of torques (3.12 and later)."""
+    """Return whether an actuator is MuJoCo's <dcmotor> whose gains give efforts (3.12 and later)."""
     kind = getattr(mujoco.mjtGain, "mjGAIN_DCMOTOR", None)
     return bool(hasattr(model, "actuator_ctrlspec") and model.actuator_gaintype[actuator] == kind)
 
 
 def _inputs(model: Any, actuator: int) -> int:
-    """Return the inputs of an actuator as bits of ``mjtCtrlInput``, 0 of actuators that have no choice."""
+    """Return the inputs of an actuator as bits of ``mjtCtrlInput``; 0 for actuators without a choice."""
     return int(model.actuator_ctrlspec[actuator]) if hasattr(model, "actuator_ctrlspec") else 0

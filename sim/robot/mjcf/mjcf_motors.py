@@ -187,7 +187,7 @@ def _field(model: Any, name: str, index: int) -> float:
 def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
     """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by name; else None."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
-    outputs = getattr(model, "actuator_outadr", None)  # of an orientation servo three, each with a gear
+    outputs = getattr(model, "actuator_outadr", None)  # an orientation servo has three, each with a gear
     gear = float(model.actuator_gear[actuator if outputs is None else int(outputs[actuator]), 0])
     if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
         return {names.joints[target]: gear} if target in names.joints else None
