@@ -1,9 +1,9 @@
-// Clearance: proof that no two shapes of a robot touch, so that MuJoCo need not look for contacts in a sim step.
+// Proof that no two shapes of a robot touch, with which a sim step skips MuJoCo's collision detection.
 //
 // Two shapes d apart stay apart while the joints move by less than sum_j arm_j |dq_j| = d, where arm_j bounds the speed at
 // which joint j closes them, at every pose. That is conservative advancement (B. Mirtich, Impulse-based Dynamic
-// Simulation of Rigid Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A proof is of
-// the state alone: where it fails, MuJoCo looks, with the same result.
+// Simulation of Rigid Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A proof uses
+// the present state alone. Where there is none, MuJoCo runs its collision detection, with the same result.
 
 #pragma once
 
@@ -25,7 +25,7 @@ enum ShapeKind : std::int32_t { PLANE = 0, SPHERE = 2, CAPSULE = 3, CYLINDER = 5
 // and owns what they point to.
 struct Clearance {
   void (*kinematics)(void const *model, void *data);  // mj_kinematics
-  void *const *models;               // (robots,): mjModel of no other group
+  void *const *models;               // (robots,): mjModel, not shared with another group
   double *const *places, *const *turns;  // (robots,): places (shapes, 3) and rotations (shapes, 9), in mjData
   std::int32_t const *kinds;         // (shapes,)
   double const *sizes;               // (shapes, 3), as in mjModel
@@ -36,19 +36,19 @@ struct Clearance {
   double const *arms;                // (pairs, dof)
   double const *travel;              // (2, dof): least and largest position at which the arms hold
   double *last;                      // (robots, dof): positions after the last sim step
-  double *moved;                     // (robots, dof): |dq| since the clearances
+  double *moved;                     // (robots, dof): sum of |dq| since the last proof
   float *left;                       // (robots, pairs): clearances [m], rounded down
   double *rate;                      // (robots, dof): largest arm over clearance [1/rad or 1/m]
-  std::int32_t *wait;                // (robots,): 0 with a proof; otherwise sim steps until the next is tried
+  std::int32_t *wait;                // (robots,): 0 while a proof holds; otherwise sim steps until the next attempt
   std::int64_t number;               // of pairs
   std::int64_t flags;                // place of opt.disableflags in mjModel [bytes]
   std::int32_t contact, unused;      // mjDSBL_CONTACT
 };
 
 constexpr double MARGIN = 1e-4;        // [m], far above the rounding of places and of MuJoCo's own distances
-constexpr double SHARE = 0.25;         // of a clearance, the use from which it is computed anew
-constexpr double TIGHT = 0.7;          // of the true distance, the least bound that ends the search for a better one
-constexpr int MOST_POINTS = 16;        // of Gilbert's algorithm
+constexpr double SHARE = 0.25;         // of a clearance; when more of it is used, it is computed anew
+constexpr double TIGHT = 0.7;          // of the true distance, at which a bound is good enough to stop
+constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
 constexpr std::int32_t RETRY_STEPS = 50;
 
 using Point = Vector<double>;
@@ -131,7 +131,7 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   return best;
 }
 
-// Compute anew the clearances of one robot of which a good part is used. Return whether all are positive.
+// Recompute the clearances of one robot that are used up in part. Return whether all are positive.
 inline bool prove(Clearance const &clearance, std::int64_t row, std::int64_t dof) {
   double *moved = clearance.moved + row * dof, *rate = clearance.rate + row * dof;
   float *left = clearance.left + row * clearance.number;
