@@ -50,6 +50,7 @@ CLICK = {
 UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1.0}}
 PARTS = ("type", *CAMERA, *CLICK, *UPDATE)
 ENCODED = [msgspec.msgpack.encode(message) for message in (CAMERA, CLICK, UPDATE)]
+UNHURRIED = {"ping_interval": None, "open_timeout": None}  # of a socket, for a loaded machine
 BAD_VALUES = [
     ("kp", -1, "kp: out of range (got -1.0); use a number from 0"),
     ("kp", 1e9, "kp: out of range"),
@@ -75,7 +76,7 @@ class Page:
 
     async def __aenter__(self):
         protocols = [f"viser-v{viser.__version__}"]
-        self.socket = await connect(self.address, subprotocols=protocols, max_size=None)
+        self.socket = await connect(self.address, subprotocols=protocols, max_size=None, **UNHURRIED)
         self._task = asyncio.create_task(self._listen())
         await self.send(CAMERA)
         await until(lambda: "Push along" in self.controls)
@@ -103,7 +104,7 @@ class Page:
         await self.send({**UPDATE, "uuid": self.controls[label], "updates": {"value": value}})
 
 
-async def until(condition, seconds=60):
+async def until(condition, seconds=200):
     async with asyncio.timeout(seconds):
         while not condition():
             await asyncio.sleep(0.01)
@@ -115,8 +116,7 @@ def live(panda):
 
 
 @pytest.fixture
-def view(live, serve, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.view.page.NOTICE_SECONDS", 0.0)
+def view(live, serve):
     view = serve(live, port=18200)
     view.panel.frames_left = 0
     return view
@@ -172,7 +172,9 @@ def test_which_hosts_are_this_server():
         assert gate.problem([ours[0]], [f"http://{ours[0]}"] * 2, path)
 
 
-def test_bad_values_are_refused_with_a_notice_and_good_ones_act(live, view):
+def test_bad_values_are_refused_with_a_notice_and_good_ones_act(live, view, monkeypatch):
+    monkeypatch.setattr("batchpid.sim.view.page.NOTICE_SECONDS", 0.0)
+
     async def visit():
         async with Page(view) as page, Page(view) as other:
             before = live.gains["pid"].params
@@ -232,7 +234,7 @@ def attack(view, live, messages, clients):
         async with Page(view) as page:
             others = [Page(view) for _ in range(clients - 1)]
             for other in others:
-                other.socket = await connect(other.address, subprotocols=[f"viser-v{viser.__version__}"])
+                other.socket = await connect(other.address, subprotocols=[f"viser-v{viser.__version__}"], **UNHURRIED)
             for number, message in enumerate(hostile(messages, page.controls, seed=0)):
                 await page.send(message)
                 if number % 50 == 0:  # closes that connection
