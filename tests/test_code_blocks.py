@@ -35,7 +35,7 @@ SHORTER = {
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "excite": ["--duration", "1"],
-    "parity": ["--moves", "1", "--seconds", "0.5", "--workers", "0"],
+    "parity": ["--moves", "1", "--seconds", "0.1", "--workers", "0"],
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }

@@ -181,8 +181,9 @@ def array(
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
     given, result = result.reshape(-1), _broadcast(argument, result, shape, remedy)
-    # The sum of squares first: it costs a third, and is finite for most. (np.vdot is a call of Python, too.)
-    if finite and not math.isfinite(given.dot(given)) and not (good := np.isfinite(result)).all():
+    # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
+    is_sound = given.size < 10_000 and math.isfinite(given.dot(given))
+    if finite and not is_sound and not (good := np.isfinite(result)).all():
         entries(argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers")
     return result
 

@@ -161,7 +161,9 @@ class _Factors:
     def _all(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
         key = theta.tobytes()
         if key not in self._known:
-            self.left -= bool(self._known)  # the one at the start does not count, so that a fit may resume there
+            # The one at the start does not count, so that a fit may resume there. A point that is moved off a bound
+            # may be one too many.
+            self.left = max(0, self.left - bool(self._known))
             self._known[key] = self._evaluate(theta)
         return self._known[key]
 

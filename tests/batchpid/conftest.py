@@ -10,6 +10,8 @@ from quick_jit import quick_jit
 
 import batchpid as bp
 
+COMPILED_BY_DEFAULT = ("limits", "mixed per env", "everything")
+
 
 @pytest.fixture(autouse=True)
 def strict() -> Any:
@@ -39,8 +41,9 @@ def backend(request: pytest.FixtureRequest) -> Backend:
         return Backend(request.param, dtype, lambda value: read_only(value, dtype), bp.step_terms)
     if dtype == np.float64:
         request.getfixturevalue("x64")
-    # One of the two as JAX compiles it by default.
-    step = (jax.jit if dtype == np.float64 else quick_jit)(bp.step_terms, static_argnames="dt")
+    # Options that work together, as JAX compiles them by default; the others in a third of the time.
+    default = request.node.callspec.params["options"] in COMPILED_BY_DEFAULT and dtype == np.float64
+    step = (jax.jit if default else quick_jit)(bp.step_terms, static_argnames="dt")
 
     def strict_step(*args: Any, **keywords: Any) -> Any:
         with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from law_cases import DT, ENVS, GAINS, JOINTS, LIMITED, OPTIONS
+from quick_jit import quick_jit
 
 import batchpid as bp
 from batchpid import backends
@@ -18,8 +19,8 @@ def compare(params, inputs, rows):
     """Assert that steps in blocks, each written over the state before last, equal plain steps."""
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
     k = bp.discretise(params, DT)
-    blocks = jax.jit(lambda out, *given: advance_in_blocks(k, *given, out=out, rows=rows), donate_argnums=0)
-    plain = jax.jit(lambda *given: bp.advance(k, *given))
+    blocks = quick_jit(lambda out, *given: advance_in_blocks(k, *given, out=out, rows=rows), donate_argnums=0)
+    plain = quick_jit(lambda *given: bp.advance(k, *given))
     expected = state = bp.init(params, jnp.asarray(inputs.measurement[0], jnp.float32))
     out = None
     for t in range(4):

@@ -6,7 +6,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from law_cases import DT, ENVS, JOINTS, LIMITED
+from law_cases import DT, ENVS, JOINTS, LIMITED, OPTIONS
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -21,6 +21,13 @@ def kind(request):
     return request.param
 
 
+# Each case is compiled; test_law_oracle.py compares the compiled law over every option.
+COMPILED = ("p", "per env", "rate and limits", "derivative weight", "mixed per env", "hold effort", "everything")
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"), [*(("numpy", case) for case in OPTIONS), *(("jax", case) for case in COMPILED)], indirect=True
+)
 def test_calls_equal_steps_of_the_law(kind, options, inputs):
     params = bp.make_params(JOINTS, **options)
     pid = bp.BatchPID(params, ENVS, DT, kind, terms=True)

@@ -12,9 +12,10 @@ ALL = ("measurement_rate", "setpoint_rate", "feedforward")
 SOME = [("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]
 
 
-@pytest.mark.parametrize("given", [(), ALL], ids=["differences", "all inputs"])
-def test_step_equals_the_scalar_law(backend, options, inputs, given):
-    compare(backend, options, inputs, given)
+def test_step_equals_the_scalar_law(backend, options, inputs):
+    """With all inputs in one float type of JAX, without in the other: each is another program to compile."""
+    for given in {"jax64": [()], "jax32": [ALL]}.get(backend.name, [(), ALL]):
+        compare(backend, options, inputs, given)
 
 
 @pytest.mark.parametrize("given", SOME, ids=" ".join)

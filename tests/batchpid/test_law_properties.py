@@ -34,6 +34,7 @@ def equal_bits(a, b):
 
 
 @given(cases, runs)
+@settings(max_examples=50)
 def test_effort_stays_within_its_limits_and_rate(case, run):
     params = bp.make_params(JOINTS, **OPTIONS[case])
     _, terms = roll(params, *run)
@@ -57,8 +58,8 @@ def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
     kp, ki, limit = rng.uniform(0, 10, (envs, 1)), rng.uniform(0.1, 50, (envs, 1)), rng.uniform(0.1, 10, (envs, 1))
     params = bp.make_params(1, kp, ki, effort_limit=limit, anti_windup=strategy)
     free = bp.make_params(1, kp, ki, effort_limit=limit)
-    r, y = rng.uniform(-3, 3, (2, 2000, envs, 1))
-    r[:1000] = np.abs(r[:1000]) + 4
+    r, y = rng.uniform(-3, 3, (2, 1000, envs, 1))
+    r[:500] = np.abs(r[:500]) + 4
     bounded, wound_up = (np.max([np.abs(s.integral) for s in roll(p, r, y)[0]], axis=0) for p in (params, free))
     time = 0.0 if params.tracking_time is None else params.tracking_time
     most = {
@@ -67,10 +68,11 @@ def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
         "back_calculation": limit + 10 * (kp + ki * (time + DT)),
     }
     assert (bounded <= most[strategy] * (1 + 1e-9)).all()
-    assert (wound_up > 1000 * ki * DT).all()
+    assert (wound_up > 500 * ki * DT).all()
 
 
 @given(cases, runs, seeds)
+@settings(max_examples=50)
 def test_permuting_envs_permutes_the_results(case, run, seed):
     order = np.random.default_rng(seed).permutation(ENVS)
     params = bp.make_params(JOINTS, **OPTIONS[case])
@@ -81,6 +83,7 @@ def test_permuting_envs_permutes_the_results(case, run, seed):
 
 
 @given(cases, runs, st.integers(1, ENVS - 1), st.booleans())
+@settings(max_examples=50)
 def test_sharding_envs_changes_no_bit(case, run, cut, spread):
     params = bp.make_params(JOINTS, **OPTIONS[case])
     whole = bp.init(params, run[1][0])
@@ -97,6 +100,7 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
 
 
 @given(runs, st.sampled_from([np.nan, np.inf, -np.inf]), st.integers(0, 2), st.sampled_from(["zero", "hold"]))
+@settings(max_examples=40)
 def test_a_non_finite_input_affects_its_joint_alone(run, bad, which, policy):
     """Its state is kept, its effort is 0 or the last, the mask marks it, and the others are bit-identical."""
     params = bp.make_params(
@@ -136,7 +140,7 @@ def test_without_the_option_a_nan_propagates_in_its_joint():
 
 @pytest.mark.parametrize("case", OPTIONS)
 @given(runs, npst.arrays(float, (ENVS, JOINTS), elements=st.floats(-0.9, 0.9)), st.booleans())
-@settings(max_examples=25)
+@settings(max_examples=20)
 def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates):
     options = OPTIONS[case] | {"ki": OPTIONS[case].get("ki", 0.0)}
     for limited in ("integral_limit", "deadband"):
@@ -166,6 +170,7 @@ def test_track_needs_an_integral_and_a_time_step_to_integrate_first():
 
 
 @given(runs, st.floats(0, 100))
+@settings(max_examples=30)
 def test_a_change_of_ki_is_bumpless(run, ki):
     params = bp.make_params(JOINTS, 4.0, 3.0, 0.2)
     state = roll(params, *run)[0][-1]
@@ -203,29 +208,20 @@ def test_a_constant_error_has_no_derivative_under_wrap(error, path):
         assert abs(shown.d.item()) < 1e-9
 
 
-@pytest.mark.parametrize("strategy", ["clamp", "conditional", "back_calculation"])
-def test_recovery_from_saturation_overshoots_less_with_anti_windup(strategy):
-    """A double integrator with a weak motor: the textbook's case of windup."""
-    peaks = {}
-    for chosen in ("none", strategy):
-        params = bp.make_params(
-            1,
-            4.0,
-            3.0,
-            4.0,
-            effort_limit=0.2,
-            anti_windup=chosen,
-            **({"tracking_time": 0.3} if "back" in chosen else {}),
-        )
-        x, v, state, peak = np.zeros((1, 1)), np.zeros((1, 1)), None, 0.0
-        state = bp.init(params, x)
-        for _ in range(6000):
-            state, effort = bp.step(params, state, np.ones((1, 1)), x, DT)
-            v = v + effort * DT
-            x = x + v * DT
-            peak = max(peak, x.item())
-        peaks[chosen] = peak - 1
-    assert peaks[strategy] < 0.7 * peaks["none"]
+def test_recovery_from_saturation_overshoots_less_with_anti_windup():
+    """A double integrator with a weak motor: the textbook's case of windup; an env for each strategy."""
+    strategies = [["none"], ["clamp"], ["conditional"], ["back_calculation"]]
+    params = bp.make_params(1, 4.0, 3.0, 4.0, effort_limit=0.2, anti_windup=strategies, tracking_time=0.3)
+    x, v, peak = np.zeros((3, 4, 1))
+    state = bp.init(params, x)
+    for _ in range(6000):
+        state, effort = bp.step(params, state, np.ones((4, 1)), x, DT)
+        v = v + effort * DT
+        x = x + v * DT
+        peak = np.maximum(peak, x)
+    without, *others = peak[:, 0] - 1
+    assert without > 0
+    assert max(others) < 0.7 * without
 
 
 def test_the_first_step_has_no_derivative_kick():
@@ -238,6 +234,7 @@ def test_the_first_step_has_no_derivative_kick():
 
 
 @given(cases, runs, npst.arrays(bool, ENVS), st.booleans())
+@settings(max_examples=50)
 def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):
     params = bp.make_params(JOINTS, **OPTIONS[case])
     state = roll(params, *run)[0][-1]
@@ -251,6 +248,7 @@ def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):
 
 
 @given(cases, runs)
+@settings(max_examples=50)
 def test_arguments_are_neither_written_to_nor_kept(case, run):
     """Read-only arrays are accepted, and a caller may reuse its buffers."""
     params = bp.make_params(JOINTS, **OPTIONS[case])
@@ -297,7 +295,7 @@ def test_decayed_filters_never_hold_denormal_numbers(dtype):
     zero, one = np.zeros((1, 1), dtype), np.ones((1, 1), dtype)
     state, _ = bp.step(params, bp.init(params, zero), zero, one, DT)
     tiny = np.finfo(dtype).tiny
-    for _ in range(10_000):
+    for _ in range(2_500):
         state, _ = bp.step(params, state, one, one, DT)
         for leaf in (state.derivative, state.integral):
             assert leaf == 0 or abs(leaf) >= tiny

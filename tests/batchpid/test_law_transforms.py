@@ -1,4 +1,4 @@
-"""The law under every JAX transform, over every option.
+"""The law under every JAX transform, over the options.
 
 test_law_oracle.py compares the law as JAX compiles it by default with NumPy's.
 """
@@ -13,9 +13,13 @@ from quick_jit import quick_jit
 import batchpid as bp
 
 GAINS = ("kp", "ki", "kd")
+# Every option in float32, and in float64 the two cases that hold most of them.
+IN_BOTH_DTYPES = [(case, np.float32) for case in OPTIONS] + [
+    (case, np.float64) for case in ("mixed per env", "everything")
+]
 
 
-@pytest.fixture(params=[np.float32, np.float64], ids=["f32", "f64"])
+@pytest.fixture
 def dtype(request):
     if request.param == np.float64:
         request.getfixturevalue("x64")
@@ -50,6 +54,7 @@ def numpy_rollout(params, setpoint, measurement):
     return np.array(efforts)
 
 
+@pytest.mark.parametrize(("options", "dtype"), IN_BOTH_DTYPES, indirect=True)
 def test_jit_compiles_once_over_every_option(options, inputs, dtype):
     params = on_jax(bp.make_params(JOINTS, **options, dtype=dtype), dtype)
     r, y = (jnp.asarray(x, dtype) for x in (inputs.setpoint, inputs.measurement))
@@ -76,7 +81,11 @@ def test_jit_compiles_once_over_every_option(options, inputs, dtype):
     assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
 
 
-def test_scan_vmap_and_grad_over_every_option(options, inputs, x64):
+@pytest.mark.parametrize(
+    "options", ["p", "per env", "one limit", "derivative weight", "mixed per env", "kick", "everything"], indirect=True
+)
+def test_scan_vmap_and_grad(options, inputs, x64):
+    """The gradient of a scan over each of the options is compared below."""
     check_scan_vmap_and_grad(options, inputs, np.float64, {"rtol": 1e-12, "atol": 1e-11})
 
 
@@ -157,7 +166,6 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
         pytest.param("make_params", {"anti_windup": "back_calculation"}, marks=pytest.mark.slow),
         ("make_params", {"anti_windup": "conditional", "ki": 0.0}),
         ("replace", {"anti_windup": "back_calculation"}),
-        ("replace", {"anti_windup": "clamp"}),
     ],
     ids=str,
 )
@@ -193,6 +201,7 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, in
         np.testing.assert_allclose(slope @ step, (compiled(kp + step) - compiled(kp - step)) / 2, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("options", "dtype"), IN_BOTH_DTYPES, indirect=True)
 def test_params_whose_leaves_are_all_traced_can_be_changed(options, dtype):
     """The arguments of a compiled function: replace gives the same result as outside."""
     params = bp.make_params(JOINTS, **options, dtype=dtype)

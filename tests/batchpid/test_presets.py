@@ -47,7 +47,7 @@ def test_tutorial(path, kp, ki, kd):
     st.booleans(),
     st.booleans(),
 )
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_measurement):
     options = {
         "output_limits": limits,
@@ -70,6 +70,7 @@ def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_me
     st.integers(1, 24),
     st.booleans(),
 )
+@settings(max_examples=40)
 def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, differential_on_measurement):
     """Starting output, gains and time steps that change at every step, a reset, and the terms on the way."""
     options = {"output_limits": (-5, 7), "differential_on_measurement": differential_on_measurement}
@@ -90,6 +91,7 @@ def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, di
 
 
 @given(series, gain, gain)
+@settings(max_examples=50)
 def test_simple_pid_with_an_error_map_equals_a_continuous_joint_without_d(path, kp, ki):
     """P and I alone: its D spikes, see below."""
     assume(all(abs(math.remainder(r - y, 2 * math.pi)) < math.pi - 1e-6 for r, y in path))

@@ -174,6 +174,7 @@ def test_a_notebook_has_no_stored_output_and_shows_tables_and_pictures(path):
     notebook = formats.read(path, as_version=4)
     for cell in notebook.cells:
         assert (cell.get("outputs", []), cell.get("execution_count")) == ([], None)
+        cell.source = cell.source.replace("(8, robot.dof)", "(2, robot.dof)").replace("num_envs=8", "num_envs=2")
     notebook.cells.append(formats.v4.new_code_cell("assert np.abs(good.qpos[-1] - goal).max() < 1e-3"))
     client.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(path.parent)}}).execute()
     shown = [kind for cell in notebook.cells for output in cell.get("outputs", []) for kind in output.get("data", {})]

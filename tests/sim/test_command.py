@@ -107,15 +107,15 @@ def run(arm, control=None, ticks=30, **options):
 def test_the_tool_reaches_its_command_in_any_number_of_workers(arm, backend):
     if backend == "jax":
         pytest.importorskip("jax")
-    rollout = run(arm, backend=backend, ticks=200)
+    options = {"backend": backend, "timestep": 1 / 1000, "substeps": 10}
+    rollout = run(arm, ticks=200, **options)
     np.testing.assert_allclose(tool(rollout.qpos[-1].astype(float)), goals(), atol=2e-3)
     assert rollout.setpoint.shape == (200, N, 2)
     workers = {"numpy": 2, "jax": 1}[backend]
-    assert_identical(run(arm, backend=backend, ticks=40, workers=workers), rollout.for_ticks(slice(0, 40)))
+    assert_identical(run(arm, ticks=20, workers=workers, **options), rollout.for_ticks(slice(0, 20)))
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
-@pytest.mark.parametrize("more", [0, 1, 5])
+@pytest.mark.parametrize(("more", "backend"), [(0, "numpy"), (1, "numpy"), (5, "numpy"), (5, "jax")])
 def test_a_command_has_any_size(arm, more, backend):
     if backend == "jax":
         pytest.importorskip("jax")
@@ -288,7 +288,7 @@ def test_commands_of_joints_have_their_names_and_units(panda):
 
 @pytest.mark.parametrize(
     ("on_fault", "backend", "workers"),
-    [("hold", "numpy", 0), ("reset", "numpy", 2), ("hold", "jax", 1), ("reset", "jax", 0)],
+    [("hold", "numpy", 0), ("reset", "numpy", 2), ("hold", "jax", 0)],
 )
 def test_a_fault_names_the_entry_and_is_contained(arm, on_fault, backend, workers):
     if backend == "jax":

@@ -303,15 +303,15 @@ def fuzz(count: int, check: Callable[..., None], *arguments: Any) -> None:
 
 
 def test_entry_points_accept_or_name_any_argument():
-    fuzz(400, check_entry)
+    fuzz(180, check_entry)
 
 
 def test_a_call_that_a_runner_refuses_changes_nothing(runner):
-    fuzz(250, check_method, runner)
+    fuzz(120, check_method, runner)
 
 
 def test_a_call_that_a_containing_runner_refuses_changes_nothing(containing):
-    fuzz(150, check_method, containing)
+    fuzz(60, check_method, containing)
 
 
 @pytest.mark.slow

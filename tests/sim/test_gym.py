@@ -33,8 +33,8 @@ def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mod
     """Equal observations, rewards, flags and infos through time limits, success and resets."""
     drawn = Randomization(payload=Uniform(0, 1), qvel=Uniform(-0.1, 0.1), params={"kp": Uniform(-5, 5)})
     options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6, "randomization": drawn}
-    ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=7, **options)
-    theirs = SyncVectorEnv([lambda: gymnasium.make(ID, max_episode_steps=7, **options)] * 3, autoreset_mode=mode)
+    ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=4, **options)
+    theirs = SyncVectorEnv([lambda: gymnasium.make(ID, max_episode_steps=4, **options)] * 3, autoreset_mode=mode)
     assert ours.unwrapped.spec.id == "batchpid/Reach-v0"
     assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
     assert ours.observation_space == theirs.observation_space
@@ -43,7 +43,7 @@ def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mod
     assert ours.unwrapped.runner.episodes.tolist() == [[5, 0], [6, 0], [7, 0]]
     ours.action_space.seed(1)
     ends = np.zeros(3, int)
-    for _ in range(24):
+    for _ in range(14):
         action = ours.action_space.sample()
         step = ours.step(action)
         assert same(step, theirs.step(action))
@@ -84,8 +84,8 @@ def test_results_depend_on_the_seed_and_not_on_the_workers():
         with_workers.close()
         return first, last
 
-    np.testing.assert_array_equal(run(0, 3), run(2, 3))
-    first, _ = run(0, 3)
+    first, last = run(0, 3)
+    np.testing.assert_array_equal((first, last), run(2, 3))
     other, _ = run(0, 4)
     np.testing.assert_array_equal(first[1:], other[:-1])  # env k has seed + k
     assert (first[0] != other[0]).any()
@@ -109,7 +109,7 @@ def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
 def test_a_setpoint_at_the_goal_reaches_it_and_raises_the_reward():
     gains = {"kp": 600.0, "kd": 50.0, "ki": 0.0, "derivative_filter_time": 2e-3}
     probe = ReachVectorEnv(1, workers=0)
-    env = ReachVectorEnv(4, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None)
+    env = ReachVectorEnv(2, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None)
     obs, _ = env.reset(seed=0)
     goal = obs[:, 18:]
     action = 2 * (goal - env.low) / (env.high - env.low) - 1

@@ -10,7 +10,7 @@ from robots import RUBBING, load_bundled
 from batchpid.sim import FaultWarning, Runner
 from batchpid.sim.options import default_params
 
-TICKS = 25  # of 20 sim steps: 0.25 s
+TICKS = 10  # of 20 sim steps: 0.1 s
 
 
 def start_poses(robot, num_envs):
@@ -45,38 +45,38 @@ def reference(engine):
     return functools.partial(in_this_process, engine)
 
 
-@pytest.mark.parametrize("workers", [0, 2, 3])
+@pytest.mark.parametrize("workers", [0, 3])
 def test_any_number_of_workers(workers, reference):
     assert_identical(run(workers=workers), reference())
 
 
-@pytest.mark.parametrize("pack_size", [1, 8, 16])
+@pytest.mark.parametrize("pack_size", [1, 8])
 def test_any_pack_size(pack_size):
     assert_identical(run(workers=0, pack_size=pack_size), in_this_process("sapien"))
 
 
 def test_any_number_of_envs(reference):
-    many = run(num_envs=40, ticks=20, workers=0)
-    assert_identical(run(num_envs=1, ticks=20, workers=0), many, slice(0, 1))
-    assert_identical(many, reference(ticks=20), slice(0, 20))
+    many = run(num_envs=24, workers=0)
+    assert_identical(run(num_envs=1, workers=0), many, slice(0, 1))
+    assert_identical(many, reference(), slice(0, 20))
 
 
 @pytest.mark.parametrize("control", ["drive", "effort"])
 def test_other_controls(control):
-    expected = in_this_process("sapien", control=control, ticks=20)
-    assert_identical(run(ticks=20, workers=2, pack_size=8, control=control), expected)
+    expected = in_this_process("sapien", control=control)
+    assert_identical(run(workers=2, pack_size=8, control=control), expected)
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_another_robot():
-    assert_identical(run("jaco2", ticks=20, workers=2, pack_size=3), in_this_process("sapien", "jaco2", ticks=20))
+    assert_identical(run("jaco2", workers=2, pack_size=3), in_this_process("sapien", "jaco2"))
 
 
 @pytest.mark.parametrize("control", ["pid", "drive"])
 def test_a_robot_with_friction_and_damping(control, reference):
-    expected = reference(RUBBING, control=control, ticks=20)
-    assert_identical(run(RUBBING, ticks=20, workers=1, pack_size=3, control=control), expected)
-    alone = run(RUBBING, num_envs=1, ticks=20, workers=0, control=control)
+    expected = reference(RUBBING, control=control)
+    assert_identical(run(RUBBING, workers=1, pack_size=3, control=control), expected)
+    alone = run(RUBBING, num_envs=1, workers=0, control=control)
     assert_identical(alone, expected, slice(0, 1))
 
 
@@ -134,12 +134,12 @@ def test_a_masked_reset_does_not_affect_the_other_envs(panda, reference):
     with Runner(panda, 20, params=panda.params(), workers=0) as runner:
         runner.reset(start_poses(panda, 20))
         for tick in range(TICKS):
-            if tick == 15:
+            if tick == 6:
                 runner.reset(start_poses(panda, 20), mask=mask)
             obs = runner.step(panda.settings.target)
         assert_identical(obs, reference(), ~mask)
         # So many ticks after its reset an env is where it was as many after the first one.
         runner.reset(start_poses(panda, 20))
-        for _ in range(TICKS - 15):
+        for _ in range(TICKS - 6):
             early = runner.step(panda.settings.target)
     assert_identical(obs, early, mask)

@@ -26,7 +26,7 @@ from batchpid.sim import (
     write_recording,
 )
 
-N, TICKS = 6, 6
+N, TICKS = 6, 4
 KILLS = int(os.environ.get("BATCHPID_SOAK_KILLS", "100"))
 EVERYTHING = Randomization(
     seed=3,
@@ -72,7 +72,7 @@ def episodes(runner, num_envs=N):
 def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
     robot, runs = load_bundled(name), []
     cases = ((N, {}), (N, {"workers": 2}), (N, {"pack_size": 1}), (2, {}))
-    for num_envs, options in cases if name == "panda" else cases[::2]:
+    for num_envs, options in cases if name == "panda" else cases[1:3]:
         with make(robot, num_envs, **options) as runner:
             runs.append(episodes(runner, num_envs))
     for run in runs[1:]:
@@ -87,7 +87,7 @@ def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
     actuators = bp.make_actuators(PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1))))
     scale = Randomization(seed=1, actuators={"limit_efforts": Uniform(0.1, 1, operation="scale")})
     runs = []
-    for options in ({}, {"workers": 2}, {"pack_size": 1}):
+    for options in ({}, {"workers": 2, "pack_size": 1}):
         with make(actuators=actuators, randomization=scale, **options) as runner:
             draws = runner.draws["actuators.limit_efforts"]
             runs.append(episodes(runner))
@@ -96,7 +96,7 @@ def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
             assert_identical(ours, expected)
     assert draws.shape == (N, PANDA.dof)
     drawn = actuators._replace(limit_efforts=actuators.limit_efforts * draws[..., None])
-    with make(actuators=drawn, randomization=None, workers=1, pack_size=1) as runner:
+    with make(actuators=drawn, randomization=None, pack_size=1) as runner:
         assert_identical(runner.rollout(setpoints()), runs[0][0])
 
 

@@ -7,6 +7,12 @@ import pytest
 from batchpid.sim.cli import main
 
 
+@pytest.fixture(autouse=True)
+def working_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each test run in an empty folder: files of the checkout, as in its out/, do not matter, and none is added."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("working"))
+
+
 @pytest.fixture
 def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Function that runs a command line in this process and returns (exit status, stdout, stderr)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from robots import load_bundled
@@ -19,7 +19,7 @@ ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 @pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
     path = tmp_path / "new" / "demo.png"
-    flags = ("--num-envs", 3, "--workers", 1 if name == "panda" else 0, "--seconds", 0.05, "--picture", path)
+    flags = ("--num-envs", 3, "--workers", 1 if name == "panda" else 0, "--seconds", 0.02, "--picture", path)
     status, said, _ = batchpid("demo", name, *flags)
     assert status == 0
     for line in (
@@ -46,7 +46,7 @@ def test_demo_notes_where_it_differs_from_the_tutorial(batchpid, tmp_path):
 @pytest.mark.usefixtures("undrawn")
 def test_demo_depends_on_nothing_but_its_flags(batchpid, tmp_path):
     def table(*flags):
-        args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05, "--picture", tmp_path / "x.png")
+        args = ("--num-envs", 3, "--workers", 0, "--seconds", 0.02, "--picture", tmp_path / "x.png")
         return batchpid("demo", *args, *flags)[1].partition("\n\n")[2]
 
     assert table() == table("--seed", 0)
@@ -94,6 +94,7 @@ def test_demo_runs_with_gains_by_name_or_from_a_file(batchpid, tmp_path):
     assert "drive at 2000 Hz, gains drive (30, 6)" in batchpid("demo", *flags, "--gains", "drive:30,6")[1]
 
 
+@settings(max_examples=30)
 @given(
     name=st.sampled_from(list(ROBOTS)),
     num_envs=st.integers(1, 40),

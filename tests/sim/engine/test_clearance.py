@@ -50,7 +50,7 @@ def model_of(of, **changes):
     return robot_model(SceneSpec(of.urdf, of.ignored_pairs, of.joints, 5e-4, physics, engine="mujoco", **changes))
 
 
-@pytest.fixture(params=["panda", "jaco2", "tree 0", "tree 1", "tree 2"])
+@pytest.fixture(params=["panda", "jaco2", "tree 0", "tree 1"])
 def arm(request, tmp_path):
     name, *seed = request.param.split()
     return shaped_tree(int(seed[0]), tmp_path) if seed else load_bundled(name)
@@ -78,7 +78,7 @@ def test_every_contact_is_of_a_pair(arm, ground):
     built = model_of(arm, ground=ground)
     pairs = {tuple(sorted(pair)) for pair in shape_tables(built)["pairs"].tolist()}
     touched = set()
-    for qpos in poses(arm, 200):
+    for qpos in poses(arm, 100):
         data = at(built, qpos)
         touched |= {tuple(sorted(pair)) for pair in data.contact.geom[: data.ncon].tolist()}
     assert touched <= pairs
@@ -89,7 +89,7 @@ def test_shapes_close_no_faster_than_their_arms(arm):
     built = model_of(arm)
     tables = shape_tables(built)
     rng = np.random.default_rng(1)
-    for qpos in poses(arm, 30):
+    for qpos in poses(arm, 15):
         moved = np.clip(qpos + rng.normal(scale=rng.choice([0.01, 0.3]), size=arm.dof), arm.lower, arm.upper)
         before, after = at(built, qpos), at(built, moved)
         for pair, arms in list(zip(tables["pairs"], tables["arms"], strict=True))[:: 1 + len(tables["pairs"]) // 40]:
@@ -115,7 +115,7 @@ def clearances(monkeypatch):
 @needs_extension
 def test_bounds_are_below_the_distances_and_near_them(arm, clearances):
     built = model_of(arm)
-    for qpos in poses(arm, 20):
+    for qpos in poses(arm, 12):
         data = at(built, qpos)
         step = mujoco_step.MujocoStep(
             built, [built.model], lambda data=data: [data], np.zeros((1, arm.dof)), np.zeros(1, bool), False, None
@@ -142,8 +142,8 @@ def motion(of, **options):
 
 
 @needs_extension
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
-def test_a_motion_is_the_same_without_proofs(arm, physics, clearances, monkeypatch):
+def test_a_motion_is_the_same_without_proofs(arm, clearances, monkeypatch):
+    physics = "accurate" if arm.name == "panda" else "fast"
     ours = motion(arm, physics=physics)
     assert clearances
     monkeypatch.setattr(mujoco_step, "shape_tables", lambda robot: None)

@@ -33,7 +33,7 @@ def slider(tmp_path_factory):
     return Robot.load(write(tmp_path_factory.mktemp("robot"), robot(*parts)))
 
 
-def rollout(monkeypatch, switch, robot, ticks=20, **options):
+def rollout(monkeypatch, switch, robot, ticks=12, **options):
     """Return a rollout to seeded setpoints, or under seeded efforts, by native (1) or Python calls (0)."""
     monkeypatch.setenv(native.SWITCH, switch)
     rng = np.random.default_rng(3)
@@ -58,8 +58,14 @@ CASES = {
 
 @needs_extension
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", ["panda", "jaco2", "slider"])
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [
+        *(("panda", case) for case in CASES),
+        *(("jaco2", case) for case in ("tuned", "efforts, in contact")),
+        *(("slider", case) for case in ("tuned", "drive", "efforts, in contact", "without compensation")),
+    ],
+)
 def test_results_are_bit_identical(monkeypatch, name, case, slider):
     robot = slider if name == "slider" else load_bundled(name)
     ours, theirs = (rollout(monkeypatch, switch, robot, **CASES[case]) for switch in "10")

@@ -107,6 +107,7 @@ CASES = st.tuples(
 )
 
 
+@settings(max_examples=30)
 @given(CASES, st.booleans())
 def test_it_writes_to_nothing(case, coupled):
     arguments = a_step(case[0], case[1] or "effort", *case[2:], coupled)
@@ -120,6 +121,7 @@ def test_it_writes_to_nothing(case, coupled):
         np.testing.assert_array_equal(one, other)
 
 
+@settings(max_examples=30)
 @given(CASES, st.permutations(range(ENVS)))
 def test_envs_do_not_see_each_other(case, order):
     arguments = a_step(case[0], case[1] or "effort", case[2] - {"motors"}, case[3])
@@ -182,6 +184,7 @@ def test_every_executor_calls_it(panda, backend, monkeypatch):
     assert (len(calls) < 3) if in_one_program else (len(calls) == 3)
 
 
+@pytest.mark.usefixtures("quick_compilation")
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_a_program_of_xla_goes_on_from_a_snapshot_in_either_precision(panda, dtype):
     table = panda.settings.target + 0.01 * np.sin(np.arange(6.0))[:, None, None] - np.full((6, 2, 1), 0.012)

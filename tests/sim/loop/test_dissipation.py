@@ -57,7 +57,7 @@ def push(robot, efforts, seconds, physics="accurate", qvel=0.0, qpos=0.0, subste
 @pytest.mark.parametrize("physics", PRESETS)
 @pytest.mark.parametrize(("inertia", "friction"), [(0.1, 1.0), (10.0, 1.0), (1e-5, 0.1)])
 def test_a_joint_sticks_below_its_friction_and_moves_above_it(physics, inertia, friction, tmp_path):
-    seconds, efforts = 0.5, friction * np.array([0.95, -0.95, 0.0, 1.05, -1.2])
+    seconds, efforts = 0.25, friction * np.array([0.95, -0.95, 0.0, 1.05, -1.2])
     if inertia < 1e-3:
         seconds = 0.01  # then it is at PhysX's largest joint speed
     rollout = push(wheel(tmp_path, inertia, friction=friction), efforts, seconds, physics, substeps=1)
@@ -126,7 +126,7 @@ def test_damping_acts_as_the_equation_says_at_any_ratio_to_the_inertia(physics, 
     np.testing.assert_allclose(rollout.qpos[-1, 0, 0], position[-1], rtol=0.01)
 
 
-@pytest.mark.parametrize(("damping", "friction"), [(0.05, 0.0), (2.0, 0.0), (0.05, 0.3), (2.0, 0.3)])
+@pytest.mark.parametrize(("damping", "friction"), [(2.0, 0.0), (0.05, 0.3)])
 def test_both_solvers_agree_on_the_free_motion(damping, friction, tmp_path):
     robot, start = pendulum(tmp_path, 3, damping, friction), np.array([1.2, 0.4, -0.6])
     one, other = (push(robot, 0.0, 1.0, physics, qpos=start).qpos for physics in PRESETS)
@@ -134,7 +134,7 @@ def test_both_solvers_agree_on_the_free_motion(damping, friction, tmp_path):
     assert np.abs(one[-1] - start).max() > 0.05
 
 
-@pytest.mark.parametrize(("damping", "friction"), [(0.05, 0.0), (0.5, 0.1), (0.05, 0.3), (2.0, 0.3)])
+@pytest.mark.parametrize(("damping", "friction"), [(0.5, 0.1), (0.05, 0.3)])
 def test_mujoco_finds_the_same_motion(damping, friction, tmp_path):
     mujoco = pytest.importorskip("mujoco")
     robot, start = pendulum(tmp_path, 3, damping, friction), np.array([1.2, 0.4, -0.6])

@@ -52,20 +52,20 @@ def commands(robot, ticks, seed=0):
 
 
 def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
-    chosen, table = actuators(panda), commands(panda, 16)
+    chosen, table = actuators(panda), commands(panda, 12)
     with Runner(panda, N, workers=0, substeps=5, actuators=chosen) as runner:
-        first = runner.rollout(table[:8])
+        first = runner.rollout(table[:6])
         snapshot = runner.snapshot()
-        second = runner.rollout(table[8:])
+        second = runner.rollout(table[6:])
         runner.restore(snapshot)
-        assert_identical(second, runner.rollout(table[8:]))
-    snapshot.save(tmp_path / "at8.npz")
+        assert_identical(second, runner.rollout(table[6:]))
+    snapshot.save(tmp_path / "at6.npz")
     with Runner(panda, N, workers=2, substeps=5, actuators=chosen) as runner:
-        assert_identical(first, runner.rollout(table[:8]))
-        runner.restore(Snapshot.load(tmp_path / "at8.npz"))
-        assert_identical(second, runner.rollout(table[8:]))
+        assert_identical(first, runner.rollout(table[:6]))
+        runner.restore(Snapshot.load(tmp_path / "at6.npz"))
+        assert_identical(second, runner.rollout(table[6:]))
     with Runner(panda, 2, workers=0, substeps=5, actuators=chosen.for_envs(slice(2))) as runner:
-        assert_identical(first.for_envs(slice(2)), runner.rollout(table[:8, :2]))
+        assert_identical(first.for_envs(slice(2)), runner.rollout(table[:6, :2]))
 
 
 def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_packs(panda):
@@ -91,17 +91,17 @@ def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_p
 
 
 def test_a_lost_worker_leaves_no_trace(panda):
-    chosen, table = actuators(panda), commands(panda, 12)
+    chosen, table = actuators(panda), commands(panda, 6)
     other = actuators(panda, seed=1, command_delay=0.006, lag=None)
 
     def run(workers):
         with Runner(panda, N, workers=workers, actuators=chosen) as runner:
-            runner.rollout(table[:4])
+            runner.rollout(table[:2])
             runner.actuators = other
-            runner.rollout(table[4:8])
+            runner.rollout(table[2:4])
             for pid in runner.pids:
                 os.kill(pid, signal.SIGKILL)
-            return runner.rollout(table[8:])
+            return runner.rollout(table[4:])
 
     with pytest.warns(RecoveryWarning):
         lost = run(1)

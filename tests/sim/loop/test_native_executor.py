@@ -34,7 +34,7 @@ def params_of(robot, case):
     return robot.params(**CASES[case]) if CASES[case] else None
 
 
-def rollout(robot, ticks=40, rates=False, forward=False, **options):
+def rollout(robot, ticks=20, rates=False, forward=False, **options):
     rng = np.random.default_rng(0)
     middle = np.clip(robot.settings.target, robot.lower + 0.05, robot.upper - 0.05)
     path = np.clip(middle + np.cumsum(0.01 * rng.normal(size=(ticks, N, robot.dof)), 0), robot.lower, robot.upper)
@@ -44,9 +44,18 @@ def rollout(robot, ticks=40, rates=False, forward=False, **options):
         return runner.rollout(path, **more)
 
 
-@pytest.mark.parametrize("more", [{}, {"rates": True, "forward": True}, {"guard": True}], ids=str)
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
+AHEAD, GUARD = {"rates": True, "forward": True}, {"guard": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "more"),
+    [
+        *(("panda", case, {}) for case in CASES),
+        *(("jaco2", case, AHEAD) for case in CASES),
+        *(("panda", "tuned", GUARD), ("jaco2", "implicit", GUARD), ("panda", "without units", AHEAD)),
+    ],
+    ids=str,
+)
 def test_the_motion_is_that_of_numpy(name, case, more, monkeypatch):
     robot = load_bundled(name)
     options = {"params": params_of(robot, case), **more}
@@ -57,6 +66,7 @@ def test_the_motion_is_that_of_numpy(name, case, more, monkeypatch):
     np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(ours.saturated, theirs.saturated)
     np.testing.assert_array_equal(ours.guarded, theirs.guarded)
+    assert theirs.guarded.any() == ("guard" in more)
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])

@@ -118,7 +118,7 @@ def spec_of(robot, **options):
 @pytest.mark.parametrize("merge_fixed", [True, False])
 @pytest.mark.parametrize("name", TEXTS)
 def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
-    robot = load(TEXTS[name], merge_fixed=merge_fixed)
+    robot = load(TEXTS[name], merge_fixed=merge_fixed, self_collision="none")
     model = mujoco.MjModel.from_xml_string(TEXTS[name])
     data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     joints = [3 if each == "joint3" else model.joint(each).id for each in robot.joint_names]  # that has no name
@@ -227,7 +227,7 @@ def reach_of(model, data):
 
 
 def test_shapes_are_where_they_are_in_the_file(load):
-    robot = load(ARM)
+    robot = load(ARM, self_collision="none")
     built = robot_model(spec_of(robot))
     original = mujoco.MjModel.from_xml_string(ARM)
     reach = []
@@ -375,7 +375,7 @@ def test_a_pid_has_an_integral_and_may_have_several_inputs(load):
         rest="""<actuator><pid joint="j" kp="5" kv="1" ki="3" imax=".5" gear="2" input="pos vel ff"/>
         <motor joint="j" gear="3" ctrlrange="-2 2" delay="0.01" nsample="9"/></actuator>"""
     )
-    robot = load(text)
+    robot = load(text, self_collision="none")
     gains = robot.mjcf_gains()
     figures = gains.kp, gains.ki, gains.kd, gains.integral_max
     np.testing.assert_array_equal(np.ravel(figures), [20, 12, 4, 3])
@@ -464,7 +464,7 @@ def test_armature_and_damping_of_actuators(load):
 
 
 def test_floating_base(load):
-    fixed, floating = load(WALKER), load(WALKER, fixed_base=False)
+    fixed, floating = load(WALKER), load(WALKER, fixed_base=False, self_collision="none")
     assert fixed.dof == floating.dof == 2
     assert ["joint-type" in {each.code for each in robot.repairs} for robot in (fixed, floating)] == [True, False]
     assert {each.link for each in fixed.repairs if each.code == "loose-link"} == {"ball", "goal"}

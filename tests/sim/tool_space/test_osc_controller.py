@@ -58,8 +58,10 @@ def pose_of(of, qpos, name):
     return ts.link_poses(of.kinematic_tree(), qpos, [name])[..., 0, :]
 
 
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-@pytest.mark.parametrize("name", ["panda", "six_joints", "with_friction"])
+@pytest.mark.parametrize(
+    ("name", "engine"),
+    [("panda", "sapien"), ("six_joints", "mujoco"), ("with_friction", "sapien"), ("with_friction", "mujoco")],
+)
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are compensated."""
     if engine == "mujoco":
@@ -67,7 +69,7 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     of = request.getfixturevalue(name)
     tool, start = (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
     control = OperationalSpace(of, tool, twist=True, acceleration=True, stiffness=400.0)
-    at, ticks, dt = pose_of(of, start, tool), 130, 1 / 100
+    at, ticks, dt = pose_of(of, start, tool), 100, 1 / 100
     phase = np.pi * dt * np.arange(1, ticks + 1)
     setpoints = np.tile(np.concatenate([at, np.zeros(12)]), (ticks, 1))
     ahead = 0.5 * np.pi * dt  # a setpoint is held for a tick: its middle is that of the motion
@@ -129,14 +131,17 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     np.testing.assert_allclose(rollout.qpos[-1, 0, 7:], [panda.start[7], 0.035], atol=1e-3)
 
 
-def test_xla_computes_the_same(panda):
-    control = OperationalSpace(panda, HAND, joints=["panda_finger_joint1"], twist=True)
-    setpoint = control.command.neutral + np.eye(14)[1] * 0.02
+@pytest.mark.usefixtures("quick_compilation")
+def test_xla_computes_the_same(six_joints):
+    start = np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1])
+    control = OperationalSpace(six_joints, "l6", twist=True)
+    setpoint = np.concatenate([pose_of(six_joints, start, "l6"), np.zeros(6)]) + np.eye(13)[1] * 0.02
     ends = []
     for backend in ("numpy", "jax"):
-        with Runner(panda, 1, control=control, backend=backend, **OPTIONS) as runner:
-            runner.reset(START)
-            ends.append(runner.rollout(np.broadcast_to(setpoint, (10, 14))).qpos[-1])
+        with Runner(six_joints, 1, control=control, backend=backend, **OPTIONS) as runner:
+            runner.reset(start)
+            ends.append(runner.rollout(np.broadcast_to(setpoint, (10, 13))).qpos[-1])
+    assert np.abs(ends[0] - start).max() > 1e-3
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
 
 
@@ -208,8 +213,8 @@ def test_control_osc_moves_a_link(panda):
     np.testing.assert_allclose(pose_of(panda, rollout.qpos[-1], HAND)[:, :3], np.tile(goal[:3], (2, 1)), atol=2e-3)
     with Runner(panda, 2, control=OperationalSpace(panda, HAND), **OPTIONS) as runner:
         runner.reset(START)
-        again = runner.rollout(np.broadcast_to(goal, (80, 7)))
-    np.testing.assert_array_equal(rollout.qpos, again.qpos)
+        again = runner.rollout(np.broadcast_to(goal, (20, 7)))
+    np.testing.assert_array_equal(rollout.qpos[:20], again.qpos)
     with Runner(panda, 1, control="osc", workers=0) as runner:  # the hand, and not a finger
         np.testing.assert_allclose(runner.command.neutral, pose_of(panda, panda.start, HAND))
 
@@ -275,14 +280,19 @@ MORE = [
 ]
 
 
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-@pytest.mark.parametrize(("case", "more"), [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)])
+ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
+
+
+@pytest.mark.parametrize(
+    ("engine", "case", "more"),
+    [*(("sapien", *each) for each in ALL), *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[8]))],
+)
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(request, engine, case, more):
     """Also with resets, an env that fails, a snapshot and setpoints that change."""
     if engine == "mujoco":
         pytest.importorskip("mujoco")
-    options, seen = {"substeps": 20, "workers": 0, "engine": engine, **more}, []
+    options, seen = {"substeps": 10, "workers": 0, "engine": engine, **more}, []
     arm, link = request.getfixturevalue(options.pop("arm", "panda")), options.pop("link", HAND)
     noise = 0.05 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
     starts = (START + noise)[:, : arm.dof]

@@ -90,7 +90,7 @@ def test_workers_outlive_the_thread_that_made_them(panda):
     ("body", "status"),
     [
         ("raise RuntimeError('the caller')", 1),
-        ("sys.exit(7)", 7),
+        pytest.param("sys.exit(7)", 7, marks=pytest.mark.slow),  # the interpreter ends as with an error
         pytest.param("runner.close(); runner.close(); sys.exit(3)", 3, marks=pytest.mark.slow),
         ("import os; os._exit(9)", 9),
         ("runner.step(robot.settings.target); del runner; print('end')", 0),
@@ -123,7 +123,7 @@ def test_a_forked_child_does_not_end_the_workers_of_its_parent():
     assert have_ended(pids)
 
 
-@pytest.mark.parametrize("kind", ["stdin", "script", "thread"])
+@pytest.mark.parametrize("kind", ["stdin", pytest.param("script", marks=pytest.mark.slow), "thread"])
 def test_programs_need_no_main_guard(kind, tmp_path):
     text = PROGRAM.format(body="print(runner.step(robot.settings.target).ok.all(), len(runner.pids))", workers=1)
     if kind == "thread":

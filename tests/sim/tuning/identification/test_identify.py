@@ -68,6 +68,14 @@ def runs(arm, mujoco_log):
     return truth, as_log(arm, table, "setpoint"), as_log(arm, table, "effort")
 
 
+@pytest.fixture
+def short_search(monkeypatch):
+    """The search has few steps: one hypothesis of the compensation, one generation, short fits of neighbours."""
+    monkeypatch.setattr("batchpid.sim.identification.regression.hypotheses", lambda drive, payload: [drive])
+    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
+
+
 def error_of_the_export(found, log: Log, params: bp.PIDParams, dt: float) -> float:
     """Return the error on the held-out rows of the identified motors as MJCF, in MuJoCo under the law [rad].
 
@@ -265,11 +273,12 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
     assert np.array_equal(shaken[~of_elbow], known[~of_elbow])
 
 
+@pytest.mark.usefixtures("short_search")
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
     time, qpos, command = (table[:210] for table in (setpoints.time, setpoints.qpos, setpoints.command))
     log = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
-    options = {"params": arm.designed("effort"), "timestep": DT, "workers": 0, "payload": False, "evaluations": 6}
+    options = {"params": arm.designed("effort"), "timestep": DT, "workers": 0, "payload": False, "evaluations": 3}
     seen = []
     whole = identify(arm, log, **options, progress=lambda steps: (seen.append(step) or step for step in steps))
 
@@ -291,6 +300,7 @@ def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
         identify(arm, log, **options, seed=1, history=history)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path):
     _, setpoints, _ = runs
     time, qpos, command = (table[:210] for table in (setpoints.time, setpoints.qpos, setpoints.command))
@@ -336,6 +346,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(arm, runs):
     assert np.array_equal(alone.uncertainty.deviation, shared.uncertainty.deviation)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_a_log_that_no_robot_could_have_made_is_refused(runs, tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.replace("revolute", "continuous"))
     arm, log = Robot.load(tmp_path / "arm.urdf"), runs[1]

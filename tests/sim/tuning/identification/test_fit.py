@@ -1,0 +1,40 @@
+"""The count of evaluations of a fit, on a problem of linear residuals."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from batchpid.sim.identification.fit import Step, fit
+from batchpid.sim.identification.problem import Evaluation
+
+TIME = np.linspace(0, 1, 8)
+JACOBIAN = np.stack([np.ones(8), TIME], axis=-1)[:, None]
+
+
+class Line:
+    """Rows 5 + t - (offset + slope t), whose best offset lies beyond its bound of 1."""
+
+    unknowns = SimpleNamespace(scale=np.ones(2), spread=1e3 * np.ones(2), low=-np.ones(2), high=np.ones(2), prior=0.0)
+    stretches, count = [[np.arange(8)]], 8
+
+    def evaluate(self, theta):
+        rows = (5 + TIME - JACOBIAN[:, 0] @ theta)[:, None]
+        return [Evaluation(rows, rows, JACOBIAN, np.zeros((1, 1)))]
+
+    def sizes(self, white):
+        return np.sqrt(np.mean(np.square(white), axis=1))
+
+    def costs(self, sizes, determinants):
+        return np.log(sizes)
+
+
+@pytest.mark.parametrize("evaluations", range(1, 6))
+def test_a_fit_at_a_bound_leaves_no_less_than_no_evaluation(evaluations):
+    steps = []
+    found = fit(Line(), Step.first(np.array([1.0, 0.0]), evaluations), lambda step, _: steps.append(step))
+    assert len(steps) > 1
+    assert min(step.left for step in steps) >= 0
+    again = fit(Line(), steps[-1])  # as from a history
+    assert (again.theta == found.theta).all()
+    assert again.cost == found.cost
