@@ -64,14 +64,9 @@ ACTUATOR_FLOORS = {
 
 @pytest.fixture
 def check(most):
-    """Function that fails unless one of a few runs of ``measure`` has every ratio at its floor or above.
-
-    In a smoke run one robot is enough: test_throughput.py and test_few_robots.py measure the same cases of both.
-    """
+    """Function that fails unless one of a few runs of ``measure`` has every ratio at its floor or above."""
 
     def check(label, measure):
-        if not (most.floors or "panda, fast" in label):
-            pytest.skip("measured by other smoke runs")
         for _ in range(ATTEMPTS):
             found = measure()
             print(f"\n{label}: " + ", ".join(f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()))

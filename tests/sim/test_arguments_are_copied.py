@@ -145,22 +145,6 @@ def test_options_of_a_runner_are_copies():
 
 
 INPUTS = ("setpoint", "measurement", "measurement_rate", "setpoint_rate", "feedforward")
-
-
-@pytest.fixture(scope="module")
-def quick():
-    """Let JAX compile with few optimisations; of the module, as a property may not have a fixture of each test."""
-    try:
-        import jax
-    except ImportError:  # the rows of NumPy run without it
-        yield
-        return
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()
-
-
 LAWS = {
     "plain": {},
     "all": {
@@ -177,7 +161,6 @@ LAWS = {
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("backend", ["numpy", "jax"])
-@pytest.mark.usefixtures("quick")
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), rates=st.booleans(), data=st.data())
 def test_a_controller_keeps_nothing_of_the_callers(law, backend, seed, rates, data):
