@@ -91,7 +91,7 @@ def test_errors_are_of_the_documented_order_of_magnitude(name):
         "contact": (1.0, 5e-2),
         "limit": (2e-2, 1e-3),
     }
-    errors = {motion: accuracy.measure_errors(robot, motion, count=4) for motion in bounds}
+    errors = {motion: accuracy.measure_errors(robot, motion, count=2) for motion in bounds}
     for motion, (largest, rms) in bounds.items():
         for case, error in errors[motion].items():
             assert 1e-6 < error.rms < rms, (motion, case)

@@ -187,7 +187,7 @@ def simulated_once(monkeypatch):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_disk_with_any_space_left_keeps_the_older_file_or_holds_the_new_one(name, command, tmp_path, monkeypatch):
     statuses = set()
-    for free in (*range(0, 9 * 4096, 4096), *np.geomspace(65536, 12e6, 6).astype(int)):
+    for free in (*range(0, 9 * 4096, 2 * 4096), *np.geomspace(65536, 12e6, 4).astype(int)):
         with small_disk(tmp_path / "disk", 1 << 24) as disk:
             statuses.add(run_while_filling(command, name, disk, int(free), monkeypatch))
     assert statuses == {0, 2}

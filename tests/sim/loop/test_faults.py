@@ -18,7 +18,7 @@ PANDA = load_bundled("panda")
 N = 6
 OVERFLOW = 1e38
 """Effort [N m or N] that is finite, and makes the engine's state infinite or NaN in one sim step."""
-CASES = int(os.environ.get("BATCHPID_SOAK_FAULTS", "200"))
+CASES = int(os.environ.get("BATCHPID_SOAK_FAULTS", "100"))
 
 
 def setpoints(ticks, num_envs=N, seed=0):

@@ -24,7 +24,7 @@ pytestmark = [*FILTERS, pytest.mark.slow]
 TICKS = 700
 MACHINE_KILLS, PROCESS_KILLS, SEEDS = (
     int(os.environ.get(f"BATCHPID_SOAK_{name}", count))
-    for name, count in (("MACHINE_KILLS", 10), ("PROCESS_KILLS", 5), ("SEEDS", 6))
+    for name, count in (("MACHINE_KILLS", 5), ("PROCESS_KILLS", 4), ("SEEDS", 3))
 )
 
 
