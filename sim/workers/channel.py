@@ -59,6 +59,7 @@ class Channel:
     def close(self) -> None:
         """Close this end."""
         self._socket.close()
+        self._on_wait = None  # it may refer to the channel's owner, whose files a cycle would keep open
 
     def _read(self, count: int) -> bytes:
         parts, missing = [self._unread], count - len(self._unread)
@@ -84,5 +85,5 @@ class Channel:
     def _wait(self, event: int) -> None:
         poll = select.poll()
         poll.register(self._socket, event)
-        if not poll.poll(1e3 * _WAIT_INTERVAL) and self._on_wait is not None:
-            self._on_wait()
+        if not poll.poll(1e3 * _WAIT_INTERVAL) and (on_wait := self._on_wait) is not None:
+            on_wait()

@@ -213,6 +213,7 @@ class ProcessWorker(Worker):
     def close(self, patience: float) -> None:
         if self._opening is not None and not self._opening.done and not sys.is_finalizing():
             BACKGROUND.call(lambda: None)  # the call that opened it was interrupted
+        self._opening = None  # it refers to this worker, whose files a cycle would keep open
         if self._process is None:
             return
         self._channel.close()

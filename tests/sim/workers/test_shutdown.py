@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -144,3 +145,21 @@ def test_programs_need_no_main_guard(kind, tmp_path):
     )
     assert done.stdout.splitlines()[-1] == "True 1", done.stderr
     assert have_ended([int(pid) for pid in done.stdout.splitlines()[0].split()])
+
+
+def test_a_closed_runner_keeps_no_pipe_or_socket_of_its_workers(panda):
+    def pipes_and_sockets():
+        links = (os.readlink(path) for path in Path("/proc/self/fd").iterdir() if path.is_symlink())
+        return sorted(link for link in links if link.startswith(("pipe:", "socket:")))
+
+    Runner(panda, 2, workers=2).close()  # starts what stays, such as the server that forks workers
+    gc.collect()
+    before = pipes_and_sockets()
+    gc.disable()
+    try:
+        runner = Runner(panda, 2, workers=2)
+        assert pipes_and_sockets() != before
+        runner.close()
+        assert pipes_and_sockets() == before
+    finally:
+        gc.enable()
