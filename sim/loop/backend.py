@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import batchpid as bp
+from batchpid.native.operations import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import xla
+from batchpid.sim.loop.acting_draws import acting_actuators
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.fields import MASSES
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
@@ -19,6 +22,14 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
         return "the guard of setpoints is in NumPy"
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"
+    if reason := _engine_obstacle(options):
+        return reason
+    status = xla.status()
+    return "" if status.active else status.reason
+
+
+def _engine_obstacle(options: RunnerOptions) -> str:
+    """Return why native steps of the engine do not read the passive force, or nothing."""
     engine = options.load_engine()
     if "compiled_steps" not in engine.capabilities:
         return f"the sim steps of {engine.name!r} are calls of Python"
@@ -27,8 +38,27 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
             return f"{engine.title} needs NumPy for the passive force of a floating base"
         if "coriolis" not in options.compensate:
             return f"{engine.title} needs NumPy for gravity without Coriolis forces"
-    status = xla.status()
-    return "" if status.active else status.reason
+    return ""
+
+
+def native_obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
+    """Return why the sim steps of a tick cannot be one native call, under backend "numpy"; or nothing."""
+    control, randomization = options.control, options.randomization
+    if options.robot.coupling is not None:
+        return "coupled joints take constraint efforts of NumPy"
+    if isinstance(control, OperationalSpace):
+        if not control.is_native:
+            return "task space takes the compensation of friction, or a subclass' law, from NumPy"
+    elif not isinstance(control, str):
+        return "the controller is one of Python"
+    if options.robot.dof > MOST_SUMMED:
+        return f"more than {MOST_SUMMED} joints"
+    acting = acting_actuators(options, actuators, None)
+    if acting is not None and acting.measures:
+        return "sensors take noise and passive force of NumPy"
+    if "gravity" in options.compensate and randomization is not None and MASSES & randomization.given.keys():
+        return "the passive force of varied masses is NumPy's"
+    return _engine_obstacle(options)
 
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
@@ -38,10 +68,11 @@ def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     if options.control == "drive":
         return f"law in {engine} (control 'drive'), {calls}"
     if options.backend == "numpy":
-        compiled = (
-            options.control == "pid" or isinstance(options.control, OperationalSpace)
-        ) and native.status().active
-        return f"law {'as a native program' if compiled else 'in NumPy'}, {calls}"
+        active = native.status().active
+        compiled = active and (options.control == "pid" or isinstance(options.control, OperationalSpace))
+        reason = native_obstacle(options, actuators) if active else ""
+        each = f", a call each sim step ({reason})" if reason else ""
+        return f"law {'as a native program' if compiled else 'in NumPy'}{each}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"
     if not reason:

@@ -26,6 +26,8 @@ PHYSICAL = {
     "armature": Bounds("kg m^2 or kg"),
 }
 """Fields that change the simulated robot."""
+MASSES = frozenset({"payload", "link_mass", "center_of_mass"})
+"""Those by which its masses differ from the model."""
 START = {"qpos": Bounds("rad or m", low=-np.inf), "qvel": Bounds("rad/s or m/s", low=-np.inf)}
 """Fields that change the state at a reset."""
 GROUPS = ("params", "actuators")

@@ -195,9 +195,14 @@ class OperationalSpace:
         new, effort = ts.advance(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
         return new._replace(posture=state.posture), effort
 
+    @property
+    def is_native(self) -> bool:
+        """Whether native code has this law: not that of a subclass, and not with compensation of friction."""
+        return type(self) is OperationalSpace and self._friction is None
+
     def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:
         """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
-        if type(self) is not OperationalSpace or self._friction is not None or native_rows.in_use() is None:
+        if not self.is_native or native_rows.in_use() is None:
             return None
         tool = self.tree, self.link, self.point
         given = self._parts, self._columns, self._damping, self._timestep

@@ -19,6 +19,7 @@ from batchpid.sim.loop import native_executor, tick_program
 from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
+from batchpid.sim.loop.tick_program import TickProgram
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
 N = 3
@@ -246,3 +247,36 @@ def test_control_steps_that_are_a_program(panda):
                 runner.step(panda.settings.target)
             programs |= {case} if executors[-1] else set()
     assert programs == cases.keys() - {"integral", "controller"}
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({}, ""),
+        ({"control": "effort"}, ""),
+        ({"actuators": bp.make_actuators(9, strength=0.9, viscous=0.1)}, ""),
+        ({"actuators": bp.make_actuators(9, position_noise=1e-4)}, "sensors"),
+        ({"randomization": Randomization(friction=Uniform(0.1, 0.2))}, ""),
+        ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, "varied masses"),
+        ({"control": Rest()}, "the controller is one of Python"),
+        ({"control": "osc", "tool": "panda_hand"}, ""),
+        ({"control": "osc", "tool": "panda_hand", "actuators": bp.make_actuators(9, position_noise=1e-4)}, "sensors"),
+    ],
+    ids=["pid", "effort", "motors", "sensors", "friction", "masses", "controller", "tool", "tool with sensors"],
+)
+def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, panda, monkeypatch):
+    """Runs of the program, of the whole tick or of one sim step, are counted."""
+    spans, run = [], TickProgram.run
+
+    def counted(self, step, begin, until, end):
+        spans.append(until - begin)
+        return run(self, step, begin, until, end)
+
+    monkeypatch.setattr(TickProgram, "run", counted)
+    with Runner(panda, 2, workers=0, **options) as runner:
+        begin = runner.reset()
+        runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=10)
+        assert (spans == [10]) == (not reason)
+        assert ("a call each sim step (" in runner.backend) == bool(reason)
+        assert reason in runner.backend
