@@ -27,7 +27,7 @@ limits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -251,3 +251,48 @@ class NativeMassMatrix:
         out = np.empty((*rows.shape, rows.shape[1]))
         self._native.mass_matrices(*self._bodies, rows, out, *rows.shape)
         return out
+
+
+class NativePassiveForce:
+    """Passive forces of the robot of ``spec``, on a fixed base, at given states, by the extension."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self._spec, self._native = spec, native.extension("_batch_dynamics")
+
+    @cached_property
+    def _tree(self) -> Any:
+        bodies = scene_dynamics(self._spec).bodies
+        dof = len(bodies.tree)
+        everyone = np.arange(dof, dtype=np.int32), np.ones(dof), np.zeros(dof)
+        return self._native.tree(
+            bodies.tree, bodies.table(), *everyone, dof, dof, 0, (0.0, 0.0, 0.0), self._spec.gravity
+        )
+
+    def __call__(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
+        """Return the efforts (M, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal forces."""
+        force = self._computed(qpos, qvel if coriolis else np.zeros_like(qvel))
+        return force if gravity else force - self._computed(qpos, np.zeros_like(qvel))
+
+    def _computed(self, qpos: Float64, qvel: Float64) -> Float64:
+        rows, dof = qpos.shape
+        force, state = np.empty((rows, dof)), (np.ascontiguousarray(each, np.float64) for each in (qpos, qvel))
+        self._native.dynamics(
+            self._tree, *state, np.zeros((rows, 1)), np.empty((rows, dof, dof)), force, np.empty((rows, dof))
+        )
+        return force
+
+
+def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Float64, bool, bool], Float64]:
+    """Return the function of positions, velocities, gravity and coriolis that computes a robot's passive forces.
+
+    ``natively`` says whether the extension is used; then every executor takes them from it, since the engines' differ
+    in the last bits.
+    """
+    if natively and spec.fixed_base:
+        return NativePassiveForce(spec)
+
+    @cache  # looked up once: the hash of a spec takes many calls
+    def dynamics() -> RobotModel:
+        return scene_dynamics(spec)
+
+    return lambda qpos, qvel, gravity, coriolis: dynamics().passive_force(qpos, qvel, gravity, coriolis)

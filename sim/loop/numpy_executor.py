@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import ControllerError
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
-from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
+from batchpid.sim.engine.batch_dynamics import NativeMassMatrix, passive_force_of
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
 from batchpid.sim.loop.arrays import Command
@@ -125,9 +125,8 @@ def with_model(
     if motors is not None:
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if gravity:
-        dynamics = cache(lambda: scene_dynamics(pack.spec))  # looked up once: the hash of a spec takes many calls
-        force = lambda qpos, qvel: dynamics().passive_force(qpos, qvel, gravity, coriolis)  # noqa: E731
-        model = model._replace(passive_force=force)
+        force = passive_force_of(pack.spec, _is_native(pack))
+        model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, gravity, coriolis))
     return layout._replace(model=model)
 
 
@@ -140,7 +139,7 @@ def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
 
     If the extension is used, every executor takes the mass matrix from it, since Pinocchio's differs in the last bits.
     """
-    if isinstance(pack, CompiledPack) and pack.steps_natively:
+    if _is_native(pack):
         return NativeMassMatrix(pack.spec)
 
     @cache
@@ -148,6 +147,10 @@ def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
         return scene_dynamics(pack.spec)
 
     return lambda qpos: dynamics().mass_matrix(qpos)
+
+
+def _is_native(pack: EnginePack) -> bool:
+    return isinstance(pack, CompiledPack) and pack.steps_natively
 
 
 def _joint_mass_matrix(pack: EnginePack, qpos: Float64) -> Float64:

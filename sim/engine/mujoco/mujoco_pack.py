@@ -6,7 +6,7 @@ Longer than 300 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine import native
+from batchpid.sim.engine.batch_dynamics import passive_force_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.batch_model import FLOATING, BatchModel, set_inertia
@@ -124,12 +125,12 @@ class MujocoPack(SingleOwner):
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
+        if self.spec.fixed_base:
+            return self._passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis).astype(dtype)
         force = np.zeros((self.size, self.dof))
-        base = still = None
-        if not self.spec.fixed_base:
-            rows = [(data.qpos[: FLOATING + 1], data.qvel[:FLOATING]) for data in self._data]
-            base = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-            still = base[0], np.zeros_like(base[1])
+        rows = [(data.qpos[: FLOATING + 1], data.qvel[:FLOATING]) for data in self._data]
+        base = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+        still = base[0], np.zeros_like(base[1])
         if coriolis:
             self._model.compute(self.read_qpos(), self.read_qvel(), base)
             force += self._model.joint_bias()
@@ -137,6 +138,10 @@ class MujocoPack(SingleOwner):
             self._model.compute(self.read_qpos(), 0.0, still)
             force += self._model.joint_bias() if gravity else -self._model.joint_bias()
         return force.astype(dtype) if gravity or coriolis else np.zeros_like(force, dtype)
+
+    @cached_property
+    def _passive_force(self) -> Callable[..., Float64]:
+        return passive_force_of(self.spec, self.steps_natively)
 
     @cached_property
     def _model(self) -> BatchModel:

@@ -8,7 +8,7 @@ with one exception: a new center of mass moves the frames of the joints by round
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from sapien import Pose
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
+from batchpid.sim.engine.batch_dynamics import passive_force_of
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
@@ -93,6 +94,10 @@ class VariedPack(Pack):
     def _dynamics(self) -> Dynamics:
         return scene_dynamics(self.spec)
 
+    @cached_property
+    def _passive_force(self) -> Callable[..., Float64]:
+        return passive_force_of(self.spec, self.steps_natively)
+
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         return self._dynamics.joint_mass_matrix(qpos, self._added)
 
@@ -104,5 +109,4 @@ class VariedPack(Pack):
         """Return the passive force of the model at the measured positions."""
         if not self._bodies:
             return super().passive_force(gravity, coriolis, dtype)
-        force = self._dynamics.passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis)
-        return force.astype(dtype)
+        return self._passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis).astype(dtype)

@@ -12,7 +12,7 @@ from robots import load_bundled
 import batchpid as bp
 from batchpid.sim import Randomization, Runner, Uniform
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
+from batchpid.sim.engine.batch_dynamics import NativeMassMatrix, NativePassiveForce
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop import native_executor, tick_program
@@ -76,6 +76,21 @@ def test_the_mass_matrix_is_that_of_the_model(name):
     poses = robot.sample(50, seed=0)
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
     np.testing.assert_allclose(NativeMassMatrix(spec)(poses), robot.dynamics().mass_matrix(poses), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("parts", [(True, True), (True, False), (False, True)], ids=str)
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_the_passive_force_is_that_of_the_model(name, parts):
+    robot = load_bundled(name)
+    poses, rates = robot.sample(21, seed=0), np.random.default_rng(0).normal(size=(21, robot.dof))
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
+    force = NativePassiveForce(spec)(poses, rates, *parts)
+    wanted = robot.dynamics().passive_force(poses, rates, *parts)
+    assert np.abs(wanted).max() > 0.01
+    np.testing.assert_allclose(force, wanted, rtol=1e-5, atol=1e-6)  # SAPIEN's model is float32
+    for row in range(21):
+        alone = NativePassiveForce(spec)(poses[row : row + 1], rates[row : row + 1], *parts)
+        np.testing.assert_array_equal(alone[0], force[row])
 
 
 def test_an_env_that_is_reset_changes_no_other(panda):
