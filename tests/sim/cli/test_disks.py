@@ -156,7 +156,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
     return status
 
 
-@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", "plot", "render"])
+@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", pytest.param("plot", marks=pytest.mark.slow), "render"])
 def test_a_disk_that_fills_up_during_the_run_keeps_the_older_file(name, command, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 1 << 16) as disk:
         assert run_while_filling(command, name, disk, 0, monkeypatch) == 2

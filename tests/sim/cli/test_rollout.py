@@ -83,7 +83,7 @@ def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
 
 
 def test_the_default_gains_settle_and_the_tutorial_s_do_not(batchpid):
-    flags = ("--num-envs", 3, "--workers", 0, "--seconds", 1.2)
+    flags = ("--num-envs", 1, "--workers", 0, "--seconds", 1.2)
     assert "Every joint of every env settled" in batchpid("rollout", *flags)[1]
     assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "tutorial")[1]
 
@@ -151,6 +151,7 @@ def test_bad_flags_are_named(flags, message, batchpid):
     assert err.startswith(f"batchpid: {message}")
 
 
+@pytest.mark.slow
 def test_picture(batchpid, tmp_path):
     path = tmp_path / "run.svg"
     assert batchpid("rollout", *SHORT, "--picture", path)[0] == 0

@@ -32,6 +32,7 @@ def few_moves(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_tune_resumes_an_interrupted_search_and_writes_params_with_settings_and_metrics(
     batchpid, tmp_path, monkeypatch
 ):
@@ -120,6 +121,7 @@ def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch
     np.testing.assert_array_equal(found.params.kp, found.start_params.kp)
 
 
+@pytest.mark.slow
 def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     robot = load_bundled("panda")
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)

@@ -45,13 +45,26 @@ def reference(name="jaco2", physics="accurate", engine="sapien"):
     return thrash(name, physics=physics, engine=engine, **({"pack_size": 1} if engine == "sapien" else {}))
 
 
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
-@pytest.mark.parametrize("options", [{"pack_size": 8}, {"pack_size": 4, "workers": 2}], ids=str)
+PACKED, SHARED = {"pack_size": 8}, {"pack_size": 4, "workers": 2}
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "physics"),
+    [
+        (SHARED, "jaco2", "accurate"),
+        (PACKED, "panda", "fast"),
+        *(pytest.param(SHARED, *each, marks=pytest.mark.slow) for each in (("jaco2", "fast"), ("panda", "accurate"))),
+        *(pytest.param(PACKED, "jaco2", each, marks=pytest.mark.slow) for each in ("accurate", "fast")),
+        pytest.param(PACKED, "panda", "accurate", marks=pytest.mark.slow),
+        pytest.param(SHARED, "panda", "fast", marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
 def test_any_packing_and_workers_are_bit_identical(name, physics, options):
     assert_identical(thrash(name, physics=physics, **options), reference(name, physics))
 
 
+@pytest.mark.slow
 def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     """Otherwise the tests of this module could not fail."""
     monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *_: False)
@@ -59,7 +72,7 @@ def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     assert (shared.qpos != thrash(pack_size=1, physics="fast").qpos).any((0, 2)).sum() > 2
 
 
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
+@pytest.mark.parametrize("name", [pytest.param("jaco2", marks=pytest.mark.slow), "panda"])
 def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name):
     robot = load_bundled(name)
     poses = robot.sample(N, seed=1)
@@ -114,6 +127,7 @@ def closed_hand(robot):
     return pose
 
 
+@pytest.mark.slow
 def test_robots_that_start_in_contact_are_isolated_and_bit_identical(jaco2, packs):
     def start(runner):
         runner.reset(closed_hand(jaco2))
@@ -122,21 +136,22 @@ def test_robots_that_start_in_contact_are_isolated_and_bit_identical(jaco2, pack
     assert_identical(*(thrash(pack_size=size, before=start) for size in (1, 8)))
 
 
-def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
+@pytest.mark.parametrize("closed", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_an_episode_does_not_depend_on_the_episodes_before_it(closed, jaco2, packs):
     """A reset discards the order of earlier contacts, too."""
-    for start, isolated in ((jaco2.start, 0), (closed_hand(jaco2), N)):
-        with Runner(jaco2, N, control="effort", params=jaco2.params(**OPEN_LOOP), workers=0) as runner:
-            episodes = []
-            for _ in range(2):
-                runner.reset(start)
-                assert packs.isolated() == isolated
-                episodes.append(runner.rollout(random_efforts(jaco2)))
-                assert packs.isolated() > 0
-        assert_identical(*episodes, skip=["time"])
+    start, isolated = (closed_hand(jaco2), N) if closed else (jaco2.start, 0)
+    with Runner(jaco2, N, control="effort", params=jaco2.params(**OPEN_LOOP), workers=0) as runner:
+        episodes = []
+        for _ in range(2):
+            runner.reset(start)
+            assert packs.isolated() == isolated
+            episodes.append(runner.rollout(random_efforts(jaco2)))
+            assert packs.isolated() > 0
+    assert_identical(*episodes, skip=["time"])
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
+@pytest.mark.parametrize("name", [pytest.param("jaco2", marks=pytest.mark.slow), "panda"])
 def test_robots_in_free_motion_share_systems(name, packs):
     robot = load_bundled(name)
     with Runner(robot, 8, params=robot.params(), workers=0) as runner:
@@ -186,6 +201,7 @@ def test_a_snapshot_in_contact_is_the_same_barrier_for_any_packing(jaco2):
         assert_identical(runner.rollout(effort[TICKS:]), first)
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_contact_is_replaced_bit_identically():
     def wait(runner):
         runner.rollout(np.zeros((1, N, runner.robot.dof)))

@@ -160,7 +160,7 @@ def test_a_region_ends_where_a_joint_has_moved_by_its_weight():
     assert regions.left(qpos) == []
 
 
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
+@pytest.mark.parametrize("physics", ["accurate", pytest.param("fast", marks=pytest.mark.slow)])
 def test_regions_change_no_prediction(physics, panda, monkeypatch):
     """Limp robots that fall, looked at in every step and only where they leave their regions."""
     spec = SceneSpec(panda.urdf, panda.srdf, panda.joints, DT, PHYSICS[physics])
@@ -303,6 +303,7 @@ def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
     pack.close()
 
 
+@pytest.mark.slow
 def test_isolation_before_contact_does_not_change_the_path(panda, packs, monkeypatch):
     """A robot that is rebuilt in contact would lose the engine's contact cache."""
     moves, runs = load_script("accuracy").contact_moves(panda, 2), []

@@ -36,7 +36,13 @@ def moved(pack: Pack, reference: Pack, qpos: np.ndarray, steps: int = 2000) -> n
     return np.array(positions)
 
 
-@pytest.mark.parametrize(("seed", "physics"), [(0, "accurate"), (1, "fast"), (2, "accurate"), (3, "fast")])
+@pytest.mark.parametrize(
+    ("seed", "physics"),
+    [
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0, "accurate"), (1, "fast"), (2, "accurate"))),
+        (3, "fast"),
+    ],
+)
 def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
     rng = np.random.default_rng(seed)
     loaded = Robot.load(write(tmp_path, robot(*random_tree(rng, 9))))

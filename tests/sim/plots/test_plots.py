@@ -48,7 +48,7 @@ def split_axes(figure):
     return named, [axes for axes in figure.axes if axes not in named]
 
 
-@pytest.mark.parametrize("joints", [1, 9])
+@pytest.mark.parametrize("joints", [1, pytest.param(9, marks=pytest.mark.slow)])
 def test_every_joint_has_its_axes(joints):
     rollout = make(joints)
     named, others = split_axes(plots.step_responses(rollout, mark=0))
@@ -113,6 +113,7 @@ def test_quantiles_are_those_of_the_finite_values(values, q):
             assert np.isnan(value)
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None)
 @given(
     bad=st.sampled_from([np.nan, np.inf, -np.inf, 1e38]),
@@ -183,7 +184,7 @@ def test_png_and_svg(tmp_path):
         plots.save(figure, tmp_path / "run.pdf")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
+@pytest.mark.parametrize("suffix", [pytest.param(".png", marks=pytest.mark.slow), ".svg"])
 def test_a_picture_that_cannot_be_written_leaves_the_older_one(suffix, tmp_path):
     path = tmp_path / f"run{suffix}"
     path.write_text("older")

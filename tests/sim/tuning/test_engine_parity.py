@@ -28,7 +28,7 @@ def test_another_mass_is_found(panda, monkeypatch):
     monkeypatch.setattr(model_builder, "body_inertias", heavier)
     forget()
     try:
-        found = compare_engines(panda, moves=1, seconds=1.0, workers=0)
+        found = compare_engines(panda, moves=1, seconds=0.3, workers=0)
     finally:
         forget()
     assert found.mass_matrix > 0.1

@@ -44,7 +44,7 @@ def test_frames_equal_those_of_a_runner_before_and_after_a_gain_changes(live):
     np.testing.assert_array_equal(history.qpos[-1], observation.qpos)
 
 
-@pytest.mark.parametrize("params", [None, "tuned"])
+@pytest.mark.parametrize("params", [None, pytest.param("tuned", marks=pytest.mark.slow)])
 def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, params):
     given = None if params is None else panda.tuned()
     live = LiveSimulation(panda, 2, workers=0, physics="fast", params=given)
@@ -61,6 +61,7 @@ def test_a_simulation_without_params_runs_the_tuned_ones_bit_identically(panda, 
     live.close()
 
 
+@pytest.mark.slow
 def test_gain_sets_in_other_units_are_applied_without_a_bump(panda):
     live = LiveSimulation(panda, 1, workers=0, spread=0.0, physics="fast")  # so that the setpoint weight has no effect
     live.payload = 1.0
@@ -100,6 +101,7 @@ def test_effort_limits_bound_the_motors_and_not_the_payload(live):
     assert live.frame().saturated[0].any(1).all()
 
 
+@pytest.mark.slow
 def test_a_push_moves_the_robots_and_ends(live):
     rest, _ = run(live, 1.0)
     live.push((0.0, 80.0, 0.0))
@@ -156,8 +158,14 @@ def test_a_diverged_robot_stays_finite_until_a_reset(live):
     assert live.frame().ok.all()
 
 
-@pytest.mark.parametrize("fixed_base", [True, False])
-@pytest.mark.parametrize("control", ["pid", "drive"])
+@pytest.mark.parametrize(
+    ("control", "fixed_base"),
+    [
+        ("pid", True),
+        ("drive", False),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in (("pid", False), ("drive", True))),
+    ],
+)
 def test_a_robot_without_settings_gets_gains_that_hold_it(tmp_path, panda, control, fixed_base):
     path = tmp_path / "copy.urdf"
     path.write_text(panda.path.read_text())
