@@ -71,6 +71,7 @@ def test_gains_from_a_file(batchpid, tmp_path, panda):
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
 
 
+@pytest.mark.slow
 def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     """By name, or from the params file with its gain units and measurement rate."""
     path = panda.path.with_name("panda.tuned.yaml")

@@ -54,6 +54,7 @@ def test_shortfalls_of_the_tutorials_gains_are_listed(panda):
     assert "settling time of move 'tutorial'" in "".join(shortfalls)
 
 
+@pytest.mark.slow
 def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
     moves, arm = random_moves(panda, 2, seed=4), arm_joints(panda)
     tuned, weak = (

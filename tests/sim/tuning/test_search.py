@@ -62,7 +62,7 @@ def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, f
 
 def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
     moves = random_moves(panda, 1, 0)
-    options = {"population": 4, "seconds": 0.2, "moves": moves, "workers": 0}
+    options = {"population": 4, "seconds": 0.1, "moves": moves, "workers": 0}
     whole = tune(panda, generations=3, **options)
     history = tmp_path / "search.json"
     tune(panda, generations=2, history=history, **options)
@@ -144,6 +144,7 @@ def test_randomization_and_actuators_make_another_search(panda):
     assert varied.settings["randomization"] == drawn.to_dict()
 
 
+@pytest.mark.slow
 def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
     late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
     options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}

@@ -124,6 +124,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
         np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
 
 
+@pytest.mark.slow
 def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     """The change of a strength for finite differences moves a joint only by its coupling to others."""
     inertia = Plant(arm, (1,), Drive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
@@ -349,6 +350,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(arm, runs):
     assert np.array_equal(alone.uncertainty.deviation, shared.uncertainty.deviation)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_search")
 def test_a_log_that_no_robot_could_have_made_is_refused(runs, tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.replace("revolute", "continuous"))
