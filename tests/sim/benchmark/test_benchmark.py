@@ -41,6 +41,7 @@ def test_robot_without_gains_is_refused(panda):
         Workload(dataclasses.replace(panda, settings=None))
 
 
+@pytest.mark.slow
 def test_phases_are_positive_and_the_engine_takes_most(workload):
     spent = measure_phases(workload)
     assert list(spent) == ["read", "control", "passive", "write", "step", "waiting"]
@@ -48,7 +49,14 @@ def test_phases_are_positive_and_the_engine_takes_most(workload):
     assert spent["step"] == max(spent[phase] for phase in ("read", "passive", "write", "step"))
 
 
-@pytest.mark.parametrize("name", [name for name in PEERS if name != "gymnasium, all envs"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name.startswith("gymnasium") else ())
+        for name in PEERS
+        if name != "gymnasium, all envs"
+    ],
+)
 def test_peers_reach_the_same_place_in_every_round(workload, name):
     pytest.importorskip(PEERS[name].package)
     peer = make_peers(workload, [name])[name]

@@ -3,6 +3,7 @@ import json
 import pytest
 
 
+@pytest.mark.slow
 def test_bench_prints_cases_and_phases_and_writes_them(batchpid, tmp_path):
     path = tmp_path / "new" / "bench.json"
     flags = ["--num-envs", 1, "--workers", 0, "--ticks", 50, "--rounds", 1]

@@ -16,7 +16,18 @@ from batchpid.sim.cli.run import start_poses
 ROBOTS = {name: load_bundled(name) for name in ("panda", "jaco2")}
 
 
-@pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("undrawn")
+def test_demo_reports_every_joint(batchpid, tmp_path):
+    flags = ("--num-envs", 2, "--workers", 0, "--seconds", 0.02, "--picture", tmp_path / "demo.png")
+    status, said, _ = batchpid("demo", "panda", *flags)
+    assert status == 0
+    assert "NOT SETTLED" in said
+    for joint in ROBOTS["panda"].joint_names:
+        assert f"\n{joint} " in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_demo_reports_every_joint_and_draws(name, batchpid, tmp_path):
     path = tmp_path / "new" / "demo.png"
     flags = ("--num-envs", 3, "--workers", 1 if name == "panda" else 0, "--seconds", 0.02, "--picture", path)

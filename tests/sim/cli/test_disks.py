@@ -36,6 +36,9 @@ COMMANDS = {
     "tune picture": ((*TUNE, "--out", "OTHER.yaml", "--picture"), "a.png"),
 }
 """Flags of each command that writes, its output last."""
+SECOND = ("rollout picture", "survey json", "tune picture")
+"""Other outputs of a command that is in the table already."""
+ROWS = [pytest.param(name, marks=pytest.mark.slow if name in SECOND else ()) for name in COMMANDS]
 NEEDS = {"rollout h5": "h5py", "render": "imageio_ffmpeg", "tune": "cmaes", "tune picture": "cmaes"}
 
 
@@ -91,7 +94,7 @@ def assert_refused(result: tuple[int, str], folder: Path, before: dict[str, byte
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ROWS)
 def test_places_that_cannot_be_written_to_are_refused_before_the_run(name, command, tmp_path, monkeypatch):
     path = tmp_path / "place" / COMMANDS[name][1]
     path.parent.mkdir()
@@ -106,7 +109,7 @@ def test_places_that_cannot_be_written_to_are_refused_before_the_run(name, comma
         assert_refused(command(name, tmp_path / "new" / path.name), tmp_path, before)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ROWS)
 @pytest.mark.parametrize("make", [fill, make_read_only], ids=["full", "read-only"])
 def test_disks_that_cannot_be_written_to_are_refused_before_the_run(make, name, command, tmp_path):
     with small_disk(tmp_path / "disk", 1 << 16) as disk:
@@ -156,7 +159,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
     return status
 
 
-@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", "plot", "render"])
+@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", pytest.param("plot", marks=pytest.mark.slow), "render"])
 def test_a_disk_that_fills_up_during_the_run_keeps_the_older_file(name, command, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 1 << 16) as disk:
         assert run_while_filling(command, name, disk, 0, monkeypatch) == 2
@@ -204,7 +207,10 @@ WRITERS: dict[str, tuple[str, Callable]] = {
 }
 
 
-@pytest.mark.parametrize("name", [*list(WRITERS)[:-1], pytest.param("drawing", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [*list(WRITERS)[:-2], *(pytest.param(each, marks=pytest.mark.slow) for each in ("picture", "drawing"))],
+)
 @pytest.mark.parametrize("make", [fill, make_read_only], ids=["full", "read-only"])
 def test_a_call_that_cannot_write_raises_an_error_of_the_system(make, name, panda, rollout, tmp_path):
     if name in ("HDF5", "recorder"):

@@ -8,6 +8,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
 
+@pytest.mark.slow
 def test_the_engines_agree_on_a_panda(batchpid, tmp_path):
     files = "--json", tmp_path / "a.json", "--picture", tmp_path / "a.png"
     status, out, _ = batchpid("parity", "panda", "--moves", "1", "--seconds", "1", "--workers", "0", *files)

@@ -71,6 +71,7 @@ def test_gains_from_a_file(batchpid, tmp_path, panda):
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
 
 
+@pytest.mark.slow
 def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     """By name, or from the params file with its gain units and measurement rate."""
     path = panda.path.with_name("panda.tuned.yaml")
@@ -83,7 +84,7 @@ def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
 
 
 def test_the_default_gains_settle_and_the_tutorial_s_do_not(batchpid):
-    flags = ("--num-envs", 3, "--workers", 0, "--seconds", 1.2)
+    flags = ("--num-envs", 1, "--workers", 0, "--seconds", 1.2)
     assert "Every joint of every env settled" in batchpid("rollout", *flags)[1]
     assert "NOT SETTLED" in batchpid("rollout", *flags, "--gains", "tutorial")[1]
 
@@ -151,6 +152,7 @@ def test_bad_flags_are_named(flags, message, batchpid):
     assert err.startswith(f"batchpid: {message}")
 
 
+@pytest.mark.slow
 def test_picture(batchpid, tmp_path):
     path = tmp_path / "run.svg"
     assert batchpid("rollout", *SHORT, "--picture", path)[0] == 0

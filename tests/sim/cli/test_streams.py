@@ -57,7 +57,7 @@ def shell(line: str, folder: Path, status: str = "$?") -> tuple[int, str, str]:
 @pytest.mark.parametrize(
     ("line", "status", "lines"),
     [
-        ("--help >&-", 0, 0),
+        pytest.param("--help >&-", 0, 0, marks=pytest.mark.slow),
         ("--help >/dev/full", 2, 1),
         ("--version <&- >&- 2>&-", 0, 0),
         ("inspect nobody 2>/dev/full", 2, 0),

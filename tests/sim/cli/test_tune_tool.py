@@ -11,6 +11,7 @@ import batchpid.task_space as ts
 HAND = "panda_hand"
 
 
+@pytest.mark.slow
 def test_tune_writes_gains_that_rollout_reads(batchpid, tmp_path, monkeypatch):
     pytest.importorskip("cmaes")
     for name in ("MOVES", "FINAL_MOVES"):

@@ -36,6 +36,7 @@ def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
     assert "real-time factor" in said
 
 
+@pytest.mark.slow
 def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
     robot = load_bundled("panda")
     bp.save_params(tmp_path / "plain.yaml", robot.params(kp=50.0), robot.joint_names)

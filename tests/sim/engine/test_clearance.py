@@ -50,7 +50,9 @@ def model_of(of, **changes):
     return robot_model(SceneSpec(of.urdf, of.ignored_pairs, of.joints, 5e-4, physics, engine="mujoco", **changes))
 
 
-@pytest.fixture(params=["panda", "jaco2", "tree 0", "tree 1"])
+@pytest.fixture(
+    params=["panda", "tree 0", *(pytest.param(each, marks=pytest.mark.slow) for each in ("jaco2", "tree 1"))],
+)
 def arm(request, tmp_path):
     name, *seed = request.param.split()
     return shaped_tree(int(seed[0]), tmp_path) if seed else load_bundled(name)

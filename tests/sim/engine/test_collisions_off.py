@@ -52,9 +52,9 @@ def free_moves(name):
     ("name", "control", "physics"),
     [
         ("panda", "pid", "accurate"),
-        ("panda", "drive", "fast"),
-        ("jaco2", "pid", "free"),
-        (RUBBING, "pid", "accurate"),
+        pytest.param("panda", "drive", "fast", marks=pytest.mark.slow),
+        pytest.param("jaco2", "pid", "free", marks=pytest.mark.slow),
+        pytest.param(RUBBING, "pid", "accurate", marks=pytest.mark.slow),
         (RUBBING, "drive", "fast"),
     ],
 )
@@ -71,13 +71,16 @@ def test_free_motion_is_bit_identical_to_that_of_the_shaped_robot(name, control,
 @pytest.mark.parametrize(
     "options",
     [
-        {
-            "randomization": Randomization(
-                payload=Uniform(0.0, 1.0), link_mass=Uniform(1.0, 2.0), friction=Uniform(0, 1)
-            )
-        },
+        pytest.param(
+            {
+                "randomization": Randomization(
+                    payload=Uniform(0.0, 1.0), link_mass=Uniform(1.0, 2.0), friction=Uniform(0, 1)
+                )
+            },
+            marks=pytest.mark.slow,
+        ),
         {"guard": True},
-        {"actuators": batchpid.make_actuators(9, command_delay=0.002)},
+        pytest.param({"actuators": batchpid.make_actuators(9, command_delay=0.002)}, marks=pytest.mark.slow),
     ],
     ids=lambda options: next(iter(options)),
 )
@@ -88,7 +91,9 @@ def test_free_motion_is_bit_identical_with_other_options_too(panda, options):
     assert_identical(bare, shaped)
 
 
-@pytest.mark.parametrize("options", [{"pack_size": 1}, {"workers": 2, "pack_size": 3}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{"pack_size": 1}, pytest.param({"workers": 2, "pack_size": 3}, marks=pytest.mark.slow)], ids=str
+)
 def test_any_packing_and_number_of_workers(jaco2, options):
     start = jaco2.sample(11, seed=0)
     effort = np.random.default_rng(0).choice([-1, 1], start.shape) * jaco2.effort_limit  # into links and limits
@@ -113,7 +118,7 @@ def test_masses_and_inertias_stay(falling):
     assert 1.0 < bare[0, 0, 0] < 2.0  # 4 kg (1000 kg/m^3) at 0.5 m, not the 1e-6 kg of a link without shapes
 
 
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_missed_contacts_are_those_found_by_looking_at_every_tick(name):
     robot = load_bundled(name)
     start, target = robot.sample(8, seed=2), robot.sample(8, seed=3)
@@ -143,6 +148,7 @@ def test_one_warning_names_envs_and_links(falling):
         assert [contact.env for contact in runner.missed_contacts] == [1, 1]
 
 
+@pytest.mark.slow
 def test_checkpoints_and_lost_workers_do_not_change_what_was_missed(jaco2):
     start, target = jaco2.sample(8, seed=2), jaco2.sample(8, seed=3)
 

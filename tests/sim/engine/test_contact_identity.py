@@ -45,13 +45,25 @@ def reference(name="jaco2", physics="accurate", engine="sapien"):
     return thrash(name, physics=physics, engine=engine, **({"pack_size": 1} if engine == "sapien" else {}))
 
 
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
-@pytest.mark.parametrize("options", [{"pack_size": 8}, {"pack_size": 4, "workers": 2}], ids=str)
+PACKED, SHARED = {"pack_size": 8}, {"pack_size": 4, "workers": 2}
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "physics"),
+    [
+        (SHARED, "jaco2", "accurate"),
+        *(pytest.param(SHARED, *each, marks=pytest.mark.slow) for each in (("jaco2", "fast"), ("panda", "accurate"))),
+        *(pytest.param(PACKED, "jaco2", each, marks=pytest.mark.slow) for each in ("accurate", "fast")),
+        *(pytest.param(PACKED, "panda", each, marks=pytest.mark.slow) for each in ("accurate", "fast")),
+        pytest.param(SHARED, "panda", "fast", marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
 def test_any_packing_and_workers_are_bit_identical(name, physics, options):
     assert_identical(thrash(name, physics=physics, **options), reference(name, physics))
 
 
+@pytest.mark.slow
 def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     """Otherwise the tests of this module could not fail."""
     monkeypatch.setattr(ContactPredictor, "predicts_contact", lambda *_: False)
@@ -59,7 +71,7 @@ def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     assert (shared.qpos != thrash(pack_size=1, physics="fast").qpos).any((0, 2)).sum() > 2
 
 
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
+@pytest.mark.parametrize("name", [pytest.param("jaco2", marks=pytest.mark.slow), "panda"])
 def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name):
     robot = load_bundled(name)
     poses = robot.sample(N, seed=1)
@@ -78,6 +90,7 @@ def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name
     assert_identical(fall(8), first)
 
 
+@pytest.mark.parametrize("engine", ["sapien", pytest.param("mujoco", marks=pytest.mark.slow)], indirect=True)
 @pytest.mark.usefixtures("engine")
 def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     robot = Robot.load("panda", fixed_base=False)
@@ -85,7 +98,7 @@ def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     runs = []
     for pack_size, workers in ((1, 0), (4, 2)):
         with Runner(robot, N, pack_size=pack_size, workers=workers, **options) as runner:
-            runs.append(runner.rollout(random_efforts(robot)))
+            runs.append(runner.rollout(random_efforts(robot, 6)))
     assert_identical(*runs)
 
 
@@ -114,6 +127,7 @@ def closed_hand(robot):
     return pose
 
 
+@pytest.mark.slow
 def test_robots_that_start_in_contact_are_isolated_and_bit_identical(jaco2, packs):
     def start(runner):
         runner.reset(closed_hand(jaco2))
@@ -122,21 +136,22 @@ def test_robots_that_start_in_contact_are_isolated_and_bit_identical(jaco2, pack
     assert_identical(*(thrash(pack_size=size, before=start) for size in (1, 8)))
 
 
-def test_an_episode_does_not_depend_on_the_episodes_before_it(jaco2, packs):
+@pytest.mark.parametrize("closed", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_an_episode_does_not_depend_on_the_episodes_before_it(closed, jaco2, packs):
     """A reset discards the order of earlier contacts, too."""
-    for start, isolated in ((jaco2.start, 0), (closed_hand(jaco2), N)):
-        with Runner(jaco2, N, control="effort", params=jaco2.params(**OPEN_LOOP), workers=0) as runner:
-            episodes = []
-            for _ in range(2):
-                runner.reset(start)
-                assert packs.isolated() == isolated
-                episodes.append(runner.rollout(random_efforts(jaco2)))
-                assert packs.isolated() > 0
-        assert_identical(*episodes, skip=["time"])
+    start, isolated, ticks = (closed_hand(jaco2), N, 6) if closed else (jaco2.start, 0, TICKS)
+    with Runner(jaco2, N, control="effort", params=jaco2.params(**OPEN_LOOP), workers=0) as runner:
+        episodes = []
+        for _ in range(2):
+            runner.reset(start)
+            assert packs.isolated() == isolated
+            episodes.append(runner.rollout(random_efforts(jaco2, ticks)))
+            assert packs.isolated() > 0
+    assert_identical(*episodes, skip=["time"])
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
-@pytest.mark.parametrize("name", ["jaco2", "panda"])
+@pytest.mark.parametrize("name", [pytest.param("jaco2", marks=pytest.mark.slow), "panda"])
 def test_robots_in_free_motion_share_systems(name, packs):
     robot = load_bundled(name)
     with Runner(robot, 8, params=robot.params(), workers=0) as runner:
@@ -155,6 +170,7 @@ def test_a_robot_that_is_isolated_keeps_its_drives(jaco2, packs):
     assert np.abs(runs[0].qpos[-1, :, :6] - target[:6]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_isolated_keeps_its_payload_and_friction(jaco2, packs):
     randomization, actuators = usual_variation(jaco2)
     options = {"randomization": replace(randomization, seed=2), "actuators": actuators}
@@ -167,25 +183,28 @@ def test_a_robot_that_is_isolated_keeps_its_payload_and_friction(jaco2, packs):
     assert_identical(*runs)
 
 
-def test_a_snapshot_in_contact_is_the_same_barrier_for_any_packing(jaco2):
-    effort = random_efforts(jaco2, TICKS + 5)
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_snapshot_in_contact_is_the_same_barrier_for_any_packing(jaco2, workers):
+    ticks = 5
+    effort = random_efforts(jaco2, 2 * ticks)
     options = {"control": "effort", "params": jaco2.params(**OPEN_LOOP)}
 
     def run(pack_size):
         with Runner(jaco2, N, workers=0, pack_size=pack_size, **options) as runner:
-            runner.rollout(effort[:TICKS])
+            runner.rollout(effort[:ticks])
             snapshot = runner.snapshot()
-            return runner.rollout(effort[TICKS:]), snapshot
+            return runner.rollout(effort[ticks:]), snapshot
 
     (first, snapshot), (second, other) = run(1), run(8)
     assert_identical(second, first)
     np.testing.assert_array_equal(other.states.engine, snapshot.states.engine)
     assert snapshot.states.engine[:, 2 * jaco2.dof + 13].any()  # isolated
-    with Runner(jaco2, N, workers=2, **options) as runner:
+    with Runner(jaco2, N, workers=workers, **options) as runner:
         runner.restore(snapshot)
-        assert_identical(runner.rollout(effort[TICKS:]), first)
+        assert_identical(runner.rollout(effort[ticks:]), first)
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_contact_is_replaced_bit_identically():
     def wait(runner):
         runner.rollout(np.zeros((1, N, runner.robot.dof)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import load_bundled
 from scripts import load_script
@@ -90,6 +90,7 @@ def test_a_pair_closes_as_fast_as_the_joints_between_its_links_move(links, reach
     assert predicts_contact([(*links, closes + 0.99 * FROM_REST)] * 2, qvel)
 
 
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4), st.floats(-0.01, 0.02)), max_size=6),
     st.lists(st.floats(-50, 50), min_size=4, max_size=4),
@@ -112,6 +113,7 @@ def reach_between(predictor: ContactPredictor, first: int, second: int) -> np.nd
     return np.where((a > 0) != (b > 0), a + b, 0.0)
 
 
+@settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(st.sampled_from([(2, 3), (2, 4), (3, WORLD), (0, 4)]), st.floats(1e-4, LISTED_DISTANCE)), max_size=4
@@ -160,7 +162,7 @@ def test_a_region_ends_where_a_joint_has_moved_by_its_weight():
     assert regions.left(qpos) == []
 
 
-@pytest.mark.parametrize("physics", ["accurate", "fast"])
+@pytest.mark.parametrize("physics", ["accurate", pytest.param("fast", marks=pytest.mark.slow)])
 def test_regions_change_no_prediction(physics, panda, monkeypatch):
     """Limp robots that fall, looked at in every step and only where they leave their regions."""
     spec = SceneSpec(panda.urdf, panda.srdf, panda.joints, DT, PHYSICS[physics])
@@ -303,6 +305,7 @@ def test_an_isolated_robot_keeps_its_state_and_settings(physics, jaco2):
     pack.close()
 
 
+@pytest.mark.slow
 def test_isolation_before_contact_does_not_change_the_path(panda, packs, monkeypatch):
     """A robot that is rebuilt in contact would lose the engine's contact cache."""
     moves, runs = load_script("accuracy").contact_moves(panda, 2), []

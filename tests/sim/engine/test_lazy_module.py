@@ -17,6 +17,7 @@ assert urchin.trimesh.Trimesh is trimesh.Trimesh
 """
 
 
+@pytest.mark.slow
 def test_the_engine_is_imported_without_trimesh():
     pytest.importorskip("trimesh")
     subprocess.run([sys.executable, "-W", "ignore", "-c", PROGRAM], check=True, timeout=100)

@@ -36,7 +36,13 @@ def moved(pack: Pack, reference: Pack, qpos: np.ndarray, steps: int = 2000) -> n
     return np.array(positions)
 
 
-@pytest.mark.parametrize(("seed", "physics"), [(0, "accurate"), (1, "fast"), (2, "accurate"), (3, "fast")])
+@pytest.mark.parametrize(
+    ("seed", "physics"),
+    [
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0, "accurate"), (1, "fast"), (2, "accurate"))),
+        (3, "fast"),
+    ],
+)
 def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
     rng = np.random.default_rng(seed)
     loaded = Robot.load(write(tmp_path, robot(*random_tree(rng, 9))))
@@ -50,7 +56,8 @@ def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
 
 def test_motion_of_the_bundled_panda_is_that_of_all_links(panda):
     merged, unmerged = (Pack(spec_of(panda, merge), 1) for merge in (True, False))
-    ours, theirs = (moved(pack, unmerged, panda.start) for pack in (merged, unmerged))
+    ours, theirs = (moved(pack, unmerged, panda.start, steps=600) for pack in (merged, unmerged))
+    assert np.ptp(theirs, axis=0).max() > 0.3
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)
 
 

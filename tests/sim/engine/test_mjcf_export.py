@@ -187,6 +187,7 @@ def test_the_motors_alone_deliver_what_the_actuators_do():
 
 
 LINE = {"saturation_effort": 6.0, "no_load_speed": 1.5}
+EFFECTS = {"pid": {}, "line": LINE, "both": LINE | {"lag": 0.004}, "lag": {"lag": 0.004}}
 
 
 def arm_motion(step, joints=9):
@@ -197,9 +198,13 @@ def arm_motion(step, joints=9):
 
 
 @pytest.mark.parametrize(
-    "effects", [{}, LINE, LINE | {"lag": 0.004}, {"lag": 0.004}], ids=["pid", "line", "both", "lag"]
+    ("guarded", "effects"),
+    [
+        pytest.param(guarded, EFFECTS[name], id=f"{guarded}-{name}", marks=() if quick else pytest.mark.slow)
+        for guarded, names in ((False, ("pid", "both")), (True, ("line", "lag")))
+        for name, quick in ((each, each in names) for each in EFFECTS)
+    ],
 )
-@pytest.mark.parametrize("guarded", [False, True])
 def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded):
     """The guard, the law and the motors of batchpid, step by step, are MuJoCo's actuators.
 
@@ -331,6 +336,7 @@ def test_a_locked_joint_may_be_guarded(tmp_path):
     assert high == np.nextafter(1.0, 2.0)
 
 
+@pytest.mark.slow
 def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
     """Under what the target has of the tuned gains: efforts at one inertia, no filter, weight or anti-windup."""
     loaded = Robot.load("panda")
@@ -390,7 +396,7 @@ CHAIN = [*LINKS, *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy",
 
 
 @given(random_params(), st.integers(0, 2**32 - 1))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     params = params.replace(kp=params.kp + 1.0)  # a file without any stiffness has no servos
     folder, inertia, rng = tmp_path_factory.mktemp("chain"), np.array([2.0, 1.0, 0.5]), np.random.default_rng(seed)

@@ -146,15 +146,20 @@ def test_a_link_named_world_and_a_floating_base(tmp_path):
     ("name", "options", "tolerance"),
     [
         ("panda", {}, 1e-5),
-        ("panda", {"compensate": "gravity"}, 1e-4),
+        pytest.param("panda", {"compensate": "gravity"}, 1e-4, marks=pytest.mark.slow),
         ("panda", {"control": "drive"}, 1e-5),
         ("panda", {"collisions": False}, 1e-5),
         ("jaco2", {}, 2e-4),
-        (RUBBING, {}, 1e-4),
+        pytest.param(RUBBING, {}, 1e-4, marks=pytest.mark.slow),
         ("panda", {"actuators": {"command_delay": 0.002, "armature": 0.1}}, 1e-4),
         ("panda", {"randomization": Randomization(payload=Uniform(0.0, 2.0), link_mass=SCALE)}, 1e-4),
-        ("panda", {"randomization": Randomization(center_of_mass=Uniform(-0.02, 0.02))}, 1e-4),
-        ("panda", {"randomization": Randomization(damping=Uniform(0.0, 2.0), armature=Uniform(0.0, 0.1))}, 1e-4),
+        *(
+            pytest.param("panda", {"randomization": randomization}, 1e-4, marks=pytest.mark.slow)
+            for randomization in (
+                Randomization(center_of_mass=Uniform(-0.02, 0.02)),
+                Randomization(damping=Uniform(0.0, 2.0), armature=Uniform(0.0, 0.1)),
+            )
+        ),
     ],
 )
 def test_a_robot_moves_as_in_sapien(name, options, tolerance):
@@ -165,6 +170,7 @@ def test_a_robot_moves_as_in_sapien(name, options, tolerance):
     assert all(obs.ok.all() for obs in both)
 
 
+@pytest.mark.slow
 def test_moves_under_tuned_gains_are_those_of_sapien(panda):
     moves = tutorial_move(panda) + random_moves(panda, 7, seed=1)
 

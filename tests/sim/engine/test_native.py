@@ -61,9 +61,12 @@ CASES = {
 @pytest.mark.parametrize(
     ("name", "case"),
     [
-        *(("panda", case) for case in CASES),
-        *(("jaco2", case) for case in ("tuned", "efforts, in contact")),
+        ("panda", "tuned"),
+        ("panda", "efforts, in contact"),
+        ("panda", "a speed limit, which stops envs"),
         *(("slider", case) for case in ("tuned", "drive", "efforts, in contact", "without compensation")),
+        *(pytest.param("panda", case, marks=pytest.mark.slow) for case in ("drive", "fast", "without compensation")),
+        *(pytest.param("jaco2", case, marks=pytest.mark.slow) for case in ("tuned", "efforts, in contact")),
     ],
 )
 def test_results_are_bit_identical(monkeypatch, name, case, slider):
@@ -104,7 +107,7 @@ class Told:
 
 
 @needs_extension
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_python_calls_hold_for_the_workers_of_a_runner(panda, workers, monkeypatch):
     monkeypatch.delenv(native.SWITCH, raising=False)
     with native.python_calls():
@@ -141,6 +144,7 @@ def test_a_failed_self_test_is_a_warning(monkeypatch, tmp_path, program, problem
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @needs_extension
 def test_the_self_test_runs_once_for_a_pair_of_libraries(monkeypatch, tmp_path):
     monkeypatch.delenv("BATCHPID_NATIVE_VERIFIED", raising=False)

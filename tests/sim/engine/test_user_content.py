@@ -43,7 +43,7 @@ def run(build, num_envs=4, ticks=30, **options):
         return rollout, runner.poses()
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_content_falls_and_a_reset_puts_it_back(workers):
     with Runner(ROBOT, 2, params=ROBOT.params(), workers=workers, build=box_beside_the_robot) as runner:
         before = runner.poses()
@@ -78,7 +78,10 @@ def reference():
     return run(balls_on_the_arm, num_envs=5, ticks=40, workers=0)
 
 
-@pytest.mark.parametrize("options", [{"pack_size": 1}, {"pack_size": 3}, {"workers": 2, "pack_size": 4}])
+@pytest.mark.parametrize(
+    "options",
+    [*(pytest.param({"pack_size": size}, marks=pytest.mark.slow) for size in (1, 3)), {"workers": 2, "pack_size": 4}],
+)
 def test_content_is_bit_identical_for_any_packing_and_workers(reference, options):
     expected, poses = reference
     found, others = run(balls_on_the_arm, num_envs=5, ticks=40, **({"workers": 0} | options))

@@ -35,7 +35,7 @@ def odd_robot(folder):
     return Robot.load(write(folder, re.sub(r'<link name="(\w+)"/>', lambda found: link(found[1]), ODD)))
 
 
-@pytest.fixture(scope="module", params=["panda", "jaco2", "odd"])
+@pytest.fixture(scope="module", params=["panda", pytest.param("jaco2", marks=pytest.mark.slow), "odd"])
 def robot(request, tmp_path_factory):
     return odd_robot(tmp_path_factory.mktemp("odd")) if request.param == "odd" else load_bundled(request.param)
 

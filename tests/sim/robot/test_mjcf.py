@@ -176,6 +176,7 @@ def test_swings_as_in_mujoco(load, engine):
     np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_both_engines_agree_and_settle(load):
     robot = load(ARM)
     target, ends = np.array([0.2, 0.05, 0.6]), []

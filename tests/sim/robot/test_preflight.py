@@ -161,7 +161,7 @@ def test_invalid_arguments_raise(options, panda):
         panda.check(**options)
 
 
-@pytest.mark.parametrize(("kp", "moves"), [(0.0, False), (20.0, True)])
+@pytest.mark.parametrize(("kp", "moves"), [(0.0, False), pytest.param(20.0, True, marks=pytest.mark.slow)])
 def test_ki_is_reported_under_a_drive_only_where_it_has_no_effect(kp, moves, tmp_path):
     """A drive has no integral, so the integral moves its target: without stiffness the target has no effect."""
     hinge = Robot.load(write(tmp_path, one_joint()))
@@ -214,7 +214,7 @@ def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning")
 @pytest.mark.parametrize("filter_time", [0.0, 1e-3])
-@pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
+@pytest.mark.parametrize("units", ["effort", pytest.param("inertia", marks=pytest.mark.slow), "mass_matrix"])
 @pytest.mark.parametrize(("factor", "stays"), [(0.9, True), (1.1, False)])
 def test_the_simulation_becomes_unstable_at_the_reported_bound(units, filter_time, factor, stays, panda):
     options = {"ki": None, "effort_limit": None, "derivative_filter_time": filter_time, "gain_units": units}

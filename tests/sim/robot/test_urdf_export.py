@@ -38,7 +38,7 @@ def test_a_repaired_robot_needs_no_repair_again(case, tmp_path):
     assert_same(written_again(loaded, tmp_path), loaded)
 
 
-@pytest.mark.parametrize("name", Robot.bundled())
+@pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_bundled_robots_keep_their_numbers(name, tmp_path):
     loaded = Robot.load(name)
     again = written_again(loaded, tmp_path)

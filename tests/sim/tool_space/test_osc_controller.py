@@ -60,7 +60,11 @@ def pose_of(of, qpos, name):
 
 @pytest.mark.parametrize(
     ("name", "engine"),
-    [("panda", "sapien"), ("six_joints", "mujoco"), ("with_friction", "sapien"), ("with_friction", "mujoco")],
+    [
+        ("panda", "sapien"),
+        ("six_joints", "mujoco"),
+        *(pytest.param("with_friction", engine, marks=pytest.mark.slow) for engine in ("sapien", "mujoco")),
+    ],
 )
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are compensated."""
@@ -131,6 +135,7 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     np.testing.assert_allclose(rollout.qpos[-1, 0, 7:], [panda.start[7], 0.035], atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_compilation")
 def test_xla_computes_the_same(six_joints):
     start = np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1])
@@ -219,6 +224,7 @@ def test_control_osc_moves_a_link(panda):
         np.testing.assert_allclose(runner.command.neutral, pose_of(panda, panda.start, HAND))
 
 
+@pytest.mark.slow
 def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
     pytest.importorskip("h5py")
     from batchpid.sim import Recorder, plots, read_recording, write_recording
@@ -285,7 +291,11 @@ ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
 
 @pytest.mark.parametrize(
     ("engine", "case", "more"),
-    [*(("sapien", *each) for each in ALL), *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[8]))],
+    [
+        *(("sapien", *each) for each in (ALL[0], *ALL[7:])),
+        *(pytest.param("sapien", *each, marks=pytest.mark.slow) for each in ALL[1:7]),
+        *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[8])),
+    ],
 )
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(request, engine, case, more):

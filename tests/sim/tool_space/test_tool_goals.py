@@ -37,6 +37,7 @@ def test_a_goal_is_reached_within_the_limits_or_not(panda, control, monkeypatch)
     assert not reaches(panda, control, start, goal).any()
 
 
+@pytest.mark.slow
 def test_the_default_goal_is_the_first_that_all_reach(panda, control):
     target = panda.settings.target
     start = target + 0.1 * np.random.default_rng(0).uniform(-1, 1, (4, 9)) * (np.arange(9) < 7)

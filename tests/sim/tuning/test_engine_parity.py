@@ -19,6 +19,7 @@ def forget():
     mujoco_dynamics.scene_dynamics.cache_clear()
 
 
+@pytest.mark.slow
 def test_another_mass_is_found(panda, monkeypatch):
     inertias = model_builder.body_inertias
 
@@ -42,7 +43,7 @@ def test_another_mass_is_found(panda, monkeypatch):
 def test_a_joint_without_range_does_not_end_the_comparison(tmp_path):
     held = joint("held", "arm", "tip", inner='<limit lower="0" upper="0" effort="10"/>')
     text = robot(*map(link, ("base", "arm", "tip")), joint("hinge", "base", "arm"), held)
-    found = compare_engines(Robot.load(write(tmp_path, text)), moves=1, seconds=0.5, workers=0)
+    found = compare_engines(Robot.load(write(tmp_path, text)), moves=1, seconds=0.2, workers=0)
     assert found.open_loop[-1] > 0
     at_limits = found._replace(open_loop=np.full_like(found.open_loop, np.nan))
     assert "NOTHING was compared" in " ".join(at_limits.verdict())

@@ -37,7 +37,8 @@ def test_arm_joints_leave_out_fingers(panda, jaco2):
     assert arm_joints(jaco2).sum() == 7
 
 
-@pytest.mark.parametrize("name", ["jaco2", pytest.param("panda", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(name, request):
     robot = request.getfixturevalue(name)
     moves = tutorial_move(robot) + random_moves(robot, 8, seed=11)
@@ -53,6 +54,7 @@ def test_shortfalls_of_the_tutorials_gains_are_listed(panda):
     assert "settling time of move 'tutorial'" in "".join(shortfalls)
 
 
+@pytest.mark.slow
 def test_evaluations_are_ordered_by_the_moves_that_fall_short(panda):
     moves, arm = random_moves(panda, 2, seed=4), arm_joints(panda)
     tuned, weak = (
@@ -90,11 +92,11 @@ def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
 
 
 def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
-    moves = random_moves(panda, 3, 2)
+    moves = random_moves(panda, 2, 2)
     drawn, actuators = usual_variation(panda)
     assert drawn.payload.high <= payload_capacity(panda)
     plain, *varied = (
-        evaluate_gains(panda, panda.designed(), moves, seconds=0.3, workers=workers, **options)
+        evaluate_gains(panda, panda.designed(), moves, seconds=0.15, workers=workers, **options)
         for workers, options in (
             (0, {}),
             (0, {"randomization": drawn, "actuators": actuators}),
@@ -105,6 +107,7 @@ def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_o
     assert np.abs(varied[0].rollout.qpos - plain.rollout.qpos).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it(panda):
     pose = panda.start.copy()
     pose[[1, 3]] = 0.8, -1.0

@@ -24,7 +24,7 @@ from batchpid.sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
 
-SMALL = {"generations": 2, "population": 4, "seconds": 0.2}
+SMALL = {"generations": 2, "population": 4, "seconds": 0.1}
 
 
 @pytest.fixture
@@ -44,6 +44,7 @@ def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda, fe
     assert found.cost <= found.start_cost
 
 
+@pytest.mark.slow
 def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, few_moves, monkeypatch):
     options = []
 
@@ -61,7 +62,7 @@ def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, f
 
 def test_search_that_was_stopped_resumes_as_if_it_had_not_been(panda, tmp_path):
     moves = random_moves(panda, 1, 0)
-    options = {"population": 4, "seconds": 0.2, "moves": moves, "workers": 0}
+    options = {"population": 4, "seconds": 0.1, "moves": moves, "workers": 0}
     whole = tune(panda, generations=3, **options)
     history = tmp_path / "search.json"
     tune(panda, generations=2, history=history, **options)
@@ -123,7 +124,7 @@ def test_search_starts_from_the_designed_gains(panda):
         np.testing.assert_array_equal(getattr(found.start_params, name), getattr(panda.designed(), name))
 
 
-@pytest.mark.parametrize("units", ["effort", "inertia"])
+@pytest.mark.parametrize("units", ["effort", pytest.param("inertia", marks=pytest.mark.slow)])
 def test_other_units_and_single_joints_can_be_searched_too(panda, units):
     found = tune(panda, moves=random_moves(panda, 1, 0), gain_units=units, per_joint=True, workers=0, **SMALL)
     assert np.isfinite(found.cost)
@@ -131,6 +132,7 @@ def test_other_units_and_single_joints_can_be_searched_too(panda, units):
     assert found.cost == found.start_cost or np.ptp(ratio) > 0
 
 
+@pytest.mark.slow
 def test_randomization_and_actuators_make_another_search(panda):
     moves, drawn = random_moves(panda, 1, 0), Randomization(payload=Uniform(0, 1))
     late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
@@ -142,6 +144,7 @@ def test_randomization_and_actuators_make_another_search(panda):
     assert varied.settings["randomization"] == drawn.to_dict()
 
 
+@pytest.mark.slow
 def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
     late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
     options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}
@@ -152,6 +155,7 @@ def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(pand
     assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
 
 
+@pytest.mark.slow
 def test_search_of_robots_that_differ_resumes_as_if_it_had_not_been_stopped(panda, tmp_path):
     late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
     options = {"population": 4, "seconds": 0.2, "moves": random_moves(panda, 1, 0), "workers": 0}

@@ -24,6 +24,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_reports_come_in_order_with_all_that_is_known(folder):
     good, scenery, truncated = survey(find_urdfs([folder]), moves=2, seconds=2.5, processes=2)
     assert good.urdf.endswith("arm.urdf")

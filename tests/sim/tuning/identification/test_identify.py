@@ -124,6 +124,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
         np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
 
 
+@pytest.mark.slow
 def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     """The change of a strength for finite differences moves a joint only by its coupling to others."""
     inertia = Plant(arm, (1,), Drive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
@@ -144,6 +145,7 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     truth, _, efforts = runs
     joints, drive = (0, 1), Drive(DT, None, "gravity+coriolis")
@@ -188,7 +190,7 @@ def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
         assert np.array_equal(plant.simulate(motors.take([k]), [segments[k]], 0)[0], together[k])
 
 
-@pytest.mark.parametrize("kind", ["setpoint", "effort"])
+@pytest.mark.parametrize("kind", [pytest.param("setpoint", marks=pytest.mark.slow), "effort"])
 def test_known_motors_are_found(arm, runs, kind):
     truth, setpoints, efforts = runs
     by_law = kind == "setpoint"
@@ -224,6 +226,7 @@ def test_known_motors_are_found(arm, runs, kind):
         assert error_of_the_export(found, setpoints, arm.designed("effort"), DT) < 2 * after
 
 
+@pytest.mark.slow
 def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     (tmp_path / "turret.urdf").write_text(ARM.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 0 1"/>', 1))
     turret = Robot.load(tmp_path / "turret.urdf")  # pitching its upper joint does not turn the lower one
@@ -273,6 +276,7 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
     assert np.array_equal(shaken[~of_elbow], known[~of_elbow])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_search")
 def test_a_fit_resumes_where_it_stopped(arm, runs, tmp_path):
     _, setpoints, _ = runs
@@ -346,6 +350,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(arm, runs):
     assert np.array_equal(alone.uncertainty.deviation, shared.uncertainty.deviation)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_search")
 def test_a_log_that_no_robot_could_have_made_is_refused(runs, tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.replace("revolute", "continuous"))

@@ -39,6 +39,7 @@ def test_the_spread_of_draws_has_their_covariance():
     np.testing.assert_allclose(columns @ columns.T, np.cov(draws[:, :, 0].T), atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(st.floats(1e-6, 1e-3), st.integers(1, 2))
 def test_the_noise_of_a_log_is_told_from_its_motion(size, every):

@@ -21,6 +21,7 @@ def motors_of(**values: list[float]) -> Motors:
     return Motors(*joints, *(np.array([[values[kind]]]) for kind in ("delay", "stopping", "payload")))
 
 
+@pytest.mark.slow
 def test_joints_that_stick_half_of_the_time_are_found(panda):
     joints, params = (5,), panda.designed("effort")
     params = type(params)(*(leaf[:, list(joints)] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
