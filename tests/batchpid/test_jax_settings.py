@@ -58,6 +58,7 @@ def test_no_setting_changes_a_result(pid, name):
         np.testing.assert_array_equal(efforts(pid), expected)
 
 
+@pytest.mark.slow
 def test_all_of_them_at_once_in_large_batches(monkeypatch):
     monkeypatch.setattr(backends, "LARGE", 1)
     expected = efforts(controller())
@@ -65,6 +66,7 @@ def test_all_of_them_at_once_in_large_batches(monkeypatch):
         np.testing.assert_array_equal(efforts(controller()), expected)
 
 
+@pytest.mark.slow
 def test_settings_in_environment_variables_change_no_result(pid):
     values = {name.upper(): {True: "1"}.get(value, value) for name, value in SETTINGS.items()}
     program = (

@@ -179,6 +179,7 @@ def check_random_settings(folder, data, compiler, steps, *flags):
     np.testing.assert_array_equal(efforts_in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 @given(data=st.data())
 @settings(max_examples=10)
@@ -250,7 +251,10 @@ int main(void) {{
 """
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("panda", np.float64), (0, np.float64), ("planar", np.float32)])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [pytest.param("panda", np.float64, marks=pytest.mark.slow), (0, np.float64), ("planar", np.float32)],
+)
 def test_the_dynamics_of_the_robot(name, dtype, tmp_path):
     tree = planar(gravity=(0.0, -9.81, 0.0)) if name == "planar" else tree_of(name)
     tree = dataclasses.replace(tree, armature=np.linspace(0, 0.2, tree.dof))

@@ -167,6 +167,7 @@ def load_instead(monkeypatch, path):
     load.cache_clear()
 
 
+@pytest.mark.slow
 @needs_extension
 @needs_compiler
 def test_an_extension_of_permuted_operations_is_refused(monkeypatch, build):

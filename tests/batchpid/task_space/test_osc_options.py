@@ -37,6 +37,7 @@ def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias
     return np.array(errors), state, q, v
 
 
+@pytest.mark.slow
 def test_an_integral_learns_a_load_that_the_model_does_not_know():
     tree, qpos = tree_of("panda"), np.tile(START, (2, 1))
     goal, load = ts.link_poses(tree, qpos, [HAND])[:, 0], np.array([0, 0, -20.0, 0, 1.0, 0])
