@@ -125,7 +125,7 @@ def test_every_setting_that_is_needed_has_a_context():
             assert getattr(jax.config, name) in values
 
 
-@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("wide", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_pure_functions_obey_the_strict_modes(wide):
     """All functions that programs of the caller may trace; functions of float32 stay in float32 under 64-bit types."""
 

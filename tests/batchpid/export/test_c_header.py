@@ -113,7 +113,12 @@ def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, 
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [*((name, np.float64) for name in SINGLE), *((name, np.float32) for name in IN_FLOAT32)]
+    ("name", "dtype"),
+    [
+        *((name, np.float64) for name in IN_FLOAT32),
+        *(pytest.param(name, np.float64, marks=pytest.mark.slow) for name in SINGLE if name not in IN_FLOAT32),
+        *((name, np.float32) for name in IN_FLOAT32),
+    ],
 )
 def test_every_option_is_bit_identical(name, dtype, tmp_path):
     params = bp.make_params(3, **SINGLE[name], dtype=dtype)
@@ -211,6 +216,7 @@ def test_sanitizers_find_nothing(tmp_path):
     np.testing.assert_array_equal(found, efforts_in_numpy(params, columns))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
 def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_path):
     params = bp.make_params(2, **{**SINGLE["pid"], "kp": 1.0, "ki": 1.0, "kd": 0.1})

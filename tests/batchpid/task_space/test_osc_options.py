@@ -164,6 +164,7 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how, decoupling):
     np.testing.assert_allclose(ts.advance(ts.discretise(stiffer, dt), found, *inputs, d)[1], again, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_native_numpy_and_jax_compute_the_same(x64):
     tree, rows, dt = planar((1.0, 0.8, 0.5)), 5, 1 / 300
     qpos, qvel = states(tree, rows)
