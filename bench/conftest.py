@@ -2,7 +2,7 @@
 
 With ``--benchmark-disable`` (``make test``) every case, and every check of ``make bench-check``, runs once on the tiny
 workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work. In a smoke run
-the rows of the jaco2 and of 2^20 envs are slow, for ``make soak``: those of the panda and of fewer run the same code.
+the rows of the jaco2 and of 2^20 envs are slow, for ``make soak``, and one physics preset of the ratios.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ class Comparison(NamedTuple):
 
 
 HERE = Path(__file__).parent
+MORE = re.compile(r"jaco2|1048576|\[panda, fast|floors\[panda-accurate")
+"""Rows whose smoke run is slow: others of the same test, or of the same cases, run the same code."""
 COMPARISONS = pytest.StashKey[list[Comparison]]()
 
 
@@ -68,7 +70,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if is_smoke(config):
         for item in items:
             item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
-            if item.path.is_relative_to(HERE) and re.search("jaco2|1048576", item.name):
+            if item.path.is_relative_to(HERE) and MORE.search(item.name):
                 item.add_marker(pytest.mark.slow)
 
 
