@@ -1,14 +1,17 @@
 """Fixtures of the benchmarks: the size of a run, and the summary of comparisons at its end.
 
 With ``--benchmark-disable`` (``make test``) every case, and every check of ``make bench-check``, runs once on the tiny
-workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work.
+workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work. In a smoke run
+the rows of the jaco2 and of 2^20 envs are slow, for ``make soak``, and one physics preset of the ratios.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -24,6 +27,7 @@ class Size(NamedTuple):
     """Number of envs in benchmarks of the law alone."""
     workers: float = math.inf
     ticks: float = math.inf
+    poses: float = math.inf
     rounds: float = math.inf
     seconds: float = math.inf
     """Duration of a measurement that repeats a call [s]."""
@@ -31,7 +35,7 @@ class Size(NamedTuple):
     """Whether ratios have to keep their floors."""
 
 
-SMOKE = Size(envs=2, rows=2048, workers=0, ticks=20, rounds=1, seconds=0.0, floors=False)
+SMOKE = Size(envs=2, rows=2048, workers=0, ticks=20, poses=1, rounds=1, seconds=0.0, floors=False)
 
 
 class Comparison(NamedTuple):
@@ -44,6 +48,9 @@ class Comparison(NamedTuple):
     least: float | None
 
 
+HERE = Path(__file__).parent
+MORE = re.compile(r"jaco2|1048576|\[panda, fast|floors\[panda-accurate")
+"""Rows whose smoke run is slow: others of the same test, or of the same cases, run the same code."""
 COMPARISONS = pytest.StashKey[list[Comparison]]()
 
 
@@ -59,16 +66,28 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select the tests marked ``check``, too, in a smoke run."""
+    """Select the tests marked ``check``, too, in a smoke run, and leave the second robot to the slow tests."""
     if is_smoke(config):
         for item in items:
             item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
+            if item.path.is_relative_to(HERE) and MORE.search(item.name):
+                item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")
 def most(pytestconfig: pytest.Config) -> Size:
     """Size of this run."""
     return SMOKE if is_smoke(pytestconfig) else Size()
+
+
+@pytest.fixture(scope="module")
+def quick_smoke() -> Iterator[None]:
+    """Let JAX compile with few optimisations."""
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -87,7 +87,7 @@ def test_ratios_keep_their_floors(check, most, name, physics):
 
     def measure():
         envs, workers, rounds = min(48, most.envs), min(2, most.workers), min(3, most.rounds)
-        workload = Workload(Robot.load(name), envs, workers, physics, ticks=60, rounds=rounds)
+        workload = Workload(Robot.load(name), envs, workers, physics, ticks=60 if most.floors else 50, rounds=rounds)
         results = measure_rates(workload, names=names)
         return {
             f"{floor.case} / {floor.over}": (results[floor.case].over(results[floor.over]), getattr(floor, physics))

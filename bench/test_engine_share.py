@@ -63,7 +63,8 @@ def engine_share(pose, physics, most):
 def test_engine_share(benchmark, compare, most, physics):
     benchmark.group = "closed loop over the bare engine, in one process"
     robot = Robot.load("panda")
-    poses = np.clip(robot.sample(POSES, seed=0), robot.lower + 0.02, robot.upper - 0.02)
+    count = int(min(POSES, most.poses))
+    poses = np.clip(robot.sample(POSES, seed=0)[:count], robot.lower + 0.02, robot.upper - 0.02)
     ratios = benchmark.pedantic(
         lambda: [statistics.median(engine_share(pose, physics, most)) for pose in poses], rounds=1
     )

@@ -364,7 +364,7 @@ def test_settled_filters_cost_the_same(benchmark, compare, most, kernel):
     pids = {name: bp.BatchPID(PARAMS, 64, DT, kernel) for name in ("moving", "settled")}
     for pid in pids.values():
         pid(r, y + 1)
-    for _ in range(min(10_000, 300 * most.ticks)):
+    for _ in range(min(10_000, 50 * most.ticks)):
         pids["settled"](r, y)
     moving = [y + 0.1, y - 0.1]
     ratios = []

@@ -24,6 +24,8 @@ ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 def setup(request, most):
     """Name of robot and physics, and the results of all cases. XLA and the peers run with "accurate" only."""
     name, physics = request.param
+    if not most.floors and physics == "accurate":  # with XLA
+        request.getfixturevalue("quick_smoke")
     envs, workers, rounds = min(ENVS, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
     peers = [each for each in PEERS if physics == "accurate" and importlib.util.find_spec(PEERS[each].package)]

@@ -51,6 +51,11 @@ SHORTER_CODE = {
 }
 TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))
 ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is slow
+RARE = {
+    # pages whose blocks seldom change and take seconds: slow
+    "python": ("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
+    "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md", "docs/gallery.md"),
+}
 ONLY_PARSED = ("bench", "tune", "identify", "render", "survey")
 
 
@@ -60,6 +65,12 @@ def name(page: Path) -> str:
 
 def blocks(page: Path, *languages: str) -> list[re.Match]:
     return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
+
+
+def pages_with(language: str) -> list:
+    """Return the pages with blocks in ``language``, the rare ones marked as slow."""
+    marks = {page: [pytest.mark.slow] if name(page) in RARE[language] else [] for page in PAGES}
+    return [pytest.param(page, marks=marks[page]) for page in PAGES if blocks(page, language)]
 
 
 def shell_lines(page: Path) -> list[list[str]]:
@@ -108,7 +119,7 @@ def test_every_page_is_in_the_index():
     assert all(f"({page.name})" in index for page in ROOT.glob("docs/*.md") if page.name != "README.md")
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
+@pytest.mark.parametrize("page", pages_with("python"), ids=name)
 def test_python_blocks_run(page, tmp_path, monkeypatch, capsys, request):
     monkeypatch.chdir(tmp_path)
     if "import jax" in page.read_text() and importlib.util.find_spec("jax"):
@@ -138,7 +149,7 @@ def test_commands_in_the_text_have_flags_that_exist(page):
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=name)
+@pytest.mark.parametrize("page", pages_with("sh"), ids=name)
 def test_commands_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_files()

@@ -48,6 +48,7 @@ def test_every_public_name_is_in_the_reference(package):
     assert [name for name in names if not places(package, name) & REFERENCE] == []
 
 
+@pytest.mark.slow
 def test_every_link_of_the_site_has_a_target(tmp_path, monkeypatch):
     pytest.importorskip("mkdocs")
     pytest.importorskip("material")

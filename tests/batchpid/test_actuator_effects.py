@@ -339,7 +339,9 @@ ALL = {
 }
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [pytest.param(np.float64, 1e-12, marks=pytest.mark.slow), (np.float32, 1e-5)]
+)
 def test_jax_agrees_with_numpy(dtype, tolerance, request):
     """Compiled, with every effect on but the resolution, whose steps rounding can move by one."""
     if dtype == np.float64:

@@ -12,6 +12,7 @@ from batchpid import backends
 from batchpid.law import blocks
 from batchpid.law.blocks import advance_in_blocks
 
+OTHERS = ("p", "per env", "zero effort", "everything")
 RATES = ("measurement_rate", "setpoint_rate", "feedforward")
 
 
@@ -36,18 +37,21 @@ def compare(params, inputs, rows):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("case", ["p", "per env", "mixed per env", "zero effort", "everything"])
+@pytest.mark.parametrize("case", ["mixed per env", *(pytest.param(case, marks=pytest.mark.slow) for case in OTHERS)])
 def test_steps_in_blocks_equal_plain_steps(case, inputs):
     """Four envs in blocks of three: the second block repeats two rows of the first."""
     compare(bp.make_params(JOINTS, **OPTIONS[case], dtype=np.float32), inputs, rows=3)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 4, 5])
+@pytest.mark.parametrize(
+    "rows", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow), 5]
+)
 def test_blocks_of_any_size(rows, inputs):
     params = bp.make_params(JOINTS, **LIMITED, anti_windup="back_calculation", dtype=np.float32)
     compare(params, inputs, rows)
 
 
+@pytest.mark.slow
 def test_gradients_through_blocks_equal_plain_gradients(inputs):
     params = bp.make_params(JOINTS, **GAINS, dtype=np.float32)
     r, y = (jnp.asarray(x[0], jnp.float32) for x in (inputs.setpoint, inputs.measurement))

@@ -29,7 +29,7 @@ def params(joints, **options):
     return bp.make_params(joints, 100.0, 50.0, 20.0, anti_windup="conditional", gain_units="mass_matrix", **options)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**31), envs=st.integers(1, 4), joints=st.integers(1, 5), hard=st.booleans())
 def test_the_effort_is_within_limits_and_keeps_the_direction_of_the_acceleration(seed, envs, joints, hard):
     rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def test_per_inertia_scales_every_gain_and_nothing_else():
         np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**31), envs=st.integers(1, 4), joints=st.integers(1, 5), limited=st.booleans())
 def test_a_rate_limit_keeps_the_direction_of_the_change_of_the_effort(seed, envs, joints, limited):
     rng = np.random.default_rng(seed)

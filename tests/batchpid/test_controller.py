@@ -22,12 +22,16 @@ def kind(request):
 
 
 # Each case is compiled; test_law_oracle.py compares the compiled law over every option.
-COMPILED = ("p", "per env", "rate and limits", "derivative weight", "mixed per env", "hold effort", "everything")
+COMPILED = [
+    *(("jax", case) for case in ("p", "rate and limits", "hold effort")),
+    *(
+        pytest.param("jax", case, marks=pytest.mark.slow)
+        for case in ("per env", "derivative weight", "mixed per env", "everything")
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    ("kind", "options"), [*(("numpy", case) for case in OPTIONS), *(("jax", case) for case in COMPILED)], indirect=True
-)
+@pytest.mark.parametrize(("kind", "options"), [*(("numpy", case) for case in OPTIONS), *COMPILED], indirect=True)
 def test_calls_equal_steps_of_the_law(kind, options, inputs):
     params = bp.make_params(JOINTS, **options)
     pid = bp.BatchPID(params, ENVS, DT, kind, terms=True)

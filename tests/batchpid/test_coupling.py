@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.motors.coupling import Coupling, Follower
@@ -29,6 +29,7 @@ def arrays(joints: int, seed: int = 0) -> tuple[np.ndarray, ...]:
     return rng.normal(size=(3, joints)), rng.normal(size=(3, joints)), root @ root.mT + np.eye(joints)
 
 
+@settings(max_examples=25)
 @given(couplings())
 def test_every_follower_is_where_its_leader_says_also_through_chains(case):
     coupling, followers = case
@@ -46,6 +47,7 @@ def test_every_follower_is_where_its_leader_says_also_through_chains(case):
     np.testing.assert_allclose(coupling.jacobian @ coupling.matrix, 0.0, atol=1e-12)
 
 
+@settings(max_examples=25)
 @given(couplings())
 def test_power_and_kinetic_energy_are_those_of_the_independent_joints(case):
     coupling, _ = case
@@ -66,6 +68,7 @@ def test_power_and_kinetic_energy_are_those_of_the_independent_joints(case):
     )
 
 
+@settings(max_examples=25)
 @given(couplings())
 def test_figures_of_followers_are_those_of_their_leaders(case):
     coupling, _ = case
@@ -83,6 +86,7 @@ def test_repr_shows_the_laws():
     assert repr(Coupling(2, [Follower(1, 0, -0.5, 0.1)])) == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
 
 
+@settings(max_examples=25)
 @given(couplings())
 def test_arrays_of_a_coupling_that_robots_share_are_read_only(case):
     coupling = case[0]

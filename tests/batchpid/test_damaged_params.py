@@ -92,14 +92,14 @@ DOCUMENTS = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(DOCUMENTS)
 def test_any_document_is_refused_or_valid(document):
     check(json.dumps(document))
     check(yaml.safe_dump(document))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.text(st.characters(codec="utf-8") | st.sampled_from("[]{}:,-?!&*|>'\"%@#\n "), max_size=60))
 def test_any_text_is_refused(text):
     with pytest.raises(bp.InvalidArgumentError):
@@ -111,7 +111,8 @@ def test_any_text_is_refused(text):
     [
         *('!!int ""', "!!int _", "!!float _", "!!bool x", "!!timestamp x", "!!binary '=='", "!!omap [a]", "!!merge x"),
         *("2001-13-45", "1e999", "1" + "0" * 5000, ".nan", "{<<: 1}", "!!python/object/apply:os.abort []"),
-        *("[" * 2_000, "{a: " * 2_000, "- " * 2_000, "? " * 2_000, "'" + "a\n" * 2_000, "!" * 2_000, "\x00"),
+        pytest.param("[" * 2_000, marks=pytest.mark.slow),
+        *("{a: " * 2_000, "- " * 2_000, "? " * 2_000, "'" + "a\n" * 2_000, "!" * 2_000, "\x00"),
     ],
 )
 def test_values_that_the_parser_trips_over_are_refused(value):

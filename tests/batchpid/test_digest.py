@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
@@ -80,11 +80,13 @@ def described(value: Any) -> str:
     return f"[{', '.join(map(described, value))}]" if isinstance(value, list) else repr(value)
 
 
+@settings(max_examples=25)
 @given(VALUES, VALUES)
 def test_digests_are_equal_if_and_only_if_the_content_is(one, two):
     assert (digest(one) == digest(two)) == (described(one) == described(two))
 
 
+@settings(max_examples=25)
 @given(PARAMS, PARAMS)
 def test_params_that_differ_in_a_leaf_have_other_digests(one, two):
     first, second = bp.make_params(3, **one), bp.make_params(3, **two)
@@ -92,6 +94,7 @@ def test_params_that_differ_in_a_leaf_have_other_digests(one, two):
     assert digest(first) == digest(bp.make_params(3, **one))
 
 
+@settings(max_examples=25)
 @given(GAINS, st.permutations(range(3)))
 def test_permuted_gains_have_another_digest(gains, order):
     permuted = [gains[at] for at in order]

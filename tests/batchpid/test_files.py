@@ -72,6 +72,7 @@ NOT_FILES = {
 }
 
 
+@pytest.mark.slow
 def test_every_file_is_written_by_the_atomic_writer():
     root = Path(batchpid.__file__).parents[1]
     folders = ("batchpid", "sim", "bench", "examples")

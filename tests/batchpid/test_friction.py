@@ -37,6 +37,7 @@ def simulate(mass, model, efforts, velocity=0.0, load=0.0):
     return tuple(map(np.array, zip(*rows, strict=True)))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15, deadline=None)
 def test_joints_come_to_rest_and_stay(seed):

@@ -81,7 +81,9 @@ def test_a_continuous_joint_takes_the_short_way_round():
     assert changed.ravel().tolist() == [True, True, False, False]
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [pytest.param(np.float64, 1e-12, marks=pytest.mark.slow), (np.float32, 1e-5)]
+)
 def test_jax_agrees_with_numpy(dtype, tolerance, request):
     if dtype == np.float64:
         request.getfixturevalue("x64")

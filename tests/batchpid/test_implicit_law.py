@@ -25,7 +25,7 @@ def solved(f):
     return -f(0.0) / (f(1.0) - f(0.0))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     gains=st.tuples(gain, st.none() | gain, st.none() | gain),
     dt=st.floats(1e-4, 0.1),
@@ -65,7 +65,7 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
         y += dt * v
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(kp=gain, ki=gain, kd=gain, dt=st.floats(1e-4, 1.0), order=st.sampled_from(["output_first", "integrate_first"]))
 def test_each_continuous_pole_s_becomes_1_over_1_minus_s_dt(kp, ki, kd, dt, order):
     p = bp.make_params(1, kp, ki, kd, integration=order, measurement_rate="measured", **IMPLICIT)

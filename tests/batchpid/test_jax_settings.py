@@ -58,6 +58,7 @@ def test_no_setting_changes_a_result(pid, name):
         np.testing.assert_array_equal(efforts(pid), expected)
 
 
+@pytest.mark.slow
 def test_all_of_them_at_once_in_large_batches(monkeypatch):
     monkeypatch.setattr(backends, "LARGE", 1)
     expected = efforts(controller())
@@ -65,6 +66,7 @@ def test_all_of_them_at_once_in_large_batches(monkeypatch):
         np.testing.assert_array_equal(efforts(controller()), expected)
 
 
+@pytest.mark.slow
 def test_settings_in_environment_variables_change_no_result(pid):
     values = {name.upper(): {True: "1"}.get(value, value) for name, value in SETTINGS.items()}
     program = (
@@ -123,7 +125,7 @@ def test_every_setting_that_is_needed_has_a_context():
             assert getattr(jax.config, name) in values
 
 
-@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("wide", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_pure_functions_obey_the_strict_modes(wide):
     """All functions that programs of the caller may trace; functions of float32 stay in float32 under 64-bit types."""
 

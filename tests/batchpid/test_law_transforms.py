@@ -18,6 +18,9 @@ IN_BOTH_DTYPES = [(case, np.float32) for case in OPTIONS] + [
     (case, np.float64) for case in ("mixed per env", "everything")
 ]
 
+QUICK = ("pid", "mixed per env", "filter", "integrate first", "setpoint weight", "continuous")
+GRADIENTS = [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS]
+
 
 @pytest.fixture
 def dtype(request):
@@ -81,14 +84,18 @@ def test_jit_compiles_once_over_every_option(options, inputs, dtype):
     assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
 
 
+SCANNED = ("p", "per env", "one limit", "derivative weight", "kick", "everything")
+
+
 @pytest.mark.parametrize(
-    "options", ["p", "per env", "one limit", "derivative weight", "mixed per env", "kick", "everything"], indirect=True
+    "options", ["mixed per env", *(pytest.param(case, marks=pytest.mark.slow) for case in SCANNED)], indirect=True
 )
 def test_scan_vmap_and_grad(options, inputs, x64):
     """The gradient of a scan over each of the options is compared below."""
     check_scan_vmap_and_grad(options, inputs, np.float64, {"rtol": 1e-12, "atol": 1e-11})
 
 
+@pytest.mark.slow
 def test_scan_vmap_and_grad_in_float32(inputs):
     check_scan_vmap_and_grad(OPTIONS["everything"], inputs, np.float32, {"rtol": 1e-4, "atol": 3e-4})
 
@@ -116,6 +123,7 @@ def check_scan_vmap_and_grad(options, inputs, dtype, tolerance):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.parametrize("options", GRADIENTS, indirect=True)
 def test_gradients_equal_finite_differences(options, inputs, x64):
     """Those of the law in NumPy. Away from saturation: the made-up run is scaled down, so that no limit is near."""
     options.pop("effort_rate_limit", None)
@@ -164,7 +172,7 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
     ("build", "strategy"),
     [
         pytest.param("make_params", {"anti_windup": "back_calculation"}, marks=pytest.mark.slow),
-        ("make_params", {"anti_windup": "conditional", "ki": 0.0}),
+        pytest.param("make_params", {"anti_windup": "conditional", "ki": 0.0}, marks=pytest.mark.slow),
         ("replace", {"anti_windup": "back_calculation"}),
     ],
     ids=str,

@@ -62,6 +62,7 @@ def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_me
     close(run(presets.simple_pid(1, kp, ki, kd, **options), path), expected)
 
 
+@pytest.mark.slow
 @given(
     series,
     st.lists(st.tuples(gain, gain, gain), min_size=25, max_size=25),

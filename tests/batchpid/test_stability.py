@@ -28,7 +28,7 @@ def test_one_joint_without_filter_is_the_textbook_bound():
     assert bound.participation == pytest.approx([1.0])
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(
     seed=st.integers(0, 2**31),
     joints=st.integers(1, 6),

@@ -45,10 +45,11 @@ def test_every_example_is_tested():
     assert {path.name for path in EXAMPLES.glob("*.py")} <= tested
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_process")
 @pytest.mark.parametrize(
     ("robot", "joint", "seconds"),
-    [pytest.param("jaco2", "j2s7s300_joint_4", "1.5", marks=pytest.mark.slow), ("panda", "panda_joint2", "4")],
+    [("jaco2", "j2s7s300_joint_4", "1.5"), ("panda", "panda_joint2", "4")],
 )
 def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot, joint, seconds):
     drive = ("drive_robot.py", robot, "--num-envs", "1", "--use-internal-drive", "--seconds")
@@ -84,6 +85,7 @@ def test_list_joints_lists_every_joint(run):
     assert "qpos: [0.   3.14 0." in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_process")
 def test_a_profile_is_followed_with_less_error_than_a_step(run):
     text = run("follow_trajectory.py")
@@ -92,6 +94,7 @@ def test_a_profile_is_followed_with_less_error_than_a_step(run):
     assert worst["minimum jerk"] < worst["trapezoidal"] < 0.1 < worst["step"]
 
 
+@pytest.mark.slow
 def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path):
     picture = tmp_path / "errors.png"
     text = run("steady_state.py", "--seconds", "3", "--picture", str(picture))
@@ -146,6 +149,7 @@ def test_the_trained_policy_reaches_nine_goals_of_ten(run, seed):
     assert float(share[1]) >= 90
 
 
+@pytest.mark.slow
 def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path):
     pytest.importorskip("mujoco")
     said = run("mujoco_log.py", "panda", "--seconds", "1", "--out", str(tmp_path / "log.csv"))
@@ -166,6 +170,7 @@ def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path)
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_has_no_stored_output_and_shows_tables_and_pictures(path):
     client = pytest.importorskip("nbclient")

@@ -113,7 +113,12 @@ def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, 
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [*((name, np.float64) for name in SINGLE), *((name, np.float32) for name in IN_FLOAT32)]
+    ("name", "dtype"),
+    [
+        *((name, np.float64) for name in IN_FLOAT32),
+        *(pytest.param(name, np.float64, marks=pytest.mark.slow) for name in SINGLE if name not in IN_FLOAT32),
+        *((name, np.float32) for name in IN_FLOAT32),
+    ],
 )
 def test_every_option_is_bit_identical(name, dtype, tmp_path):
     params = bp.make_params(3, **SINGLE[name], dtype=dtype)
@@ -179,6 +184,7 @@ def check_random_settings(folder, data, compiler, steps, *flags):
     np.testing.assert_array_equal(efforts_in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 @given(data=st.data())
 @settings(max_examples=10)
@@ -210,6 +216,7 @@ def test_sanitizers_find_nothing(tmp_path):
     np.testing.assert_array_equal(found, efforts_in_numpy(params, columns))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
 def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_path):
     params = bp.make_params(2, **{**SINGLE["pid"], "kp": 1.0, "ki": 1.0, "kd": 0.1})
@@ -250,7 +257,10 @@ int main(void) {{
 """
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("panda", np.float64), (0, np.float64), ("planar", np.float32)])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [pytest.param("panda", np.float64, marks=pytest.mark.slow), (0, np.float64), ("planar", np.float32)],
+)
 def test_the_dynamics_of_the_robot(name, dtype, tmp_path):
     tree = planar(gravity=(0.0, -9.81, 0.0)) if name == "planar" else tree_of(name)
     tree = dataclasses.replace(tree, armature=np.linspace(0, 0.2, tree.dof))

@@ -130,7 +130,7 @@ def test_a_delay_is_of_the_setpoint_in_whole_steps():
 
 
 @given(random_params())
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_nothing_is_lost_that_is_not_listed(params):
     inertia = np.array([2.0, 1.0, 0.5])
     text, differences = to_newton(params, JOINTS, DT, inertia=inertia)
@@ -170,7 +170,7 @@ def test_nothing_is_lost_that_is_not_listed(params):
 
 
 @given(random_params())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_params_without_a_listed_difference_have_the_targets_efforts(params):
     params = params.replace(gain_units="effort", dtype=np.float64)
     text, differences = to_newton(params, JOINTS, DT)

@@ -101,7 +101,7 @@ def test_a_dc_motor_is_the_law_within_the_motors_envelope(limit):
 
 
 @given(random_params())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_params_without_a_listed_difference_have_the_targets_efforts(params):
     params = params.replace(gain_units="effort", dtype=np.float64)
     text, differences = to_isaac_lab(params, JOINTS, DT, model="ideal_pd")
@@ -198,7 +198,7 @@ def test_maniskill_has_lists_in_the_order_of_the_joints():
 
 
 @given(random_params(), st.sampled_from(["implicit", "ideal_pd", "maniskill"]))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_nothing_is_lost_that_is_not_listed(params, target):
     inertia = np.array([2.0, 1.0, 0.5])
     options = {} if target == "maniskill" else {"model": target}

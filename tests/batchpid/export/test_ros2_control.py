@@ -170,7 +170,7 @@ def test_the_schema_refuses_what_the_target_refuses():
 
 
 @given(random_params(), st.sampled_from(CONTROLLERS))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(params, controller):
     exported = to_ros2_control(params, JOINTS, DT, controller=controller, inertia=[2.0, 1.0, 0.5])
     check_schema(exported.text, controller)
@@ -199,7 +199,7 @@ def test_a_round_trip_loses_only_what_is_listed(params, controller):
 
 
 @given(random_params(), st.sampled_from(CONTROLLERS))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_params_without_a_listed_difference_have_the_targets_efforts(params, controller):
     params = params.replace(gain_units="effort", dtype=np.float64)
     exported = to_ros2_control(params, JOINTS, DT, controller=controller)

@@ -31,7 +31,7 @@ def assert_identical(ours, theirs):
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
     rng, (rows, columns) = np.random.default_rng(seed), shape
     shapes = st.sampled_from([shape, (1, columns), (rows, 1), (1, 1)])
@@ -45,7 +45,7 @@ def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_constants_of_one_row_of_all_rows_and_numbers(shape, dtype, seed, data):
     def function(k, high, x):
         xp = x.__array_namespace__()
@@ -119,7 +119,7 @@ def test_the_guard_can_be_traced(options, dtype):
 
 
 @given(SHAPES, st.integers(2, 40), st.booleans(), st.integers(0, 2**32), st.integers(1, 4))
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
     rng, (rows, columns) = np.random.default_rng(seed), shape
     history = rng.normal(size=(rows, samples, (1 + is_pair) * columns))

@@ -167,6 +167,7 @@ def load_instead(monkeypatch, path):
     load.cache_clear()
 
 
+@pytest.mark.slow
 @needs_extension
 @needs_compiler
 def test_an_extension_of_permuted_operations_is_refused(monkeypatch, build):
@@ -179,6 +180,7 @@ def test_an_extension_of_permuted_operations_is_refused(monkeypatch, build):
         assert not steps()[1]
 
 
+@pytest.mark.slow
 @needs_extension
 @needs_compiler
 def test_results_that_differ_are_found_under_the_right_digests(monkeypatch, build):

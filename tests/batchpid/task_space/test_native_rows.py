@@ -36,7 +36,7 @@ def assert_same(found, wanted, tolerance):
     assert np.abs(found - wanted).max(initial=0) <= tolerance * np.abs(wanted).max(initial=1.0)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     name=st.sampled_from(TREES), rows=st.integers(0, 9), seed=st.integers(0, 2**31), pointed=st.sampled_from([0, 1, 2])
 )
@@ -61,7 +61,7 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
         assert_same(leaf, other, 1e-12)
 
 
-@settings(max_examples=80)
+@settings(max_examples=30)
 @given(
     name=st.sampled_from(["panda", "jaco2", 0, 1, 2]),
     rows=st.integers(1, 9),
@@ -114,7 +114,7 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras, 
         assert_same(*parts, 10 * tolerance)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     name=st.sampled_from(TREES),
     rows=st.integers(1, 9),

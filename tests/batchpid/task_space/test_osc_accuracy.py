@@ -140,7 +140,7 @@ def test_the_force_on_a_wall_is_the_one_asked_for():
     assert np.abs(errors[-1][:, axes]).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["straight elbow", "aligned wrist"])
+@pytest.mark.parametrize("name", ["straight elbow", pytest.param("aligned wrist", marks=pytest.mark.slow)])
 def test_a_setpoint_out_of_reach_for_2_s_and_back(name):
     """At most 0.01 N m of chatter per step while it is out of reach, and 0.05 mm after the return."""
     dt = 1 / 500

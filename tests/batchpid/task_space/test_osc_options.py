@@ -37,6 +37,7 @@ def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias
     return np.array(errors), state, q, v
 
 
+@pytest.mark.slow
 def test_an_integral_learns_a_load_that_the_model_does_not_know():
     tree, qpos = tree_of("panda"), np.tile(START, (2, 1))
     goal, load = ts.link_poses(tree, qpos, [HAND])[:, 0], np.array([0, 0, -20.0, 0, 1.0, 0])
@@ -163,6 +164,7 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how, decoupling):
     np.testing.assert_allclose(ts.advance(ts.discretise(stiffer, dt), found, *inputs, d)[1], again, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_native_numpy_and_jax_compute_the_same(x64):
     tree, rows, dt = planar((1.0, 0.8, 0.5)), 5, 1 / 300
     qpos, qvel = states(tree, rows)

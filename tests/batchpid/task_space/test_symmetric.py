@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
@@ -19,6 +19,7 @@ def matrices(seed, rows, size, spread=1.0):
     return (axes * values[:, None]) @ axes.transpose(0, 2, 1), values
 
 
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), size=st.integers(1, 9))
 def test_inverse_and_solution_are_those_of_linalg(seed, size):
     matrix, _ = matrices(seed, 5, size)
@@ -29,6 +30,7 @@ def test_inverse_and_solution_are_those_of_linalg(seed, size):
     np.testing.assert_allclose(gram(factor, factor), right.transpose(0, 2, 1) @ solve(matrix, right), atol=1e-8)
 
 
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), size=st.integers(1, 6))
 def test_eigenvalues_are_those_of_linalg(seed, size):
     matrix, wanted = matrices(seed, 4, size, spread=4.0)
@@ -38,6 +40,7 @@ def test_eigenvalues_are_those_of_linalg(seed, size):
     np.testing.assert_allclose(vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(size), (4, 1, 1)), atol=1e-13)
 
 
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), singular=st.booleans())
 def test_the_bounded_inverse_changes_small_eigenvalues_only(seed, singular):
     matrix, values = matrices(seed, 6, 6)
