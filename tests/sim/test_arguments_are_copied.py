@@ -160,7 +160,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), rates=st.booleans(), data=st.data())
 def test_a_controller_keeps_nothing_of_the_callers(law, backend, seed, rates, data):
@@ -243,6 +243,7 @@ class Gain:
         return state, passive + self.stiffness * (setpoint - qpos) - qvel
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_worker_that_is_replaced_gets_the_controller_as_it_was():
     ends = []

@@ -103,7 +103,7 @@ def run(arm, control=None, ticks=30, **options):
 # -- the control reaches its setpoint, whatever runs it ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
 def test_the_tool_reaches_its_command_in_any_number_of_workers(arm, backend):
     if backend == "jax":
         pytest.importorskip("jax")
@@ -415,6 +415,7 @@ def test_recordings_hold_names_and_units(arm, rollout, suffix, tmp_path):
     assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
 
 
+@pytest.mark.slow
 def test_the_recorder_streams_them(arm, tmp_path):
     h5py = pytest.importorskip("h5py")
     setpoints = np.random.default_rng(1).uniform(0.5, 1.0, (9, N, 2))
@@ -439,6 +440,7 @@ def test_a_labelled_dataset_has_entries(rollout):
     assert data.qpos.dims == ("time", "env", "joint")
 
 
+@pytest.mark.slow
 def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
     titles = ["shoulder", "elbow", "setpoint x [m]", "setpoint z [m]", "setpoint gain <b>"]
     figure = plots.step_responses(rollout, mark=1)

@@ -114,6 +114,7 @@ def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failure
     assert len(one[4]) == (first - 1) // SUBSTEPS
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_lost_worker_does_not_change_the_error():
     controller = FailsLater([(3, 11), (17, 14)])

@@ -67,6 +67,7 @@ def test_a_child_has_the_settings_of_its_caller_and_nothing_else(tmp_path: Path,
     assert len(files - {0, 1, 2, descriptor}) == 1  # the folder that was listed
 
 
+@pytest.mark.slow
 def test_another_environment_starts_another_server(monkeypatch):
     first, _ = start("wait")
     before = server_pid()
@@ -124,6 +125,7 @@ def test_a_server_that_cannot_start_is_an_error(monkeypatch):
         start("wait")
 
 
+@pytest.mark.slow
 def test_a_server_without_children_ends(monkeypatch):
     monkeypatch.setattr(fork_server, "_PROGRAM", fork_server._PROGRAM.replace("serve()", "serve(0.2)"))
     monkeypatch.setenv("COLOUR", "black")

@@ -27,7 +27,11 @@ def test_gymnasiums_own_checks_pass():
     check_env(env.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("mode", AutoresetMode)
+MODES = [AutoresetMode.NEXT_STEP]
+MODES += [pytest.param(mode, marks=pytest.mark.slow) for mode in AutoresetMode if mode not in MODES]
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("actions", ["increment", pytest.param("setpoint", marks=pytest.mark.slow)])
 def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mode, actions):
     """Equal observations, rewards, flags and infos through time limits, success and resets."""

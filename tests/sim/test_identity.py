@@ -67,6 +67,7 @@ def test_other_controls(control):
     assert_identical(run(workers=2, pack_size=8, control=control), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_another_robot():
     assert_identical(run("jaco2", workers=2, pack_size=3), in_this_process("sapien", "jaco2"))

@@ -134,6 +134,7 @@ def test_a_call_from_a_forked_child_raises(runner, panda):
     assert runner.step(panda.start).ok.all()
 
 
+@pytest.mark.slow
 def test_a_stopped_worker_with_a_full_socket_does_not_block_the_caller(panda, monkeypatch):
     def small_socketpair(**options):
         ends = socketpair(**options)
@@ -200,6 +201,7 @@ for limit in (before + 5, before + 12):
     assert "sys.executable" in third
 
 
+@pytest.mark.slow
 def test_workers_start_without_standard_streams_from_another_folder_and_with_odd_entries_in_sys_path():
     program = """
 import os, pathlib, sys, warnings

@@ -68,7 +68,7 @@ def episodes(runner, num_envs=N):
 
 
 @pytest.mark.usefixtures("engine")
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
+@pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
     robot, runs = load_bundled(name), []
     cases = ((N, {}), (N, {"workers": 2}), (N, {"pack_size": 1}), (2, {}))

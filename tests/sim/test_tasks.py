@@ -228,6 +228,7 @@ def test_bad_arguments_of_a_tools_task_are_named():
         PushVectorEnv(1, engine="mujoco")
 
 
+@pytest.mark.slow
 def test_a_pushed_box_is_the_same_in_workers_and_after_a_lost_one():
     """Both tools go straight ahead; the goal of each is beyond its box."""
     runs = []

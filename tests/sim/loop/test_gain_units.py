@@ -69,7 +69,7 @@ def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
     np.testing.assert_allclose(*efforts, rtol=1e-6)
 
 
-@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
+@pytest.mark.parametrize("units", [pytest.param("inertia", marks=pytest.mark.slow), "mass_matrix"])
 def test_gain_units_change_in_flight_without_a_bump(units, panda):
     """Integrals that carry the robot's weight carry on in the unit of the new gains, back and forth."""
     gains = {"kp": 400.0, "ki": 800.0, "kd": 40.0, "derivative_filter_time": 2e-3}

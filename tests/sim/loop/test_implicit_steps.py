@@ -16,7 +16,9 @@ from batchpid.trajectories import minimum_jerk
 DURATION, HELD = 1.0, 0.3
 
 
-@pytest.fixture(scope="module", params=["panda", "jaco2", "tree"])
+@pytest.fixture(
+    scope="module", params=["panda", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jaco2", "tree"))]
+)
 def arm(request, tmp_path_factory):
     if request.param != "tree":
         return load_bundled(request.param)

@@ -51,6 +51,7 @@ def commands(robot, ticks, seed=0):
     return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
 
 
+@pytest.mark.slow
 def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
     chosen, table = actuators(panda), commands(panda, 12)
     with Runner(panda, N, workers=0, substeps=5, actuators=chosen) as runner:

@@ -35,7 +35,9 @@ def params(robot, **options):
     return robot.params(**options)
 
 
-KINDS = [("jaco2", "pid", 2), ("jaco2", "drive", 0), ("jaco2", "effort", 0), (RUBBING, "pid", 0), (RUBBING, "drive", 0)]
+KINDS: list = [("jaco2", "pid", 2), (RUBBING, "drive", 0)]
+MORE_KINDS = [("jaco2", "drive", 0), ("jaco2", "effort", 0), (RUBBING, "pid", 0)]
+KINDS += [pytest.param(*kind, marks=pytest.mark.slow) for kind in MORE_KINDS]
 
 
 @pytest.mark.usefixtures("engine")

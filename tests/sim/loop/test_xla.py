@@ -91,6 +91,7 @@ def test_contacts_and_faults_are_those_of_the_loop_in_numpy(panda, engine, optio
     assert bool(results[0][1]) == ("speed_limit" in options)
 
 
+@pytest.mark.slow
 def test_any_groups_and_packs_are_bit_identical(panda):
     expected = rollout(panda, envs=20, ticks=6)
     assert_identical(rollout(panda, envs=20, ticks=6, pack_size=1), expected)
@@ -237,6 +238,7 @@ def test_a_controller_that_cannot_be_traced_is_an_error(panda, controller, probl
         runner.step(np.zeros(panda.dof))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", ["pid", Counter()], ids=["pid", "controller"])
 def test_without_native_calls_the_law_is_called_each_sim_step(monkeypatch, panda, control):
     monkeypatch.setenv(native.SWITCH, "0")

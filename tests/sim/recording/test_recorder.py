@@ -200,6 +200,7 @@ with Runner(robot, 3, params=robot.params(), workers=0, substeps=2) as runner:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_raises_and_what_was_recorded_can_be_read(tmp_path):
     path = tmp_path / "run.h5"
     done = subprocess.run(
@@ -248,7 +249,7 @@ def limited_disk(folder, kind, size):
         subprocess.run(["umount", str(folder)], check=True)
 
 
-@pytest.mark.parametrize("kind", ["disk", "file size"])
+@pytest.mark.parametrize("kind", ["disk", pytest.param("file size", marks=pytest.mark.slow)])
 def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(files, "CHUNK_BYTES", 2048)
     monkeypatch.setattr(partial_file, "METADATA_BYTES", 1 << 15)
@@ -386,6 +387,7 @@ def test_a_kill_at_any_moment_loses_at_most_a_second(tmp_path):
         assert_at_most_a_second_is_lost(read_recording(tmp_path / f"run{case}.h5.partial"), ticks)
 
 
+@pytest.mark.slow
 def test_ticks_wait_for_a_slow_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "WRITE_PERIOD", 0.05)
     monkeypatch.setattr(recorder_module, "MAX_LAG", 0.2)
@@ -414,6 +416,7 @@ def test_ticks_wait_for_a_slow_disk(tmp_path, monkeypatch):
     assert len(read_recording(tmp_path / "run.h5").time) == len(ticks)
 
 
+@pytest.mark.slow
 def test_plot_draws_complete_and_partial_recordings(tmp_path, capsys):
     for name in ("a.h5", "b.h5"):
         with make() as runner, Recorder(tmp_path / name, runner):

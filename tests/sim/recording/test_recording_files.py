@@ -362,7 +362,7 @@ def test_hdf5_that_hangs_or_crashes_is_ended(tmp_path, monkeypatch):
         hdf5.read_hdf5(path, ["time"], 1, 10**9)
 
 
-@pytest.fixture(params=[".npz", ".h5", ".h5.partial"])
+@pytest.fixture(params=[".npz", ".h5", pytest.param(".h5.partial", marks=pytest.mark.slow)])
 def small_file(request, tmp_path, rollout, monkeypatch):
     """A small recording, for the tests that damage it: whole, or as a kill leaves it."""
     skip_without_h5py(request.param)

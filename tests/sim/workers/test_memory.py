@@ -53,6 +53,7 @@ def test_more_envs_than_the_machine_has_memory_for_are_refused():
     assert estimate_memory(RunnerOptions(ROBOT, smaller), smaller) < psutil.virtual_memory().total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_the_estimate_is_below_what_the_envs_take_but_not_far(engine):
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")

@@ -103,6 +103,7 @@ def test_a_lost_worker_is_replaced(undisturbed):
     assert_identical(undisturbed, rollout)
 
 
+@pytest.mark.slow
 def test_workers_that_end_with_their_fork_server_are_replaced(undisturbed):
     with make_runner() as runner:
         lost, acts = runner.pids, {7: lambda: send(server_pid(), signal.SIGKILL)}
@@ -136,6 +137,7 @@ def test_a_worker_that_is_stopped_during_a_tick_is_noticed():
             runner.step(ROBOT.settings.target)
 
 
+@pytest.mark.slow
 def test_the_error_of_a_worker_that_is_asleep_holds_its_stack():
     def sleep_for_ever(*_):
         import threading as threads
@@ -153,6 +155,7 @@ def test_the_error_of_a_worker_that_is_asleep_holds_its_stack():
     assert "test_recovery.py" in str(info.value)
 
 
+@pytest.mark.slow
 def test_a_worker_that_exceeds_the_timeout_is_noticed():
     def work_for_ever(*_):
         while True:
@@ -177,12 +180,14 @@ def test_workers_are_pinned_if_there_are_as_many_as_cores():
         assert {frozenset(os.sched_getaffinity(pid)) for pid in runner.pids} == {frozenset(cores)}
 
 
+@pytest.mark.slow
 def test_a_worker_with_a_long_tick_does_not_count_as_stuck():
     with make_runner(workers=1, recover=False) as runner:
         obs = runner.step(ROBOT.settings.target, substeps=4_000)  # more than a second in one tick
         assert obs.ok.all()
 
 
+@pytest.mark.slow
 def test_workers_killed_between_ticks_and_during_their_replay_are_replaced(undisturbed):
     with make_runner() as runner:
         for pid in runner.pids:
@@ -220,6 +225,7 @@ def test_resets_params_and_snapshots_are_replayed():
         assert runner.recoveries == 4
 
 
+@pytest.mark.slow
 def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
     """In the first call of each method of the loop the worker dies after the work, before its answer."""
     methods = ("reset", "set_params", "run", "snapshot", "restore", "poses")
@@ -337,6 +343,7 @@ def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
         assert tape.times == (runner.time,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
 def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
     results = []

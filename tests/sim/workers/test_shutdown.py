@@ -47,8 +47,14 @@ def start(body, workers=2, **options):
 
 LONG = "while True: runner.step(robot.settings.target, substeps=1000000)"
 SHORT = "while True: runner.step(robot.settings.target)"
-ENDS: list = [(signal.SIGINT, LONG), (signal.SIGKILL, LONG)]
-MORE_ENDS = [(signal.SIGTERM, LONG), (signal.SIGSEGV, LONG), (signal.SIGKILL, SHORT), (signal.SIGINT, SHORT)]
+ENDS: list = [(signal.SIGKILL, LONG)]
+MORE_ENDS = [
+    (signal.SIGINT, LONG),
+    (signal.SIGTERM, LONG),
+    (signal.SIGSEGV, LONG),
+    (signal.SIGKILL, SHORT),
+    (signal.SIGINT, SHORT),
+]
 ENDS += [pytest.param(*end, marks=pytest.mark.slow) for end in MORE_ENDS]
 
 
@@ -66,6 +72,7 @@ def test_workers_end_with_a_parent_that_gets_a_signal(number, body):
         assert error.rstrip().endswith("KeyboardInterrupt")
 
 
+@pytest.mark.slow
 def test_stopped_workers_end_with_a_parent_that_is_killed():
     process, pids = start(SHORT)
     with process:
@@ -90,10 +97,10 @@ def test_workers_outlive_the_thread_that_made_them(panda):
 @pytest.mark.parametrize(
     ("body", "status"),
     [
-        ("raise RuntimeError('the caller')", 1),
+        pytest.param("raise RuntimeError('the caller')", 1, marks=pytest.mark.slow),
         pytest.param("sys.exit(7)", 7, marks=pytest.mark.slow),  # the interpreter ends as with an error
         pytest.param("runner.close(); runner.close(); sys.exit(3)", 3, marks=pytest.mark.slow),
-        ("import os; os._exit(9)", 9),
+        pytest.param("import os; os._exit(9)", 9, marks=pytest.mark.slow),
         ("runner.step(robot.settings.target); del runner; print('end')", 0),
         pytest.param("f = Runner.__exit__; f(runner, None, None, None)", 0, marks=pytest.mark.slow),
     ],
@@ -107,6 +114,7 @@ def test_workers_end_with_their_runner_or_with_the_program(body, status):
     assert "Exception ignored" not in error
 
 
+@pytest.mark.slow
 def test_a_forked_child_does_not_end_the_workers_of_its_parent():
     body = """
     import os
@@ -124,7 +132,8 @@ def test_a_forked_child_does_not_end_the_workers_of_its_parent():
     assert have_ended(pids)
 
 
-@pytest.mark.parametrize("kind", ["stdin", pytest.param("script", marks=pytest.mark.slow), "thread"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["stdin", "script", "thread"])
 def test_programs_need_no_main_guard(kind, tmp_path):
     text = PROGRAM.format(body="print(runner.step(robot.settings.target).ok.all(), len(runner.pids))", workers=1)
     if kind == "thread":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 from batchpid.sim import Robot, Runner
 robot = Robot.load("panda")
@@ -13,6 +15,7 @@ with Runner(robot, 1, workers=1) as runner:
 """
 
 
+@pytest.mark.slow
 def test_workers_do_not_run_modules_of_the_working_folder(tmp_path):
     modules = {"json.py", "sim.py", "numpy.py"}
     for module in modules:
