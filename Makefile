@@ -1,12 +1,12 @@
 # make demo    64 robots under one batch PID: a table, and a picture in out/demo.png
-# make test     all tests but the minutes-long ones, and every benchmark on a tiny workload
+# make test     all tests but the slow ones, and every benchmark on a tiny workload
 # make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
 # make check    linter, formatter, types, floors and docs: what CI runs before the tests
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
 # make figures  measure and redraw docs/performance.md (6 minutes, on an idle machine)
-# make soak     the minutes-long tests, each result as it comes (an hour)
+# make soak     the slow tests, each result as it comes (an hour)
 # make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
 # Each builds .venv if it is missing or older than pyproject.toml, and the extensions if they are older than their

@@ -1,17 +1,14 @@
 """Fixtures of the benchmarks: the size of a run, and the summary of comparisons at its end.
 
 With ``--benchmark-disable`` (``make test``) every case, and every check of ``make bench-check``, runs once on the tiny
-workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work. In a smoke run
-the rows of the jaco2 and of 2^20 envs are slow, for ``make soak``, and one physics preset of the ratios.
+workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work.
 """
 
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -48,9 +45,6 @@ class Comparison(NamedTuple):
     least: float | None
 
 
-HERE = Path(__file__).parent
-MORE = re.compile(r"jaco2|1048576|\[panda, fast|floors\[panda-accurate")
-"""Rows whose smoke run is slow: others of the same test, or of the same cases, run the same code."""
 COMPARISONS = pytest.StashKey[list[Comparison]]()
 
 
@@ -66,12 +60,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select the tests marked ``check``, too, in a smoke run, and leave the second robot to the slow tests."""
+    """Select the tests marked ``check``, too, in a smoke run."""
     if is_smoke(config):
         for item in items:
             item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
-            if item.path.is_relative_to(HERE) and MORE.search(item.name):
-                item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

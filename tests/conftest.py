@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -32,8 +33,18 @@ def quick_compilation() -> Iterator[None]:
     jax.clear_caches()
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each slow test hours: its limit is there to end one that hangs, also on a machine that is busy."""
+    """Make most rows of tests with ``quick_rows`` slow, and give each slow test hours, to end only one that hangs."""
+    rows: dict[tuple[str, int], list[pytest.Item]] = {}
+    for item in items:
+        if (quick := item.get_closest_marker("quick_rows")) is not None and item.get_closest_marker("slow") is None:
+            rows.setdefault((item.nodeid.partition("[")[0], quick.args[0]), []).append(item)
+    for (_, count), found in rows.items():
+        kept = {round(place) for place in np.linspace(0, len(found) - 1, count)}
+        for number, item in enumerate(found):
+            if number not in kept:
+                item.add_marker(pytest.mark.slow)
     for item in items:
         if item.get_closest_marker("slow") is not None:
             item.add_marker(pytest.mark.timeout(4 * 3600), append=False)

@@ -101,6 +101,7 @@ else:
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize(
     ("required", "status", "message"),
     [

@@ -31,6 +31,7 @@ COMPILED = [
 ]
 
 
+@pytest.mark.quick_rows(14)
 @pytest.mark.parametrize(("kind", "options"), [*(("numpy", case) for case in OPTIONS), *COMPILED], indirect=True)
 def test_calls_equal_steps_of_the_law(kind, options, inputs):
     params = bp.make_params(JOINTS, **options)

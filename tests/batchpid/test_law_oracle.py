@@ -12,6 +12,7 @@ ALL = ("measurement_rate", "setpoint_rate", "feedforward")
 SOME = [("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]
 
 
+@pytest.mark.quick_rows(50)
 def test_step_equals_the_scalar_law(backend, options, inputs):
     """With all inputs in one float type of JAX, without in the other: each is another program to compile."""
     for given in {"jax64": [()], "jax32": [ALL]}.get(backend.name, [(), ALL]):

@@ -139,6 +139,7 @@ def test_without_the_option_a_nan_propagates_in_its_joint():
     assert terms.finite.tolist() == [[True, False]]
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize(
     "case", [case if case in TRACKED else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS]
 )

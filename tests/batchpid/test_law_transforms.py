@@ -57,6 +57,7 @@ def numpy_rollout(params, setpoint, measurement):
     return np.array(efforts)
 
 
+@pytest.mark.quick_rows(14)
 @pytest.mark.parametrize(("options", "dtype"), IN_BOTH_DTYPES, indirect=True)
 def test_jit_compiles_once_over_every_option(options, inputs, dtype):
     params = on_jax(bp.make_params(JOINTS, **options, dtype=dtype), dtype)
@@ -168,6 +169,7 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "strategy"),
     [
@@ -209,6 +211,7 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, strategy, in
         np.testing.assert_allclose(slope @ step, (compiled(kp + step) - compiled(kp - step)) / 2, rtol=1e-5)
 
 
+@pytest.mark.quick_rows(14)
 @pytest.mark.parametrize(("options", "dtype"), IN_BOTH_DTYPES, indirect=True)
 def test_params_whose_leaves_are_all_traced_can_be_changed(options, dtype):
     """The arguments of a compiled function: replace gives the same result as outside."""

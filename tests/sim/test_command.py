@@ -127,6 +127,7 @@ def test_a_command_has_any_size(arm, more, backend):
         np.testing.assert_array_equal(seen.qpos, expected.qpos)
 
 
+@pytest.mark.slow
 def test_commands_are_replayed_for_a_lost_worker(arm):
     setpoints = np.random.default_rng(4).uniform(0.5, 1.0, (4, N, 3))
     control = Shapes(1)
@@ -286,6 +287,7 @@ def test_commands_of_joints_have_their_names_and_units(panda):
 # -- faults -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize(
     ("on_fault", "backend", "workers"),
     [("hold", "numpy", 0), ("reset", "numpy", 2), ("hold", "jax", 0)],

@@ -61,6 +61,7 @@ def test_any_number_of_envs(reference):
     assert_identical(many, reference(), slice(0, 20))
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("control", ["drive", "effort"])
 def test_other_controls(control):
     expected = in_this_process("sapien", control=control)
@@ -73,6 +74,7 @@ def test_another_robot():
     assert_identical(run("jaco2", workers=2, pack_size=3), in_this_process("sapien", "jaco2"))
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("control", ["pid", "drive"])
 def test_a_robot_with_friction_and_damping(control, reference):
     expected = reference(RUBBING, control=control)
@@ -106,6 +108,7 @@ def test_a_rollout_and_its_ticks_one_by_one(panda):
     assert rollout.time[-1] == pytest.approx(TICKS * 20 / 2000)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_rollout_with_checkpoints_faults_rates_and_feedforwards(panda, workers):

@@ -60,6 +60,7 @@ def test_a_call_from_another_thread_raises(runner, panda):
     assert runner.step(panda.start).ok.all()
 
 
+@pytest.mark.quick_rows(1)
 def test_threads_may_take_turns(runner, panda):
     steps = []
     lock = threading.Lock()
@@ -79,6 +80,7 @@ def test_threads_may_take_turns(runner, panda):
             assert_identical(other.step(panda.settings.target), step)
 
 
+@pytest.mark.quick_rows(1)
 def test_a_call_from_a_signal_handler_raises(runner, panda, on_alarm):
     raised = []
 

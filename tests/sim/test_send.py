@@ -57,6 +57,7 @@ def test_halves_in_turns_are_bit_identical_to_the_whole():
         half.close()
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("moment", ["before send", "during the tick", "after the tick"])
 def test_a_worker_lost_around_a_sent_tick_is_replaced(moment):
     with make() as runner, make(0) as model:

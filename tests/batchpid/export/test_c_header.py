@@ -112,6 +112,7 @@ def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, 
     return {name: column.astype(dtype) for name, column in columns.items()}
 
 
+@pytest.mark.quick_rows(8)
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [

@@ -94,6 +94,7 @@ def assert_refused(result: tuple[int, str], folder: Path, before: dict[str, byte
     assert contents(folder) == before
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize("name", ROWS)
 def test_places_that_cannot_be_written_to_are_refused_before_the_run(name, command, tmp_path, monkeypatch):
     path = tmp_path / "place" / COMMANDS[name][1]
@@ -109,6 +110,7 @@ def test_places_that_cannot_be_written_to_are_refused_before_the_run(name, comma
         assert_refused(command(name, tmp_path / "new" / path.name), tmp_path, before)
 
 
+@pytest.mark.quick_rows(6)
 @pytest.mark.parametrize("name", ROWS)
 @pytest.mark.parametrize("make", [fill, make_read_only], ids=["full", "read-only"])
 def test_disks_that_cannot_be_written_to_are_refused_before_the_run(make, name, command, tmp_path):

@@ -42,6 +42,7 @@ def make_log(folder, engine="sapien"):
     return folder / "pendulum.urdf", write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("engine", "evaluations"),
     [("sapien", 1), *(pytest.param(engine, 4, marks=pytest.mark.slow) for engine in ("sapien", "mujoco"))],

@@ -43,6 +43,7 @@ def default_motion(tmp_path_factory):
         return dict(file)
 
 
+@pytest.mark.quick_rows(4)
 @pytest.mark.parametrize(
     "flags",
     [

@@ -54,6 +54,7 @@ def shell(line: str, folder: Path, status: str = "$?") -> tuple[int, str, str]:
     return ran.returncode, ran.stdout, ran.stderr
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize(
     ("line", "status", "lines"),
     [

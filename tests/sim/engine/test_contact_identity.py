@@ -159,6 +159,7 @@ def test_robots_in_free_motion_share_systems(name, packs):
         assert packs.isolated() == 0
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_isolated_keeps_its_drives(jaco2, packs):
     """Targets, gains and limits of the engine's drives are copied to the new system."""
     target, runs = closed_hand(jaco2), []
@@ -183,6 +184,7 @@ def test_a_robot_that_is_isolated_keeps_its_payload_and_friction(jaco2, packs):
     assert_identical(*runs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_snapshot_in_contact_is_the_same_barrier_for_any_packing(jaco2, workers):
     ticks = 5

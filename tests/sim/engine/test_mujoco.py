@@ -142,6 +142,7 @@ def test_a_link_named_world_and_a_floating_base(tmp_path):
 # -- the motion --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize(
     ("name", "options", "tolerance"),
     [

@@ -56,6 +56,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick_rows(4)
 @needs_extension
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(

@@ -54,6 +54,7 @@ def push(robot, efforts, seconds, physics="accurate", qvel=0.0, qpos=0.0, subste
         return runner.rollout(np.broadcast_to(setpoint, (ticks, *setpoint.shape)))
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize("physics", PRESETS)
 @pytest.mark.parametrize(("inertia", "friction"), [(0.1, 1.0), (10.0, 1.0), (1e-5, 0.1)])
 def test_a_joint_sticks_below_its_friction_and_moves_above_it(physics, inertia, friction, tmp_path):
@@ -80,6 +81,7 @@ def test_a_joint_never_creeps(physics, tmp_path):
     assert np.abs(moved).max() < 1e-5
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize("physics", PRESETS)
 @pytest.mark.parametrize(("inertia", "friction"), [(0.1, 1.0), (0.02, 0.05), (1e-5, 0.1)])
 def test_a_moving_joint_stops_when_the_equation_says(physics, inertia, friction, tmp_path):
@@ -182,6 +184,7 @@ def test_sapiens_own_dissipation_is_the_engines(tmp_path):
     np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("control", ["pid", "drive"])
 @pytest.mark.parametrize("physics", PRESETS)
 def test_known_friction_is_compensated_without_chatter(control, physics, tmp_path):

@@ -58,6 +58,7 @@ def undisturbed_in(engine):
         return runner.rollout(setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9)))
 
 
+@pytest.mark.quick_rows(5)
 @pytest.mark.parametrize(("name", "bad", "workers"), BAD)
 def test_a_command_that_is_not_finite_suspends_its_env_alone(name, bad, workers, undisturbed):
     table, rates, forward = setpoints(12), np.zeros((12, N, 9)), np.zeros((12, N, 9))
@@ -227,12 +228,14 @@ def check_random_fault(case):
     assert np.isfinite(broken.effort).all()
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("case", [*range(3), 86])  # 86: the state stays finite, at 1e28 rad
 def test_the_other_63_of_64_envs_are_bit_identical(case):
     check_random_fault(case)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("control", ["pid", "effort"])
 def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(control, monkeypatch):

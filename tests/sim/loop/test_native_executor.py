@@ -48,6 +48,7 @@ def rollout(robot, ticks=20, rates=False, forward=False, **options):
 AHEAD, GUARD = {"rates": True, "forward": True}, {"guard": True}
 
 
+@pytest.mark.quick_rows(5)
 @pytest.mark.parametrize(
     ("name", "case", "more"),
     [

@@ -45,6 +45,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("case", CASES)
 def test_motion_is_that_of_the_law_in_numpy(case):
     name, options = CASES[case]
@@ -71,6 +72,7 @@ def test_two_seconds_of_motion(name, physics, dtype):
     np.testing.assert_allclose(ours.qpos[-1], theirs.qpos[-1], rtol=0, atol=atol)
 
 
+@pytest.mark.quick_rows(2)
 @needs_extension
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("options", [{}, {"speed_limit": 60.0, "on_fault": "reset"}, {"compensate": "none"}], ids=str)

@@ -83,6 +83,7 @@ def test_all_that_leave_programs_compiled_at_once(case, wide):
         assert_identical(motion(case), wanted)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_all_of_them_at_once(case):
     wanted = expected(case)

@@ -234,6 +234,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.quick_rows(4)
 @pytest.mark.parametrize("case", DAMAGE)
 def test_a_damaged_h5_file_is_refused(case, tmp_path, rollout):
     h5py = pytest.importorskip("h5py")
@@ -283,6 +284,7 @@ STRANGE = {
 }
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("case", STRANGE)
 def test_h5_files_of_strangers_open_no_other_file_and_take_no_memory(case, tmp_path, rollout):
     h5py = pytest.importorskip("h5py")

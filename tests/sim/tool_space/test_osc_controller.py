@@ -289,6 +289,7 @@ MORE = [
 ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
 
 
+@pytest.mark.quick_rows(4)
 @pytest.mark.parametrize(
     ("engine", "case", "more"),
     [

@@ -91,6 +91,7 @@ def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
     assert last.endswith("joint 'panda_joint4': 2.00 x limit")
 
 
+@pytest.mark.slow
 def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
     moves = random_moves(panda, 2, 2)
     drawn, actuators = usual_variation(panda)

@@ -168,6 +168,7 @@ def test_a_worker_that_exceeds_the_timeout_is_noticed():
         runner.step(ROBOT.settings.target)
 
 
+@pytest.mark.slow
 def test_workers_are_pinned_if_there_are_as_many_as_cores():
     cores = os.sched_getaffinity(0)
     with Runner(ROBOT, 8 * len(cores) + 8, params=ROBOT.params(), workers=len(cores), recover=True) as runner:

@@ -270,6 +270,7 @@ def _edited(rows: np.ndarray, row: int, value: float) -> np.ndarray:
     return np.where(np.arange(len(rows)) == row, value, rows)
 
 
+@pytest.mark.quick_rows(3)
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
