@@ -110,7 +110,7 @@ class MovingJoints(NamedTuple):
         rest[list(joints)] = 0.0
         leader[list(joints)], multiplier[list(joints)] = np.arange(len(joints)), 1.0
         if (coupling := robot.coupling) is not None:
-            followers = np.flatnonzero(coupling.followers)
+            followers = coupling.followers
             leader[followers] = leader[coupling.leader[followers]]
             multiplier[followers] = coupling.multiplier[followers] * multiplier[coupling.leader[followers]]
             rest = np.where(robot.independent, rest, coupling.multiplier * rest[coupling.leader] + coupling.offset)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robots import load_bundled
-from tiny_urdf import random_tree, robot, write
+from tiny_urdf import LIMIT, joint, link, random_tree, robot, write
 
 from batchpid.sim import Robot
 from batchpid.sim.engine import native
@@ -65,6 +65,24 @@ def test_the_extension_gives_what_pinocchio_gives(name, joints, tmp_path):
         args = (qpos, qvel, 0.1 * effort), expected.matrix, 5 * effort, added, friction_of(qpos.shape, keep), DT
         for leaf, wanted in zip(fast.step(*args), slow.step(*args), strict=True):
             np.testing.assert_allclose(leaf, wanted, rtol=0, atol=1e-12 * (1 + np.abs(wanted).max()))
+
+
+@pytest.mark.parametrize("moves", [(0, 1), (1,)], ids=str)
+@pytest.mark.parametrize("kind", [pytest.param(NativeBatchDynamics, marks=needs_extension), PinocchioBatchDynamics])
+def test_followers_move_with_their_leaders(kind, moves, tmp_path):
+    mimics = ('<mimic joint="two" multiplier="-0.5" offset="0.2"/>', '<mimic joint="three" multiplier="3"/>')
+    joints = [joint("one", "a", "b"), joint("two", "b", "c")]
+    joints += [joint("three", "c", "d", inner=LIMIT + mimics[0]), joint("four", "c", "e", inner=LIMIT + mimics[1])]
+    arm = Robot.load(write(tmp_path, robot(*map(link, "abcde"), *joints)))
+    coupling, model = arm.coupling, arm.dynamics()
+    rng, places = np.random.default_rng(0), list(moves)
+    qpos, qvel = np.tile(arm.start, (5, 1)), np.zeros((5, arm.dof))
+    qpos[:, places], qvel[:, places] = rng.uniform(-1, 1, (2, 5, len(moves)))
+    whole, rates, still = coupling.positions(qpos), coupling.rates(qvel), np.zeros((5, arm.dof))
+    columns = coupling.matrix[:, places]
+    found = kind(models_of(arm), MovingJoints.of(arm, moves)).at(qpos[:, places], qvel[:, places], np.zeros((5, 1)))
+    np.testing.assert_allclose(found.matrix, columns.T @ model.mass_matrix(whole) @ columns, rtol=1e-6)
+    np.testing.assert_allclose(found.force, model.inverse_dynamics(whole, rates, still) @ columns, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [NativeBatchDynamics, PinocchioBatchDynamics])
