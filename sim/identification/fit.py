@@ -93,7 +93,7 @@ def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = l
         gain = before - cost
         weighed = factors.at(x * scale) / sizes[..., None, None]
         moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
-        promised = _promised(weighed) / problem.count
+        promised = _promised(weighed, (bounds[0] - x, bounds[1] - x)) / problem.count
         done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or promised < LEAST_GAIN
         if done or factors.left <= 0:
             return Solution(x * scale, cost, sizes, factors.windows(x * scale), promised)
@@ -124,14 +124,20 @@ def _deviations(factors: Float64, prior: Float64) -> Float64:
     return np.linalg.norm(np.linalg.inv(root), axis=1)
 
 
-def _promised(factors: Float64) -> float:
-    """Return the decrease of the negative logarithm of the likelihood that linear residuals would allow."""
+def _promised(factors: Float64, bounds: tuple[Float64, Float64]) -> float:
+    """Return the decrease of the negative logarithm of the likelihood by the best step within ``bounds``.
+
+    Residuals are taken as linear, r - J d. A direction that a bound closes, such as to a payload below 0, promises
+    nothing.
+    """
+    from scipy.optimize import lsq_linear
+
     table = factors.reshape(-1, factors.shape[-1])
     if not np.isfinite(table).all():
         return np.inf
     residuals = table[:, -1]
-    explained = table[:, :-1] @ np.linalg.lstsq(table[:, :-1], residuals)[0]
-    return 0.5 * float(explained @ explained)
+    left = residuals - table[:, :-1] @ lsq_linear(table[:, :-1], residuals, bounds, method="bvls").x
+    return 0.5 * float(residuals @ residuals - left @ left)
 
 
 class _Factors:

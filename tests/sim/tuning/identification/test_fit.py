@@ -1,4 +1,4 @@
-"""The count of evaluations of a fit, on a problem of linear residuals."""
+"""Fits at a bound, on a problem of linear residuals: evaluations left, and the decrease that is still promised."""
 
 from types import SimpleNamespace
 
@@ -7,6 +7,7 @@ import pytest
 
 from batchpid.sim.identification.fit import Step, fit
 from batchpid.sim.identification.problem import Evaluation
+from batchpid.sim.identification.statistics import UNFINISHED
 
 TIME = np.linspace(0, 1, 8)
 JACOBIAN = np.stack([np.ones(8), TIME], axis=-1)[:, None]
@@ -38,3 +39,12 @@ def test_a_fit_at_a_bound_leaves_no_less_than_no_evaluation(evaluations):
     again = fit(Line(), steps[-1])  # as from a history
     assert (again.theta == found.theta).all()
     assert again.cost == found.cost
+
+
+def test_what_a_bound_closes_promises_nothing():
+    """A fit whose best point is at a bound has arrived: its unknowns count as found."""
+    begun = fit(Line(), Step.first(np.zeros(2), 0))
+    assert begun.promised > 10 * UNFINISHED
+    arrived = fit(Line(), Step.first(np.zeros(2), 40))
+    assert arrived.theta == pytest.approx([1.0, 1.0], abs=1e-3)
+    assert arrived.promised < UNFINISHED
