@@ -26,7 +26,7 @@ from hypothesis.stateful import (
 from processes import send
 from twin import ROBOT, CtrlC, N, Twin, nothing_left, undisturbed, warnings_raised
 
-EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "20"))
+EXAMPLES = int(os.environ.get("BATCHPID_SOAK_MACHINES", "12"))
 CTRL_C = CtrlC()
 ENGINES = ["sapien", "mujoco"] if find_spec("mujoco") else ["sapien"]
 

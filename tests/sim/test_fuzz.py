@@ -23,7 +23,7 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError
 from batchpid.sim import Randomization, Recorder, Robot, Runner, Snapshot, Uniform, read_recording
 
-CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "10000"))
+CASES = int(os.environ.get("BATCHPID_SOAK_CASES", "5000"))
 ROBOT = load_bundled("panda")
 DOF, N = ROBOT.dof, 2
 PARAMS = ROBOT.params()

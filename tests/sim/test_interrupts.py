@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from twin import ROBOT, SUBSTEPS, CtrlC, InterruptAt, N, Twin, nothing_left
 
-INTERRUPTS = int(os.environ.get("BATCHPID_SOAK_INTERRUPTS", "200"))
+INTERRUPTS = int(os.environ.get("BATCHPID_SOAK_INTERRUPTS", "100"))
 NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
 SETPOINTS = np.tile(ROBOT.settings.target, (12, 1))
 FIRST = np.arange(N) == 0
