@@ -11,8 +11,8 @@ import pytest
 
 from batchpid.sim import Recorder, Runner, Snapshot, read_recording
 
-SECONDS = float(os.environ.get("BATCHPID_SOAK_SECONDS", "20"))
-# These are 3 million env steps, and half of them again: some minutes. An hour of simulated time takes hours.
+SECONDS = float(os.environ.get("BATCHPID_SOAK_SECONDS", "30"))
+# These are 4 million env steps, and half of them again: some minutes. An hour of simulated time takes hours.
 TIMESTEP = float(os.environ.get("BATCHPID_SOAK_TIMESTEP", str(1 / 2000)))
 PHYSICS = os.environ.get("BATCHPID_SOAK_PHYSICS", "accurate")
 NUM_ENVS, TICK = 64, 0.1
