@@ -11,7 +11,7 @@ import yaml
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.sim import Robot
+from batchpid.sim import Robot, Runner
 from batchpid.sim.cli.identify import report
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.excitation import excite
@@ -441,3 +441,33 @@ def test_the_motors_of_an_arm_are_found(name, mujoco_log, kind, seed):
     assert sum(inside) >= len(inside) - 2
     assert found.interval("delay")[0] == pytest.approx(truth.delay, abs=2e-4)
     assert found.held_out_error[1] < 0.1 * found.held_out_error[0]
+
+
+@pytest.mark.slow
+def test_motors_that_move_a_mimic_joint_are_found(tmp_path):
+    """A follower as heavy as its leader, in MuJoCo."""
+    pytest.importorskip("mujoco")
+    fore, elbow = ARM[ARM.index('<link name="fore">') :], ARM[ARM.index('<joint name="elbow"') :]
+    link = fore[: fore.index("</link>") + 7].replace("fore", "twin")
+    joint = elbow[: elbow.index("</joint>")].replace("fore", "twin").replace("elbow", "follower")
+    joint = joint.replace("0 0 0.4", "0 0.2 0.4") + '<mimic joint="elbow" multiplier="-1"/></joint>'
+    (tmp_path / "arm.urdf").write_text(ARM.replace("</robot>", f"{link}{joint}</robot>"))
+    robot = Robot.load(tmp_path / "arm.urdf")
+    joints, params = [0, 1], robot.designed("effort")
+    truth = bp.make_actuators(
+        3, armature=[0.1, 0.03, 0], viscous=[0.5, 0.2, 0], coulomb=[0.6, 0.3, 0], strength=0.9, command_delay=0.004
+    )
+    motion = np.repeat(excite(robot, 6.0).position, 4, axis=0)  # of 500 Hz
+    options = {"params": params, "actuators": truth, "compensate": "gravity+coriolis", "engine": "mujoco"}
+    with Runner(robot, 1, workers=0, substeps=1, **options) as runner:
+        begin = runner.reset(motion[:1]).qpos
+        rollout = runner.rollout(motion[:, None])
+    time, qpos = np.arange(len(motion)) / 2000, np.concatenate([begin, rollout.qpos[:, 0]])[:-1]
+    log = Log("log", (0, 1), "setpoint", time, qpos[:, joints], time, motion[:, joints], False)
+    of_log = bp.PIDParams(*(leaf[:, joints] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    found = identify(robot, log, params=of_log, payload=False, workers=0)
+    for kind, name in (("armature", "armature"), ("damping", "viscous"), ("friction", "coulomb")):
+        for joint in joints:
+            wanted = float(getattr(truth, name)[0, joint])
+            assert found.interval(kind, joint)[0] == pytest.approx(wanted, rel=0.03), (kind, joint)
+    assert found.interval("delay")[0] == pytest.approx(0.004, abs=1e-4)
