@@ -168,7 +168,6 @@ def test_a_snapshot_holds_the_draws(tmp_path):
         np.testing.assert_array_equal(other.episodes, last)
 
 
-@pytest.mark.slow
 def test_a_snapshot_of_another_randomization_is_refused():
     with make() as runner:
         snapshot = runner.snapshot()

@@ -249,7 +249,6 @@ def limited_disk(folder, kind, size):
         subprocess.run(["umount", str(folder)], check=True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["disk", pytest.param("file size", marks=pytest.mark.slow)])
 def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(files, "CHUNK_BYTES", 2048)

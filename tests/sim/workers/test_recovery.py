@@ -344,7 +344,7 @@ def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
         assert tape.times == (runner.time,)
 
 
-@pytest.mark.slow
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("workers", [0, 2])
 def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
     results = []
