@@ -48,6 +48,7 @@ def test_ratio_is_where_the_exact_loop_turns_unstable(seed, joints, filter_time,
     assert spectral_radius(mass, above * kp, 0.0, above * kd, DT, **options) > 1
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("filter_time", [0.0, 2e-3])
 def test_the_simulated_law_is_stable_up_to_the_bound_and_diverges_above(filter_time):
     """Chains of four masses, an env each: the first half with gains below the bound."""

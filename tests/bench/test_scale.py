@@ -39,6 +39,7 @@ def test_without_costs_a_cluster_is_as_fast_as_its_cores():
     assert result.efficiency == pytest.approx(1.0, rel=5e-3)  # a replay each hour
 
 
+@pytest.mark.slow
 def test_a_full_network_card_limits_the_rate():
     costs = SCALE["Costs"](**FREE | {"bandwidth": 1e9}, **EVEN)
     result = SCALE["simulate"](1000, 19, costs)

@@ -119,6 +119,7 @@ def run(commands, seed, workers, disturb):
 COMMANDS = ("step", "send", "rollout", "reset", "params", "actuators", "snapshot")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning", "ignore::batchpid.sim.SetpointWarning")
 @settings(max_examples=4, deadline=None)
 @given(commands=st.permutations(COMMANDS), seed=st.integers(0, 2**32 - 1), workers=st.sampled_from([0, 1]))

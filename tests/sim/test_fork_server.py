@@ -107,6 +107,7 @@ def test_wait_has_a_limit():
     child.send_signal(signal.SIGTERM)  # of no effect
 
 
+@pytest.mark.slow
 def test_children_end_with_a_server_that_is_killed_and_another_takes_its_place():
     child, _ = start("wait")
     os.kill(server_pid(), signal.SIGKILL)

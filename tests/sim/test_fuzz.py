@@ -310,6 +310,7 @@ def test_a_call_that_a_runner_refuses_changes_nothing(runner):
     fuzz(120, check_method, runner)
 
 
+@pytest.mark.slow
 def test_a_call_that_a_containing_runner_refuses_changes_nothing(containing):
     fuzz(60, check_method, containing)
 

@@ -79,6 +79,7 @@ def same(ours, theirs):
     return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(plain(theirs[-1]))
 
 
+@pytest.mark.slow
 def test_results_depend_on_the_seed_and_not_on_the_workers():
     def run(workers, seed):
         with_workers = ReachVectorEnv(5, workers=workers, actions="increment")
@@ -110,6 +111,7 @@ def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
     theirs.close()
 
 
+@pytest.mark.slow
 def test_a_setpoint_at_the_goal_reaches_it_and_raises_the_reward():
     gains = {"kp": 600.0, "kd": 50.0, "ki": 0.0, "derivative_filter_time": 2e-3}
     probe = ReachVectorEnv(1, workers=0)

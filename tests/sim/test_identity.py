@@ -45,16 +45,19 @@ def reference(engine):
     return functools.partial(in_this_process, engine)
 
 
+@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("workers", [0, 3])
 def test_any_number_of_workers(workers, reference):
     assert_identical(run(workers=workers), reference())
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("pack_size", [1, 8])
 def test_any_pack_size(pack_size):
     assert_identical(run(workers=0, pack_size=pack_size), in_this_process("sapien"))
 
 
+@pytest.mark.quick_rows(1)
 def test_any_number_of_envs(reference):
     many = run(num_envs=24, workers=0)
     assert_identical(run(num_envs=1, workers=0), many, slice(0, 1))
@@ -83,6 +86,7 @@ def test_a_robot_with_friction_and_damping(control, reference):
     assert_identical(alone, expected, slice(0, 1))
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.usefixtures("engine")
 def test_an_episode_with_friction_does_not_depend_on_when_it_begins():
     robot = load_bundled(RUBBING)

@@ -170,6 +170,7 @@ def run(program):
     return done.stdout.splitlines() or done.stderr
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_be_started_leave_nothing_behind():
     program = """
 import gc, os, resource, sys, warnings

@@ -67,6 +67,7 @@ def episodes(runner, num_envs=N):
     return first, runner.rollout(command)
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
@@ -146,6 +147,7 @@ def test_new_params_are_randomized_and_an_env_keeps_its_draws():
         runner.params = PANDA.params(kd=None)
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.usefixtures("engine")
 def test_a_snapshot_holds_the_draws(tmp_path):
     command = setpoints()
@@ -238,6 +240,7 @@ def assert_kills_change_nothing(kills, seed=0):
     np.testing.assert_array_equal(snapshot.episodes, other.episodes)
 
 
+@pytest.mark.slow
 def test_lost_workers_draw_the_same_again():
     assert_kills_change_nothing(1)
 

@@ -68,6 +68,7 @@ def test_limit_moves_leave_the_limits_of_one_joint(panda):
     assert not panda.dynamics().in_contact(moves.target).any()
 
 
+@pytest.mark.slow
 def test_free_motion_hardly_depends_on_the_solver(panda):
     errors = accuracy.measure_errors(panda, "free", count=1, seconds=0.1)
     accurate, *others = (errors[name, "equation of motion"] for name in PHYSICS)

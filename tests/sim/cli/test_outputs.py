@@ -83,6 +83,7 @@ def test_every_command_with_outputs_has_force():
     assert {name for name, command in COMMANDS.items() if hasattr(command, "force")} == WORDS.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("empty_pictures")
 def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -66,6 +66,7 @@ def test_tune_resumes_an_interrupted_search_and_writes_params_with_settings_and_
     assert not history.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_designed_gains_are_written_where_the_tuned_ones_are_worse(batchpid, tmp_path, monkeypatch):
     """With settings of the types of their options: text "False" would be true to any program that reads it."""

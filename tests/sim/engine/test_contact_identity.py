@@ -48,6 +48,7 @@ def reference(name="jaco2", physics="accurate", engine="sapien"):
 PACKED, SHARED = {"pack_size": 8}, {"pack_size": 4, "workers": 2}
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize(
     ("options", "name", "physics"),
     [
@@ -71,7 +72,8 @@ def test_without_contact_prediction_results_depend_on_the_packing(monkeypatch):
     assert (shared.qpos != thrash(pack_size=1, physics="fast").qpos).any((0, 2)).sum() > 2
 
 
-@pytest.mark.parametrize("name", [pytest.param("jaco2", marks=pytest.mark.slow), "panda"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["jaco2", "panda"])
 def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name):
     robot = load_bundled(name)
     poses = robot.sample(N, seed=1)
@@ -90,7 +92,8 @@ def test_robots_that_fall_onto_the_ground_are_bit_identical_for_any_packing(name
     assert_identical(fall(8), first)
 
 
-@pytest.mark.parametrize("engine", ["sapien", pytest.param("mujoco", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"], indirect=True)
 @pytest.mark.usefixtures("engine")
 def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     robot = Robot.load("panda", fixed_base=False)
@@ -102,6 +105,7 @@ def test_robots_on_a_floating_base_are_bit_identical_for_any_packing():
     assert_identical(*runs)
 
 
+@pytest.mark.quick_rows(1)
 def test_an_env_alone_is_bit_identical_to_the_same_env_among_others(jaco2, engine):
     with Runner(jaco2, 1, workers=0, control="effort", params=jaco2.params(**OPEN_LOOP)) as runner:
         alone = runner.rollout(random_efforts(jaco2)[:, :1])
@@ -109,6 +113,7 @@ def test_an_env_alone_is_bit_identical_to_the_same_env_among_others(jaco2, engin
     assert np.abs(alone.qpos - jaco2.start).max() > 0.5
 
 
+@pytest.mark.quick_rows(1)
 def test_neighbours_of_an_env_that_fails_are_bit_identical(jaco2, engine):
     effort = random_efforts(jaco2)
     effort[7, 5, 3] = np.nan

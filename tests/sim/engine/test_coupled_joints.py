@@ -57,11 +57,12 @@ def constraint_error(robot: Robot, qpos: np.ndarray) -> float:
     return float(np.abs(qpos - robot.coupling.positions(qpos)).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("multiplier", "offset", "physics"),
     [
-        pytest.param(-1.0, 0.0, "accurate", marks=pytest.mark.slow),
-        pytest.param(1.0, 0.0, "fast", marks=pytest.mark.slow),
+        (-1.0, 0.0, "accurate"),
+        (1.0, 0.0, "fast"),
         (0.5, 0.01, "accurate"),
     ],
 )
@@ -139,9 +140,8 @@ def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
     np.testing.assert_allclose(seen.qpos[-1, 0, free], q[0, free], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "control", ["pid", *(pytest.param(each, marks=pytest.mark.slow) for each in ("drive", "effort"))]
-)
+@pytest.mark.quick_rows(1)
+@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
 def test_results_do_not_depend_on_packs_workers_or_snapshots(control, tmp_path):
     robot = arm(tmp_path, joints=2)
     start = robot.sample(9, seed=1)

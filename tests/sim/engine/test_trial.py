@@ -15,6 +15,7 @@ def refuse() -> None:
     raise RobotError("no such robot")
 
 
+@pytest.mark.slow
 def test_a_trial_runs_in_a_process_of_its_own():
     first, second = in_child(os.getpid), in_child(os.getpid)
     assert len({first, second, os.getpid()}) == 3

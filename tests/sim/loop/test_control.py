@@ -1,6 +1,7 @@
 """Controls "pid", "drive" and "effort", and changes of params in flight."""
 
 import numpy as np
+import pytest
 
 from batchpid.sim import Runner
 
@@ -17,6 +18,7 @@ def error_after(runner, seconds):
     return np.abs(obs.qpos - POSE)[:, ARM].max()
 
 
+@pytest.mark.slow
 def test_the_integral_of_a_drive_removes_the_error_of_gravity(panda):
     options = {"effort_limit": None, "anti_windup": "none"}
     sagging = panda.params(kp=400.0, ki=0.0, kd=80.0, **options)

@@ -90,6 +90,7 @@ def test_resets_by_mask_and_snapshots_keep_the_state(panda, tmp_path):
         other.restore(snapshot)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
 def test_a_lost_worker_is_replaced(panda):
     setpoints = np.ones((2, panda.dof))

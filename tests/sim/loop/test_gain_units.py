@@ -41,6 +41,7 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
     assert (m.steady_state_error[0, arm] < 1e-3).all()
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
 def test_any_packing_and_workers_are_bit_identical(units, panda):
     robot = panda
@@ -69,7 +70,8 @@ def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
     np.testing.assert_allclose(*efforts, rtol=1e-6)
 
 
-@pytest.mark.parametrize("units", [pytest.param("inertia", marks=pytest.mark.slow), "mass_matrix"])
+@pytest.mark.slow
+@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
 def test_gain_units_change_in_flight_without_a_bump(units, panda):
     """Integrals that carry the robot's weight carry on in the unit of the new gains, back and forth."""
     gains = {"kp": 400.0, "ki": 800.0, "kd": 40.0, "derivative_filter_time": 2e-3}

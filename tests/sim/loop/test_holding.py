@@ -1,6 +1,7 @@
 """Robots at rest, with the friction and damping of the URDF: efforts alone hold them in their pose."""
 
 import numpy as np
+import pytest
 
 from batchpid.sim import Runner
 
@@ -16,6 +17,7 @@ def drift(runner, seconds=3.0):
     return far
 
 
+@pytest.mark.slow
 def test_passive_force_alone_holds_the_pose(panda):
     with Runner(panda, 1, control="effort", workers=0) as runner:
         assert drift(runner) < 1e-3

@@ -69,6 +69,7 @@ def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
         assert_identical(first.for_envs(slice(2)), runner.rollout(table[:6, :2]))
 
 
+@pytest.mark.slow
 def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_packs(panda):
     """In flight too: a history is as long as the largest delay of all envs, in every group."""
     envs, table = 20, np.tile(panda.settings.target, (4, 1))
@@ -91,6 +92,7 @@ def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_p
         assert_identical(ours, theirs)
 
 
+@pytest.mark.slow
 def test_a_lost_worker_leaves_no_trace(panda):
     chosen, table = actuators(panda), commands(panda, 6)
     other = actuators(panda, seed=1, command_delay=0.006, lag=None)

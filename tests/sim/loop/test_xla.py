@@ -72,7 +72,7 @@ def test_two_seconds_of_motion(name, physics, dtype):
     np.testing.assert_allclose(ours.qpos[-1], theirs.qpos[-1], rtol=0, atol=atol)
 
 
-@pytest.mark.quick_rows(2)
+@pytest.mark.quick_rows(1)
 @needs_extension
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("options", [{}, {"speed_limit": 60.0, "on_fault": "reset"}, {"compensate": "none"}], ids=str)

@@ -76,7 +76,8 @@ def test_no_setting_changes_a_motion(case, name):
         assert_identical(motion(case), wanted)
 
 
-@pytest.mark.parametrize(("case", "wide"), [("pid", True), pytest.param("controller", False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("case", "wide"), [("pid", True), ("controller", False)])
 def test_all_that_leave_programs_compiled_at_once(case, wide):
     wanted = expected(case)
     with changed(**{**SETTINGS, "jax_disable_jit": False, "jax_enable_x64": wide}):

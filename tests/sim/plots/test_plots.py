@@ -174,6 +174,7 @@ def test_joints_by_name_or_index():
             plots.efforts(rollout, joints=[unknown])
 
 
+@pytest.mark.slow
 def test_png_and_svg(tmp_path):
     figure = plots.step_responses(make(1), title="one joint")
     png = plots.save(figure, tmp_path / "a" / "b" / "run.png")

@@ -75,6 +75,7 @@ def test_setpoints_under_control_by_effort_are_in_newton_metres(tmp_path):
         assert file["setpoint"].attrs["unit"][0] == "N m"
 
 
+@pytest.mark.slow
 def test_a_growing_recording_can_be_read(tmp_path):
     with make() as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
         rollout = runner.rollout(table(5))

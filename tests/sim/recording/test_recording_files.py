@@ -410,6 +410,7 @@ def flips(content, count, seed):
         yield bytes(damaged)
 
 
+@pytest.mark.quick_rows(1)
 def test_a_file_with_a_flipped_bit_is_refused_or_equal(small_file):
     count = 200 if small_file.suffix == ".npz" else 10  # a process reads each .h5 file
     assert 0 < assert_refused_or_equal(small_file, flips(small_file.read_bytes(), count, 0)) < count
@@ -420,6 +421,7 @@ def test_a_file_with_any_of_many_flipped_bits_is_refused_or_equal(small_file):
     assert assert_refused_or_equal(small_file, flips(small_file.read_bytes(), 150, 1)) > 0
 
 
+@pytest.mark.quick_rows(1)
 def test_a_truncated_file_is_refused_or_equal(small_file):
     content = small_file.read_bytes()
     some = 15 if small_file.suffix == ".npz" else 6

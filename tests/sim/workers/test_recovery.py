@@ -130,6 +130,7 @@ def test_a_worker_that_dies_is_noticed_while_another_works():
             runner.observe()
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_stopped_during_a_tick_is_noticed():
     with make_runner(recover=False) as runner:
         send(runner.pids[1], signal.SIGSTOP)
@@ -201,6 +202,7 @@ def test_workers_killed_between_ticks_and_during_their_replay_are_replaced(undis
     assert_identical(undisturbed, rollout)
 
 
+@pytest.mark.quick_rows(1)
 @pytest.mark.usefixtures("engine")
 def test_resets_params_and_snapshots_are_replayed():
     def program(runner, kill):

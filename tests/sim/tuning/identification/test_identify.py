@@ -258,6 +258,7 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     assert found.uncertainty.singular_values[-1] < 1e-3
 
 
+@pytest.mark.slow
 def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothing(arm, runs):
     truth, _, efforts = runs
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
