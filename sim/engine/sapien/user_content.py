@@ -137,10 +137,12 @@ def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapie
     try:
         returned = build(scene, env)
     except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
+        where = traceback.extract_tb(error.__traceback__)[
+            -1
+        ]  # in a worker, cloudpickle may have dropped the file's name
         raise InvalidArgumentError(
             "build",
-            f"raised {type(error).__name__}: {error} ({where.filename}:{where.lineno})",
+            f"raised {type(error).__name__}: {error} (in {where.name}, {where.filename}:{where.lineno})",
             env=env,
             remedy="correct the function; try it with workers=0 for the whole traceback",
         ) from error

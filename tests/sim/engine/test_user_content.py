@@ -112,7 +112,7 @@ def test_errors_of_build_name_it_and_the_env():
 
     for workers in (0, 2):
         with pytest.raises(
-            InvalidArgumentError, match=r"build, env 2: raised KeyError: 'no such thing'.*test_user_content"
+            InvalidArgumentError, match=r"build, env 2: raised KeyError: 'no such thing' \(in wrong, .*:\d+\)"
         ):
             run(wrong, workers=workers)
     with pytest.raises(InvalidArgumentError, match="other than entities"):
