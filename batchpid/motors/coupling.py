@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.read_only import read_only
 
 
@@ -29,6 +30,62 @@ class Follower(NamedTuple):
     leader: int
     multiplier: float = 1.0
     offset: float = 0.0
+
+
+class Share(NamedTuple):
+    """Followers of the leaders, one of each leader at most; arrays (joints,)."""
+
+    exists: Any
+    """Whether the joint has this follower."""
+    joint: Any
+    """Index of the follower, 0 without it."""
+    multiplier: Any
+
+
+class CouplingArrays(NamedTuple):
+    """Arrays of a :class:`Coupling` (joints,), for functions of NumPy arrays, or of symbols in a trace."""
+
+    leader: Any
+    multiplier: Any
+    offset: Any
+    independent: Any
+    shares: tuple[Share, ...]
+    """The first followers of all leaders, the second ones, and so on."""
+
+    def positions(self, qpos: Any) -> Any:
+        """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
+        return self.rates(qpos) + self.offset
+
+    def rates(self, qvel: Any) -> Any:
+        """Return ``qvel`` (..., joints) with the rates that the followers have by their leaders'."""
+        return self.multiplier * self.of_leaders(qvel)
+
+    def efforts(self, effort: Any) -> Any:
+        """Return the efforts G^T u on the independent joints for u (..., joints); zero for followers."""
+        xp = namespace(effort)
+        acting = xp.where(self.independent, effort, 0.0)
+        for share in self.shares:  # the order of the sum is the same for any number of rows
+            added = share.multiplier * xp.take(effort, share.joint, axis=-1)
+            acting = xp.where(share.exists, acting + added, acting)
+        return acting
+
+    def of_leaders(self, figures: Any) -> Any:
+        """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
+        return namespace(figures).take(figures, self.leader, axis=-1)
+
+    def mass_matrix(self, matrix: Float64) -> Float64:
+        """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
+
+        Rows and columns of followers are the identity's. ``fold`` in tick.h is the same function.
+        """
+        folded, followers = np.array(matrix), np.flatnonzero(~self.independent)
+        for joint in followers:
+            folded[..., self.leader[joint], :] += self.multiplier[joint] * folded[..., joint, :]
+        for joint in followers:
+            folded[..., :, self.leader[joint]] += self.multiplier[joint] * folded[..., :, joint]
+        folded[..., followers, :] = folded[..., :, followers] = 0.0
+        folded[..., followers, followers] = 1.0
+        return folded
 
 
 class Coupling:
@@ -66,6 +123,17 @@ class Coupling:
             vars(self)[name] = read_only(array)
 
     @cached_property
+    def arrays(self) -> CouplingArrays:
+        """Arrays of the coupling, for a control step."""
+        shares = list[Share]()
+        of_leader = [self.followers[self.leader[self.followers] == joint] for joint in range(len(self.leader))]
+        for number in range(max(map(len, of_leader), default=0)):
+            exists = np.array([len(followers) > number for followers in of_leader])
+            joint = np.array([followers[number] if len(followers) > number else 0 for followers in of_leader])
+            shares.append(Share(*map(read_only, (exists, joint, np.where(exists, self.multiplier[joint], 0.0)))))
+        return CouplingArrays(self.leader, self.multiplier, self.offset, self.independent, tuple(shares))
+
+    @cached_property
     def matrix(self) -> Float64:
         """G (joints, independent joints)."""
         matrix = np.zeros((len(self.leader), len(self.leader)))
@@ -86,31 +154,23 @@ class Coupling:
 
     def positions(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
-        return self.multiplier * np.asarray(qpos, np.float64)[..., self.leader] + self.offset
+        return self.arrays.positions(np.asarray(qpos, np.float64))
 
     def rates(self, qvel: ArrayLike) -> Float64:
         """Return ``qvel`` (..., joints) with the rates that the followers have by their leaders'."""
-        return self.multiplier * np.asarray(qvel, np.float64)[..., self.leader]
+        return self.arrays.rates(np.asarray(qvel, np.float64))
 
     def efforts(self, effort: ArrayLike) -> Float64:
         """Return the efforts G^T u on the independent joints for u (..., joints); zero for followers."""
-        given = np.asarray(effort, np.float64)
-        acting = np.where(self.independent, given, 0.0)
-        for joint in self.followers:  # element by element: the order of the sum is the same for any number of rows
-            acting[..., self.leader[joint]] += self.multiplier[joint] * given[..., joint]
-        return acting
+        return self.arrays.efforts(np.asarray(effort, np.float64))
 
     def reduced(self, mass_matrix: ArrayLike) -> Float64:
         """Return M_r (..., independent, independent) of a mass matrix M (..., joints, joints)."""
-        return self.matrix.T @ np.asarray(mass_matrix, np.float64) @ self.matrix
+        return self.mass_matrix(mass_matrix)[..., self.independent, :][..., self.independent]
 
     def mass_matrix(self, mass_matrix: ArrayLike) -> Float64:
         """Return M_r in the rows and columns of the independent joints (..., joints, joints), else the identity."""
-        reduced = self.reduced(mass_matrix)
-        joints, free = len(self.leader), np.flatnonzero(self.independent)
-        whole = np.tile(np.eye(joints), (*reduced.shape[:-2], 1, 1))
-        whole[..., free[:, None], free] = reduced
-        return whole
+        return self.arrays.mass_matrix(np.asarray(mass_matrix, np.float64))
 
     def reduced_damping(self, damping: ArrayLike) -> Float64:
         """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""
@@ -122,7 +182,7 @@ class Coupling:
 
     def of_leaders(self, figures: ArrayLike) -> NDArray[Any]:
         """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
-        return np.asarray(figures)[..., self.leader]
+        return np.asarray(self.arrays.of_leaders(np.asarray(figures)))
 
     def __repr__(self) -> str:
         laws = (f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers)

@@ -72,6 +72,12 @@ def history_operations(places: Any, history: Any, a: Any, b: Any) -> list[Any]:
     return [*later.take(places)]
 
 
+def columns_of(columns: Any, a: Any, b: Any) -> list[Any]:
+    """Return the columns ``columns`` (columns,) of ``a``, and of a mask."""
+    xp = a.__array_namespace__()
+    return [xp.take(a, columns, axis=-1), xp.take(a > b, columns, axis=-1)]
+
+
 def first_difference() -> str | None:
     """Return the first difference between native and NumPy's results of all operations, or None: takes 1 ms.
 
@@ -95,6 +101,10 @@ def first_difference() -> str | None:
     traced = trace(lambda places, *others: history_operations(Stack([places]), *others), 1, 3)
     if _bits(ArrayProgram(traced, [*places], 3, shape)(history, a, b)[0]) != _bits(numbers):
         return "the history of a native program is not NumPy's"
+    columns = rng.integers(shape[1], size=shape[1])
+    found = ArrayProgram(trace(columns_of, 1, 2), [columns], 2, shape)(a, b)
+    if any(_bits(one) != _bits(other) for one, other in zip(found, columns_of(columns, a, b), strict=True)):
+        return "the columns of a native program are not NumPy's"
     return None
 
 

@@ -73,7 +73,7 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
   bool fits = program->inputs >= 0 && given <= program->registers;
   for (Operation const &each : program->operations) {
     bool const writes_input = each.code == PUSH && each.out == each.operands[0] && each.out >= count;
-    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= TAKE &&
+    fits = fits && known(each.out) && (each.out >= given || writes_input) && each.code >= ADD && each.code <= GATHER &&
            std::all_of(each.operands, each.operands + 3, known);
   }
   fits = fits && std::all_of(program->results.begin(), program->results.end(), known);
@@ -95,7 +95,8 @@ inline std::unique_ptr<Program> make_program(PyObject *arguments) {
     for (Index i = 0; i < all; ++i) {
       auto const &[code, out, operands] = program->operations[static_cast<std::size_t>(i)];
       if (!std::count(operands, operands + 3, number)) continue;
-      bool const is_elementwise = code != ROW_MINIMUM && code != MATRIX_VECTOR;  // the others read after the first write
+      // The others read after the first write.
+      bool const is_elementwise = code != ROW_MINIMUM && code != MATRIX_VECTOR && code != GATHER;
       last = std::max(last, is_elementwise ? i : i + 1);
     }
     program->last_use.push_back(last);
@@ -118,10 +119,11 @@ inline bool tables_fit(Program const &program, Index rows, std::vector<Input> co
     if (size_of(operands[1]) || (!is_alone && size_of(operands[2]))) return false;
     if (code == MATRIX_VECTOR && size != columns * columns) return false;
     if (code == PUSH && size % ((is_alone ? 1 : 2) * columns) != 0) return false;
-    if (code != TAKE) continue;
+    if (code != TAKE && code != GATHER) continue;
     if (program.single || operands[1] >= constants) return false;
+    Index const end = code == TAKE ? rows * size : columns;
     for (double const place : program.constants[static_cast<std::size_t>(operands[1])]) {
-      if (!(place >= 0 && place < static_cast<double>(rows * size))) return false;
+      if (!(place >= 0 && place < static_cast<double>(end))) return false;
     }
   }
   return std::none_of(program.results.begin(), program.results.end(), size_of);

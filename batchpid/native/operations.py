@@ -14,7 +14,7 @@ OPERATIONS = (
     *("greater", "greater_equal", "less", "less_equal", "equal", "not_equal", "and", "or", "not"),
     *("negative", "absolute", "rint", "ceil", "floor", "sqrt", "sign", "isfinite"),
     *("where", "row_minimum", "matrix_vector", "multiply_add", "add_subtract"),
-    *("subtract_multiply", "clip", "push", "take"),
+    *("subtract_multiply", "clip", "push", "take", "gather"),
 )
 """Operations of programs, as Code in program.h."""
 MASKS = frozenset(OPERATIONS[6:15]) | {"isfinite"}

@@ -43,6 +43,7 @@ enum Code : std::int32_t {
   CLIP,               // min(max(a, b), c)
   PUSH,               // history, in place: b, or b and c, as its latest sample; the oldest one is lost
   TAKE,               // numbers of a table, at the places b in the whole of it
+  GATHER,             // columns b of each row of a
 };
 
 struct Operation {
@@ -177,6 +178,13 @@ BATCHPID_INLINE void apply(Program const &program, Code code, Index first, Index
       break;
     case TAKE:
       for (Index i = 0; i < n; ++i) out[i] = x.data[static_cast<Index>(y.data[y.step ? i : i % program.chunk])];
+      break;
+    case GATHER:
+      for (Index row = 0; row < n; row += columns) {
+        T const *a = x.data + (x.step ? row : row % program.chunk);
+        T const *b = y.data + (y.step ? row : row % program.chunk);
+        for (Index i = 0; i < columns; ++i) out[row + i] = a[static_cast<Index>(b[i])];
+      }
       break;
   }
 #undef EACH

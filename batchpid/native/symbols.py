@@ -43,7 +43,7 @@ class Namespace:
             each = (value if isinstance(value, Stack) else Stack([value]) for value in values)
             spread = [stack * size if len(stack) == 1 else stack for stack in map(tuple, each)]
             return Stack(self.apply(name, *entries) for entries in zip(*spread, strict=True))
-        result = Symbol(self, name in MASKS)
+        result = Symbol(self, name in MASKS or (name == "gather" and values[0].is_mask))
         self.noted.append((name, tuple(map(self.symbol, values)), result))
         return result
 
@@ -65,6 +65,11 @@ class Namespace:
     def atleast_2d(self, value: Any) -> Any:
         """Return ``value``, which already has rows and columns."""
         return value
+
+    def take(self, rows: Symbol, columns: Symbol, axis: int) -> Symbol:
+        """Return the columns of ``rows`` at the indices ``columns``, which are constants."""
+        assert axis == -1
+        return self.apply("gather", rows, columns)
 
     def zeros_like(self, _: Any) -> Symbol:
         """Return the number 0."""

@@ -253,6 +253,18 @@ class NativeMassMatrix:
         return out
 
 
+def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
+    """Return the function of positions that computes the mass matrices of a robot's description, on a fixed base.
+
+    ``natively`` says whether the extension is used; then every executor takes them from it, since Pinocchio's differ in
+    the last bits.
+    """
+    if natively:
+        return NativeMassMatrix(spec)
+    model = _model_of(spec)
+    return lambda qpos: model().mass_matrix(qpos)
+
+
 class NativePassiveForce:
     """Passive forces of the robot of ``spec``, on a fixed base, at given states, by the extension."""
 
@@ -291,8 +303,10 @@ def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Floa
     if natively and spec.fixed_base:
         return NativePassiveForce(spec)
 
-    @cache  # looked up once: the hash of a spec takes many calls
-    def dynamics() -> RobotModel:
-        return scene_dynamics(spec)
+    model = _model_of(spec)
+    return lambda qpos, qvel, gravity, coriolis: model().passive_force(qpos, qvel, gravity, coriolis)
 
-    return lambda qpos, qvel, gravity, coriolis: dynamics().passive_force(qpos, qvel, gravity, coriolis)
+
+def _model_of(spec: SceneSpec) -> Callable[[], RobotModel]:
+    """Return a function that returns the model of ``spec``, looked up once: the hash of a spec takes many calls."""
+    return cache(lambda: scene_dynamics(spec))

@@ -17,12 +17,16 @@ arm, or make it diverge. See docs/joints.md.
 
 from __future__ import annotations
 
+import ctypes
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, multiply
 from batchpid.motors.coupling import Coupling
+from batchpid.sim.engine.native.interface import Constraint
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 """Gains of c' dt and c in units of 1 / dt^2."""
@@ -31,21 +35,57 @@ RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 class ConstraintEfforts:
     """Constraint efforts of robots with the coupling ``coupling``; ``continuous`` (dof,) positions wrap.
 
-    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`.
+    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies the efforts by
+    the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if given.
     """
 
-    def __init__(self, coupling: Coupling, continuous: NDArray[np.bool_], timestep: float) -> None:
-        self._coupling, self._wraps = coupling, continuous[coupling.followers]
+    def __init__(
+        self,
+        robots: int,
+        coupling: Coupling,
+        continuous: NDArray[np.bool_],
+        timestep: float,
+        asked: NDArray[np.float32] | None = None,
+    ) -> None:
+        joints, followers = len(coupling.leader), coupling.followers
+        self._coupling, self._wraps = coupling, continuous[followers]
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
+        self._response = np.zeros((robots, len(followers), joints))
+        self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
+        arrays: dict[str, NDArray[Any]] = {
+            "response": self._response,
+            "push": self._push,
+            "passive": self._passive,
+            "followers": followers.astype(np.int64),
+            "leaders": coupling.leader[followers].astype(np.int64),
+            "multiplier": coupling.multiplier[followers],
+            "offset": coupling.offset[followers],
+            "wraps": self._wraps,
+            "wrong": np.zeros(len(followers)),
+            "free": np.zeros(joints),
+        } | ({} if asked is None else {"asked": asked})
+        self._native = Constraint(
+            rate_gain=self._rate_gain,
+            position_gain=self._position_gain,
+            size=len(followers),
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        self._kept = arrays
 
-    def update(self, mass_matrix: Float64, passive: Float64) -> None:
-        """Set mass matrix (robots, dof, dof) and passive force; they may be some steps old."""
-        sound = np.isfinite(mass_matrix).all((1, 2), keepdims=True)  # a robot may have failed
-        inverse = np.linalg.inv(np.where(sound, mass_matrix, np.eye(mass_matrix.shape[1])))
+    @property
+    def address(self) -> int:
+        """Address of the constraint, for a group of the extension."""
+        return ctypes.addressof(self._native)
+
+    def update(self, mass_matrix: Float64, passive: Float64, rows: Any = slice(None)) -> None:
+        """Set mass matrix (len(rows), dof, dof) and passive force of robots ``rows``; they may be some steps old."""
+        numbers = np.concatenate([mass_matrix, passive[:, :, None]], axis=2)
+        sound = np.isfinite(numbers).all((1, 2), keepdims=True)  # a robot may have failed
+        matrix = np.where(sound, mass_matrix, np.eye(mass_matrix.shape[1]))
         jacobian = self._coupling.jacobian
-        response = jacobian @ inverse
-        self._response, self._passive = response, passive
-        self._effort = jacobian.T @ np.linalg.inv(response @ jacobian.T)
+        response = np.linalg.solve(matrix, jacobian.T).swapaxes(1, 2)
+        self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive, 0.0)
+        self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
@@ -55,4 +95,4 @@ class ConstraintEfforts:
         rate = (qvel - coupling.rates(qvel))[:, followers]
         wrong = multiply(self._response, effort - self._passive)
         wrong += self._rate_gain * rate + self._position_gain * error
-        return effort - multiply(self._effort, wrong)
+        return effort - multiply(self._push, wrong)

@@ -188,6 +188,9 @@ class CompiledPack(EnginePack, Protocol):
         given.
         """
 
+    def update_constraint(self, rows: Any = slice(None)) -> None:
+        """Give the constraint efforts of robots ``rows`` the present mass matrix, if joints are coupled."""
+
     def look(self, left: list[int]) -> None:
         """Handle a non-zero status of a compiled step, with the envs ``left`` from :meth:`CompiledStep.left`."""
 

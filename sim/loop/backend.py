@@ -44,8 +44,6 @@ def _engine_obstacle(options: RunnerOptions) -> str:
 def native_obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return why the sim steps of a tick cannot be one native call, under backend "numpy"; or nothing."""
     control, randomization = options.control, options.randomization
-    if options.robot.coupling is not None:
-        return "coupled joints take constraint efforts of NumPy"
     if isinstance(control, OperationalSpace):
         if not control.is_native:
             return "task space takes the compensation of friction, or a subclass' law, from NumPy"

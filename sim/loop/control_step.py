@@ -27,7 +27,7 @@ from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
-from batchpid.motors.coupling import Coupling
+from batchpid.motors.coupling import CouplingArrays
 from batchpid.motors.friction import Friction, FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
@@ -137,6 +137,7 @@ class Constants(NamedTuple):
     """:class:`batchpid.motors.Coefficients` of motors and sensors."""
     driven: bp.PIDParams | None = None
     """Params of the integral that moves the targets of drives."""
+    coupling: CouplingArrays | None = None
 
 
 def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
@@ -173,7 +174,6 @@ class Layout(NamedTuple):
     """"pid", "drive", "effort" or "custom"."""
     law: PIDLaw | None = None
     """Law of control "pid"."""
-    coupling: Coupling | None = None
     measures: bool = False
     """Whether the law takes the joints' state from sensors."""
     model: Model = Model()
@@ -187,7 +187,7 @@ def control_step(
     guard, motors, guarded, seen, seen_rate = state.guard, state.motors, None, qpos, qvel
     limits: tuple[Any, Any] = (None, None)
     if guard is not None:
-        guard, command, guarded = _guarded(layout, constants, guard, command)
+        guard, command, guarded = _guarded(constants, guard, command)
     if motors is not None:
         noise = None if layout.model.noise is None else layout.model.noise(constants.motors, motors, qpos)
         stages = layout.model.stages
@@ -195,7 +195,7 @@ def control_step(
         limits = stages.limits(constants.motors, seen, seen_rate)
         if layout.measures and layout.model.passive_force is not None:
             passive = layout.model.passive_force(seen, seen_rate)
-    forward = _feedforward(layout, constants, command, seen, passive)
+    forward = _feedforward(constants, command, seen, passive)
     given = Inputs(command, Measured(seen, seen_rate, forward), limits, step)
     state, outputs = _CONTROLS[layout.control](layout, constants, state, given)
     motor = outputs.motor
@@ -213,16 +213,16 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
         matrix = matrix + xp.diag(constants.armature)
     if constants.damping is not None:
         matrix = matrix + constants.timestep * xp.diag(constants.damping)
-    return matrix if layout.coupling is None else layout.coupling.mass_matrix(matrix)
+    return matrix if constants.coupling is None else constants.coupling.mass_matrix(matrix)
 
 
-def joint_mass_matrix(layout: Layout, qpos: Any) -> Any:
+def joint_mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
     """Return the friction model's mass matrix (M, dof, dof), for the leaders only."""
     matrix = layout.model.joint_mass_matrix(qpos)
-    return matrix if layout.coupling is None else layout.coupling.mass_matrix(matrix)
+    return matrix if constants.coupling is None else constants.coupling.mass_matrix(matrix)
 
 
-def _guarded(layout: Layout, constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
+def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
     """Return the guard's state, ``command`` with guarded setpoints and rates (if given), and the mask of changes.
 
     Followers move with their leaders.
@@ -232,17 +232,17 @@ def _guarded(layout: Layout, constants: Constants, state: GuardState, command: C
     setpoint, rate = state.setpoint, command.setpoint_rate
     if rate is not None:
         rate = xp.where(changed, state.rate, rate)
-    if (coupling := layout.coupling) is not None:
+    if (coupling := constants.coupling) is not None:
         setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
         rate = None if rate is None else coupling.rates(rate)
     return state, command._replace(setpoint=setpoint, setpoint_rate=rate), changed
 
 
-def _feedforward(layout: Layout, constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
+def _feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
-    if forward is not None and layout.coupling is not None:
-        forward = layout.coupling.efforts(forward)
+    if forward is not None and constants.coupling is not None:
+        forward = constants.coupling.efforts(forward)
     if (known := constants.known) is None:
         return forward
     error = wrap(command.setpoint - qpos, known.turns, namespace(qpos))
@@ -264,8 +264,8 @@ def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) 
     if law.needs_matrix:
         matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, matrix)
     viscous = None if constants.damping is None else constants.damping * qvel
-    if viscous is not None and layout.coupling is not None:
-        viscous = layout.coupling.efforts(viscous)
+    if viscous is not None and constants.coupling is not None:
+        viscous = constants.coupling.efforts(viscous)
     inputs = ((command.setpoint, command.setpoint_rate), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
     new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
@@ -290,7 +290,7 @@ def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs
 def _effort(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
     asked = given.command.setpoint
-    total = asked if layout.coupling is None else layout.coupling.efforts(asked)
+    total = asked if constants.coupling is None else constants.coupling.efforts(asked)
     return state, _saturated(constants, _sum(total, given.seen.passive), given)
 
 
@@ -299,7 +299,7 @@ def _custom(layout: Layout, constants: Constants, state: StepState, given: Input
     seen = given.seen
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
     law, returned = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
-    total = returned if layout.coupling is None else layout.coupling.efforts(returned)
+    total = returned if constants.coupling is None else constants.coupling.efforts(returned)
     return state._replace(law=law), _saturated(constants, total, given)._replace(returned=returned)
 
 
@@ -320,7 +320,7 @@ def apply_friction(
         xp, due = namespace(age), age == REFRESH_STEPS
 
         def fresh() -> FrictionState:
-            matrix = joint_mass_matrix(layout, measured.qpos)
+            matrix = joint_mass_matrix(layout, constants, measured.qpos)
             new = friction_model.refresh(model, friction, matrix, constants.timestep, *constants.drive)
             return replace_envs(friction, new, due)
 

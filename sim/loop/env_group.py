@@ -75,8 +75,7 @@ class EnvGroup:
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
         self._executor: NumPyExecutor | XLAExecutor
-        steps = isinstance(pack, CompiledPack) and pack.steps_natively and layout.coupling is None
-        if not isinstance(pack, CompiledPack) or not steps:
+        if not isinstance(pack, CompiledPack) or not pack.steps_natively:
             self._executor = NumPyExecutor(options, pack, layout, constants)
         elif options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators):
             self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
@@ -310,8 +309,8 @@ class EnvGroup:
             self._episode[mask] += 1
             gravity, coriolis = passive_forces(self._options)
             holding = pack.passive_force(gravity, coriolis) if gravity else None
-            if holding is not None and layout.coupling is not None:
-                holding = layout.coupling.efforts(holding)
+            if holding is not None and self._constants.coupling is not None:
+                holding = self._constants.coupling.efforts(holding)
             qvel = pack.read_qvel()
             fresh = init_motors(self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding)
             motors = bp.motors.reset(state.motors, fresh, mask)

@@ -3,7 +3,8 @@
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
 arrays that hold the state from step to step. Python computes the noise of sensors, the passive force at a measured
 state, and the passive force of robots whose masses vary: with these each sim step is a call, and sensors have another
-program. Operational-space control is a native call before the program, which takes its effort as an input. Where the
+program. With coupled joints every four sim steps are a call, since Python updates the mass matrix of the constraint
+efforts. Operational-space control is a native call before the program, which takes its effort as an input. Where the
 control step cannot be traced (a caller's controller, drives whose targets move within a tick), it runs in NumPy, and
 one native call applies the efforts, steps the engine and reads it. A sim step in which the friction model updates its
 mass matrix runs in the same way.
@@ -22,7 +23,7 @@ from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import REFRESH_STEPS, Constants, Layout, Measured, Step, StepState, control_step
-from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran
+from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran
 from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
@@ -59,11 +60,15 @@ class NativeExecutor(NumPyExecutor):
             self._pack.write_drive_target(command.setpoint, np.zeros_like(command.setpoint) if rate is None else rate)
         by_step, done, status = self._layout.measures or self._calls_force, begin, 0
         while done < end and not status:
+            self._update_constraint(done)
             due = end if state.age is None else done + REFRESH_STEPS - int(program.state.age.max())
             if due > done:
                 if self._layout.measures:
                     self._measure(program)
-                done, status = program.run(self._prepared(), done, done + 1 if by_step else min(due, end), end)
+                until = done + 1 if by_step else min(due, end)
+                if self._constants.coupling is not None:
+                    until = min(until, done - done % COUPLING_STEPS + COUPLING_STEPS)
+                done, status = program.run(self._prepared(), done, until, end)
             else:
                 step, now = Step(done, end, done + 1 == end), (program.state, command, program.measured)
                 program.take(*control_step(self._layout, self._constants, *now, step))
@@ -84,6 +89,11 @@ class NativeExecutor(NumPyExecutor):
         if model.passive_force is not None:
             program.reading.passive[...] = model.passive_force(*seen)
 
+    def _update_constraint(self, index: int) -> None:
+        """Update the constraint efforts of coupled joints, if it is time for it before sim step ``index``."""
+        if self._constants.coupling is not None and index % COUPLING_STEPS == 0:
+            self._pack.update_constraint()
+
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
         own = {name: np.array(leaf) for name, leaf in state.law.items()} if isinstance(state.law, dict) else state.law
@@ -91,6 +101,7 @@ class NativeExecutor(NumPyExecutor):
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
+        self._update_constraint(index)
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._native_step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
         if not self._reads_force:
@@ -139,12 +150,7 @@ def _is_native(controller: Any, layout: Layout, constants: Constants) -> bool:
 
 
 def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: float64, no coupling, drive targets constant in a tick."""
+    """Return whether the control step can be a program: float64, drive targets constant in a tick."""
     rests = constants.driven is None and constants.guard is None
     fits = layout.control in ("pid", "effort", "custom") or (layout.control == "drive" and rests)
-    return (
-        fits
-        and layout.coupling is None
-        and dof <= MOST_SUMMED
-        and all(leaf.dtype != np.float32 for leaf in leaves(constants))
-    )
+    return fits and dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import ControllerError
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
-from batchpid.sim.engine.batch_dynamics import NativeMassMatrix, passive_force_of
-from batchpid.sim.engine.engines import scene_dynamics
-from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack, RobotModel
+from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
+from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from batchpid.sim.loop.custom import OwnController
@@ -114,7 +112,7 @@ def with_model(
 ) -> Layout:
     """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
     jitted, motors, (gravity, coriolis) = options.backend == "jax", constants.motors, passive_forces(options)
-    model = Model(_mass_matrix(pack), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
+    model = Model(mass_matrix_of(pack.spec, _is_native(pack)), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
     if layout.law is not None and jitted:
         model = model._replace(law=partial(jitted_law, options.dtype, pack.size))
     elif layout.law is not None and constants.k is not None and LawProgram.available(constants.k):
@@ -132,21 +130,6 @@ def with_model(
 
 def _zeros_for_none(outputs: Outputs) -> Float64:
     return np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
-
-
-def _mass_matrix(pack: EnginePack) -> Callable[[Float64], Float64]:
-    """Return the function that computes the mass matrix of the robots' description.
-
-    If the extension is used, every executor takes the mass matrix from it, since Pinocchio's differs in the last bits.
-    """
-    if _is_native(pack):
-        return NativeMassMatrix(pack.spec)
-
-    @cache
-    def dynamics() -> RobotModel:
-        return scene_dynamics(pack.spec)
-
-    return lambda qpos: dynamics().mass_matrix(qpos)
 
 
 def _is_native(pack: EnginePack) -> bool:

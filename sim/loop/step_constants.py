@@ -24,7 +24,7 @@ def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actu
     """Return the layout of the control step, without the executor's model."""
     control = options.control if isinstance(options.control, str) else "custom"
     law = PIDLaw.of(params) if control == "pid" else None
-    return Layout(control, law, coupling_of(options.robot.joints), actuators is not None and actuators.measures)
+    return Layout(control, law, actuators is not None and actuators.measures)
 
 
 def make_constants(
@@ -43,7 +43,8 @@ def make_constants(
     known = None if robot.actuators is None else known_joints(robot)
     law, damping = PIDLaw.of(params), np.array([joint.damping for joint in scene.joints])
     damping = damping if known is None else damping + known.viscous
-    acting = acting_gains(params, coupling_of(scene.joints))
+    coupling = coupling_of(scene.joints)
+    acting = acting_gains(params, coupling)
     if options.guard is not None:
         guard = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
     constants = Constants(
@@ -52,6 +53,7 @@ def make_constants(
         friction=pack.friction,
         known=_known_friction(options, pack),
         guard=guard,
+        coupling=None if coupling is None else coupling.arrays,
         motors=None
         if actuators is None or motors is None
         else actuator_model.discretise(actuators, motors, scene.timestep, pack.size),

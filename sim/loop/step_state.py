@@ -33,9 +33,9 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     if model.coulomb is None:
         return state._replace(friction=FrictionState(), age=None)
     velocity, load = pack.read_qvel(), pack.passive_force(True, True)
-    if layout.coupling is not None:
-        load = layout.coupling.efforts(load)
-    matrix = joint_mass_matrix(layout, pack.read_qpos())
+    if constants.coupling is not None:
+        load = constants.coupling.efforts(load)
+    matrix = joint_mass_matrix(layout, constants, pack.read_qpos())
     fresh = friction_model.init(model, velocity, load, matrix, constants.timestep, *constants.drive)
     age = np.zeros(pack.size, np.int64)
     if state.age is not None:

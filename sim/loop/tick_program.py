@@ -80,6 +80,8 @@ class TickProgram:
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
             arrays |= {} if self._seen is None else dict(zip(("pose", "rate"), self._seen, strict=True))
             arrays |= {"armature": constants.armature, "damping": constants.damping}
+            if (coupling := constants.coupling) is not None:
+                arrays |= {"leader": coupling.leader.astype(np.int32), "multiplier": coupling.multiplier}
         whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
         self._tick = NativeTick(
             program,

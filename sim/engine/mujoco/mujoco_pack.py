@@ -18,7 +18,7 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import passive_force_of
+from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.batch_model import FLOATING, BatchModel, set_inertia
@@ -74,7 +74,7 @@ class MujocoPack(SingleOwner):
         coupling, self._constraint = coupling_of(spec.joints), None
         self._continuous = np.array([joint.continuous for joint in spec.joints])
         if coupling is not None:
-            self._constraint = ConstraintEfforts(coupling, self._continuous, spec.timestep)
+            self._constraint = ConstraintEfforts(size, coupling, self._continuous, spec.timestep)
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
         self._make_data(robot_model(spec))
         if variation is not None:
@@ -169,20 +169,17 @@ class MujocoPack(SingleOwner):
 
         Without ``update`` these take the mass matrix of an earlier step.
         """
-        effort = self.qf
-        if self._constraint is not None:
-            qpos = self.read_qpos()
-            if update:
-                matrix = self.joint_mass_matrix(qpos) + self._implicit[:, None] * np.eye(self.dof)
-                self._constraint.update(matrix, self.passive_force(True, True))
-            effort = self._constraint.apply(self.qf, qpos, self.read_qvel())
+        if update:
+            self.update_constraint()
         if self.steps_natively:
             if self._own_step is None:
-                applied = np.zeros_like(self.qf)
-                self._own_step = self._make_step(applied, False, None)
-            if self._own_step(np.ascontiguousarray(effort), *np.empty((3, *effort.shape))) & FAILED:
+                self._own_step = self._make_step(False, None)
+            if self._own_step(self.qf, *np.empty((3, *self.qf.shape))) & FAILED:
                 raise RuntimeError(self._own_step.message)
             return
+        effort = self.qf
+        if self._constraint is not None:
+            effort = self._constraint.apply(self.qf, self.read_qpos(), self.read_qvel())
         handler = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(lambda message: None)  # the loop finds states that are not finite
         try:
@@ -210,10 +207,23 @@ class MujocoPack(SingleOwner):
     ) -> MujocoStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         reads_force = gravity and coriolis
-        return self._make_step(self.qf, reads_force, speed_limit)
+        return self._make_step(reads_force, speed_limit)
 
-    def _make_step(self, qf: Float64, reads_force: bool, speed_limit: NDArray[np.float64] | None) -> MujocoStep:
-        return MujocoStep(self._robot, self.models, lambda: self._data, qf, self._suspended, reads_force, speed_limit)
+    def _make_step(self, reads_force: bool, speed_limit: NDArray[np.float64] | None) -> MujocoStep:
+        constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
+        return MujocoStep(self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint)
+
+    def update_constraint(self, rows: Any = slice(None)) -> None:
+        """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
+        if self._constraint is not None:
+            matrix = self._constraint_matrix(self.read_qpos()) + self._implicit[:, None] * np.eye(self.dof)
+            self._constraint.update(matrix[rows], self.passive_force(True, True)[rows], rows)
+
+    @cached_property
+    def _constraint_matrix(self) -> Callable[[Float64], Float64]:
+        """Function of positions that returns the mass matrices for the constraint efforts."""
+        native_model = self.steps_natively and self.steps_read_force(True, True)
+        return mass_matrix_of(self.spec, True) if native_model else self.joint_mass_matrix
 
     def look(self, left: list[int]) -> None:
         """Do nothing: MuJoCo needs no care before a contact."""
@@ -233,6 +243,7 @@ class MujocoPack(SingleOwner):
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
         self._update(rows)
+        self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
         """Leave the robots of ``mask`` (M,) where they are, and step the others."""

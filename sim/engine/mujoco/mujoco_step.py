@@ -71,6 +71,8 @@ class MujocoStep:
         Whether to read the forces of gravity and Coriolis; otherwise they are zero.
     speed_limit
         Joint speed beyond which the status says so (dof,), or None.
+    constraint
+        Address of the constraint of coupled joints, or None.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class MujocoStep:
         skip: NDArray[np.bool_],
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
+        constraint: int | None = None,
     ) -> None:
         found, data = functions(), take_data()
         assert found is not None
@@ -107,6 +110,7 @@ class MujocoStep:
             gravity=reads_force,
             coriolis=reads_force,
             velocities=True,
+            constraint=constraint,
             speed_limit=None if limit is None else limit.ctypes.data,
         )
         self._take_data, self._kept = take_data, (models, data, arrays, robots, clearance, skip, limit)

@@ -39,6 +39,7 @@ class Group(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
         *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
         ("mujoco", ctypes.c_void_p),
+        ("constraint", ctypes.c_void_p),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
         ("pairs", ctypes.c_int64),
@@ -76,12 +77,25 @@ class Mujoco(ctypes.Structure):
     ]
 
 
+class Constraint(ctypes.Structure):
+    """Constraint of coupled joints, as Constraint in constraint.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("response", "push", "passive", "followers", "leaders")),
+        *((name, ctypes.c_void_p) for name in ("multiplier", "offset", "wraps", "asked", "wrong", "free")),
+        ("rate_gain", ctypes.c_double),
+        ("position_gain", ctypes.c_double),
+        ("size", ctypes.c_int64),
+    ]
+
+
 class Tick(ctypes.Structure):
     """Arrays of the sim steps of a tick, as Tick in tick.h."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
-        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping", "matrix", "control")),
+        *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
+        *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),
         ("whole", ctypes.c_int32),
@@ -108,6 +122,7 @@ def _gateway_tables() -> tuple[Any, ...]:
         _layout(Group),
         _layout(Clearance),
         _layout(Mujoco),
+        _layout(Constraint),
         _layout(Tick),
         list(BODY.items()),
         PROGRAM.tables(),
@@ -127,6 +142,7 @@ EXTENSIONS = {
                 "gateway.h",
                 "mujoco_step.h",
                 "clearance.h",
+                "constraint.h",
                 "sim_step.h",
                 "tick.h",
                 "xla_call.h",

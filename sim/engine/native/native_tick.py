@@ -35,7 +35,8 @@ class NativeTick:
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
         ``tree`` and ``bodies`` (:class:`batchpid.sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping``
-        (dof,), and ``pose`` and ``rate`` if sensors measure others than the reading.
+        (dof,), ``leader`` and ``multiplier`` of coupled joints (dof,), and ``pose`` and ``rate`` if sensors measure
+        others than the reading.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class NativeTick:
     ) -> None:
         arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
         given = {name: array for name, array in arrays.items() if array is not None}
-        types = {name: np.int32 if name == "tree" else np.float64 for name in given}
+        types = {name: np.int32 if name in ("tree", "leader") else np.float64 for name in given}
         for name, array in given.items():
             if array.dtype != types[name] or not array.flags.c_contiguous:
                 raise ValueError(f"{name} is not a contiguous array of {np.dtype(types[name])}")

@@ -2,6 +2,7 @@
 
 #pragma once
 
+#include "constraint.h"
 #include "gateway.h"
 #include "mujoco_step.h"
 
@@ -9,6 +10,7 @@
 #include <cmath>
 #include <map>
 #include <utility>
+#include <vector>
 
 #pragma GCC visibility push(hidden)
 
@@ -26,7 +28,7 @@ using Contacts = std::map<std::pair<void *, void *>, Body *const *>;
 // Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
 struct Group {
   Gateway *gateway;
-  float *qf;                         // (robots, dof)
+  float *qf;                         // (robots, dof), constraint efforts included
   char const *skip;                  // (robots,): efforts are not applied
   std::int64_t const *system_of;     // (robots,)
   Contacts const *const *contacts;   // (systems,)
@@ -41,6 +43,7 @@ struct Group {
   char *outside;                     // (robots,): robots that have left their region, an output
   double const *speed_limit;         // (dof,), or null
   Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway, and nothing to watch
+  Constraint const *constraint;      // of coupled joints, or null
   std::int64_t robots, dof;
   std::int64_t pairs, bodies_size;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
@@ -86,6 +89,22 @@ void copy_row(VectorXf const &from, T *to, std::ptrdiff_t dof) {
   for (std::ptrdiff_t joint = 0; joint < dof; ++joint) to[joint] = from.data[joint];
 }
 
+// Add the constraint efforts of a robot in SAPIEN to qf (dof).
+inline void constrain_row(Group const &group, std::size_t row, float *qf) {
+  Gateway const &gateway = *group.gateway;
+  auto const at = static_cast<std::int64_t>(row), dof = group.dof;
+  VectorXf const qpos = gateway.functions.get_qpos(gateway.robots[row]);
+  VectorXf const qvel = gateway.functions.get_qvel(gateway.robots[row]);
+  if (qpos.size != dof || qvel.size != dof) throw std::bad_exception();
+  thread_local std::vector<double> effort;
+  effort.assign(qf, qf + dof);
+  std::copy(qf, qf + dof, group.constraint->asked + at * dof);
+  constrain(
+      *group.constraint, at, dof, effort.data(), [&](std::int64_t j) { return static_cast<double>(qpos.data[j]); },
+      [&](std::int64_t j) { return static_cast<double>(qvel.data[j]); });
+  for (std::int64_t j = 0; j < dof; ++j) qf[j] = static_cast<float>(effort[static_cast<std::size_t>(j)]);
+}
+
 // Apply efforts (rows, dof), do one sim step, read (rows, dof) each; rows beyond the robots repeat the first one.
 // System by system, each while it is in the cache.
 template <class T>
@@ -102,6 +121,7 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
       for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
         qf[joint] = static_cast<float>(effort[static_cast<std::ptrdiff_t>(row) * dof + joint]);
       }
+      if (group.constraint != nullptr) constrain_row(group, row, qf);
       if (!group.skip[row]) apply(call, gateway.robots[row], qf, dof);
     }
     call.step(gateway.systems[system]);
@@ -133,6 +153,22 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
   return status;
 }
 
+// Apply the efforts of a robot in MuJoCo, and those of its constraint.
+inline void apply_efforts(Group const &group, std::int64_t row) {
+  Mujoco const &mujoco = *group.mujoco;
+  double const *qpos = mujoco.qpos[row], *qvel = mujoco.qvel[row];
+  thread_local std::vector<double> effort;
+  effort.assign(mujoco.qf + row * group.dof, mujoco.qf + (row + 1) * group.dof);
+  if (group.constraint != nullptr) {
+    constrain(
+        *group.constraint, row, group.dof, effort.data(), [&](std::int64_t j) { return qpos[mujoco.qpos_at[j]]; },
+        [&](std::int64_t j) { return qvel[mujoco.qvel_at[j]]; });
+  }
+  for (std::int64_t j = 0; j < group.dof; ++j) {
+    mujoco.applied[row][mujoco.qvel_at[j]] = effort[static_cast<std::size_t>(j)];
+  }
+}
+
 // The same in MuJoCo; the arrays are those of the robots and of the rows beyond them.
 template <class T>
 std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
@@ -144,10 +180,8 @@ std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qp
   if (before != Messages::handle) Messages::previous = before;
   for (std::int64_t row = 0; row < group.robots && status != FAILED; ++row) {
     std::int64_t const at = row * dof;
-    for (std::int64_t joint = 0; joint < dof; ++joint) {
-      mujoco.qf[at + joint] = static_cast<double>(effort[at + joint]);
-      if (!group.skip[row]) mujoco.applied[row][mujoco.qvel_at[joint]] = mujoco.qf[at + joint];
-    }
+    for (std::int64_t joint = 0; joint < dof; ++joint) mujoco.qf[at + joint] = static_cast<double>(effort[at + joint]);
+    if (!group.skip[row]) apply_efforts(group, row);
     if (!group.skip[row] && !advance(mujoco, row, dof, FARTHEST, group.message)) status = FAILED;
     for (std::int64_t joint = 0; joint < dof; ++joint) {
       std::int64_t const place = mujoco.qvel_at[joint];

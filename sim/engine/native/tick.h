@@ -24,6 +24,8 @@ struct Tick {
   double const *bodies;           // (dof, 25)
   double const *armature;         // (dof,), or null
   double const *damping;          // (dof,), or null
+  std::int32_t const *leader;     // (dof,): of coupled joints, as in batchpid/motors/coupling.py, or null
+  double const *multiplier;       // (dof,)
   double *matrix;                 // (robots, dof, dof), or its diagonal, or null
   Call const *control;            // native controller, whose effort is an input of the program, or null
   double timestep;
@@ -38,6 +40,24 @@ struct BoundProgram {
   std::vector<Input> inputs;
   std::vector<Output> outputs;
 };
+
+// Write G^T M G of coupled joints in place of M (n, n): CouplingArrays.mass_matrix in batchpid/motors/coupling.py.
+inline void fold(Tick const &tick, std::size_t n, double *matrix) {
+  auto const leader = [&](std::size_t i) { return static_cast<std::size_t>(tick.leader[i]); };
+  for (std::size_t i = 0; i < n; ++i) {
+    if (leader(i) == i) continue;
+    for (std::size_t j = 0; j < n; ++j) matrix[leader(i) * n + j] += tick.multiplier[i] * matrix[i * n + j];
+  }
+  for (std::size_t i = 0; i < n; ++i) {
+    if (leader(i) == i) continue;
+    for (std::size_t j = 0; j < n; ++j) matrix[j * n + leader(i)] += tick.multiplier[i] * matrix[j * n + i];
+  }
+  for (std::size_t i = 0; i < n; ++i) {
+    if (leader(i) == i) continue;
+    for (std::size_t j = 0; j < n; ++j) matrix[i * n + j] = matrix[j * n + i] = 0.0;
+    matrix[i * n + i] = 1.0;
+  }
+}
 
 // Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
 inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
@@ -59,6 +79,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
       if (tick.armature != nullptr) entry += tick.armature[j];
       if (tick.damping != nullptr) entry += tick.timestep * tick.damping[j];
     }
+    if (tick.leader != nullptr) fold(tick, n, found.data());
     double *to = tick.matrix + static_cast<std::size_t>(row) * (tick.whole ? n * n : n);
     if (tick.whole) {
       std::copy(found.begin(), found.end(), to);

@@ -11,17 +11,19 @@ lines because that is the whole interface between loop and engine.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float32
+from batchpid.arrays.array_types import Float32, Float64
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine import native
+from batchpid.sim.engine.batch_dynamics import mass_matrix_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.sapien.building import (
@@ -103,7 +105,7 @@ class Pack(SingleOwner):
         if coupling is not None:
             self._joint_qf = np.zeros_like(self.qf)
             continuous = np.array([joint.continuous for joint in spec.joints])
-            self._constraint = ConstraintEfforts(coupling, continuous, spec.timestep)
+            self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
         self._bind()
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
@@ -135,7 +137,11 @@ class Pack(SingleOwner):
         Without ``update`` these take the mass matrix of an earlier step.
         """
         if self._constraint is not None:
-            self._write_coupled_qf(self._constraint, update)
+            if update:
+                self.update_constraint()
+            qpos, qvel = self._calls.qpos(np.float64), self._calls.qvel(np.float64)
+            self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
+            self._calls.write_qf()
         self._calls.step()
         predicted, self._stepped_qpos = self.watch.step(self._read_float64_qpos)
         if predicted:
@@ -154,7 +160,9 @@ class Pack(SingleOwner):
         self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
     ) -> NativeStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
-        return NativeStep(self.calls, self.systems, self.watch, gravity, coriolis, velocities, speed_limit)
+        constraint = None if self._constraint is None else self._constraint.address
+        reads = gravity, coriolis, velocities
+        return NativeStep(self.calls, self.systems, self.watch, *reads, speed_limit, constraint)
 
     def look(self, left: list[int]) -> None:
         """Look for contacts after a :meth:`compiled_step` that led ``left`` out of regions."""
@@ -162,14 +170,18 @@ class Pack(SingleOwner):
         if predicted := self.watch.look(left):
             self.isolate(predicted)
 
-    def _write_coupled_qf(self, constraint: ConstraintEfforts, update: bool) -> None:
-        """Apply the efforts ``qf`` plus the efforts of the coupling, which has neither sensors nor delays."""
-        qpos = self._calls.qpos(np.float64)
-        if update:
+    def update_constraint(self, rows: Any = slice(None)) -> None:
+        """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
+        if self._constraint is not None:
+            matrix = self._constraint_matrix(self._calls.qpos(np.float64)) + self._implicit[:, None] * np.eye(self.dof)
             passive = self._calls.passive_force(True, True, np.float64)
-            constraint.update(self.joint_mass_matrix(qpos) + self._implicit[:, None] * np.eye(self.dof), passive)
-        self._joint_qf[...] = constraint.apply(self.qf, qpos, self._calls.qvel(np.float64))
-        self._calls.write_qf()
+            self._constraint.update(matrix[rows], passive[rows], rows)
+
+    @cached_property
+    def _constraint_matrix(self) -> Callable[[Float64], Float64]:
+        """Function of positions that returns the mass matrices for the constraint efforts."""
+        native_model = self.steps_natively and self.spec.fixed_base and self.steps_read_force(True, True)
+        return mass_matrix_of(self.spec, True) if native_model else self.joint_mass_matrix
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
@@ -235,6 +247,7 @@ class Pack(SingleOwner):
         become zero, and the content of their scenes is reset.
         """
         self._place(rows, qpos, qvel, np.tile(_ORIGIN, (len(rows), 1)))
+        self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
     def _place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], roots: Float32) -> None:
         """Do :meth:`write_state` with these states of the root (len(rows), 13).

@@ -38,6 +38,8 @@ class NativeStep:
         Whether to read velocities; otherwise they are zero.
     speed_limit
         Joint speed beyond which the status says so (dof,), or None.
+    constraint
+        Address of the constraint of coupled joints, or None.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class NativeStep:
         coriolis: bool,
         velocities: bool,
         speed_limit: NDArray[np.float64] | None,
+        constraint: int | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
@@ -86,6 +89,7 @@ class NativeStep:
             gravity=gravity,
             coriolis=coriolis,
             velocities=velocities,
+            constraint=constraint,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
         self._kept = calls, arrays

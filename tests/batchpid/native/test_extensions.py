@@ -16,7 +16,13 @@ import pytest
 import batchpid as bp
 from batchpid import native
 from batchpid.native import array_program, availability, extensions, operations
-from batchpid.native.availability import every_operation, first_difference, history_operations, program_status
+from batchpid.native.availability import (
+    columns_of,
+    every_operation,
+    first_difference,
+    history_operations,
+    program_status,
+)
 from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
 from batchpid.native.operations import OPERATIONS, PROGRAM
 from batchpid.native.symbols import Namespace, Stack, Symbol
@@ -196,6 +202,7 @@ def test_the_comparison_with_numpy_makes_every_operation():
     namespace = Namespace()
     every_operation(*(Symbol(namespace) for _ in range(4)))
     history_operations(Stack([Symbol(namespace)]), *(Symbol(namespace) for _ in range(3)))
+    columns_of(*(Symbol(namespace) for _ in range(3)))
     noted = {name for name, _, _ in namespace.noted}
     numbers = np.frombuffer(trace(every_operation, 0, 4).operations, np.int32).reshape(-1, 5)[:, 0]
     assert noted | {OPERATIONS[number] for number in numbers} == set(OPERATIONS)

@@ -50,11 +50,11 @@ def a_step(control, units, effects, seed, coupled=False):
     """Return the arguments of a control step with these effects, at a random state."""
     rng = np.random.default_rng(seed)
     params = bp.make_params(JOINTS, 30.0, ki=20.0, kd=2.0, effort_limit=25.0, gain_units=units)
-    coupling = Coupling(JOINTS, [Follower(2, 0, 0.5, 0.1)]) if coupled else None
     model = Model(mass_matrix, mass_matrix)
-    layout = Layout(control, PIDLaw.of(params) if control == "pid" else None, coupling, model=model)
+    layout = Layout(control, PIDLaw.of(params) if control == "pid" else None, model=model)
     qpos, qvel, passive = table(rng), table(rng), table(rng, 3.0)
-    constants = Constants(DT, (params.effort_min, params.effort_max))
+    coupling = Coupling(JOINTS, [Follower(2, 0, 0.5, 0.1)]).arrays if coupled else None
+    constants = Constants(DT, (params.effort_min, params.effort_max), coupling=coupling)
     state = StepState(bp.init(params, qpos), matrix=mass_matrix(qpos) if units == "mass_matrix" else None)
     if units == "inertia":
         state = state._replace(matrix=np.einsum("ejj->ej", mass_matrix(qpos)).copy())

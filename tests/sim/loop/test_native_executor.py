@@ -20,6 +20,7 @@ from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from batchpid.sim.loop.tick_program import TickProgram
+from tests.sim.engine.test_coupled_joints import arm
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
 N = 3
@@ -199,6 +200,12 @@ def test_random_settings_give_the_bytes_of_numpy(panda, engine, seed):
     check_against_numpy(panda, engine, seed)
 
 
+@pytest.mark.quick_rows(2)
+@pytest.mark.parametrize("seed", range(10, 30))
+def test_random_settings_of_coupled_joints_give_the_bytes_of_numpy(tmp_path, engine, seed):
+    check_against_numpy(arm(tmp_path, -0.5, 0.01, joints=3), engine, seed)
+
+
 @pytest.mark.slow
 def test_many_random_settings_give_the_bytes_of_numpy(panda, engine):
     for seed in range(100, 200):
@@ -225,6 +232,21 @@ def test_python_calls_of_a_sim_step(panda, actuators):
         finally:
             sys.setprofile(None)
     assert calls <= 2 * 4 * 20 + 60, "60 for the runner itself"
+
+
+def test_coupled_joints_take_a_call_for_four_sim_steps(tmp_path, engine, monkeypatch):
+    spans, run = [], TickProgram.run
+
+    def counted(self, step, begin, until, end):
+        spans.append((begin, until))
+        return run(self, step, begin, until, end)
+
+    monkeypatch.setattr(TickProgram, "run", counted)
+    with Runner(arm(tmp_path, joints=3), 2, workers=0, engine=engine) as runner:
+        start = runner.reset().qpos
+        runner.step(start, substeps=10)
+        assert spans == [(0, 4), (4, 8), (8, 10)]
+        assert "a call each sim step" not in runner.backend
 
 
 class Rest:
