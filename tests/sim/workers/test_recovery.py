@@ -153,7 +153,7 @@ def test_the_error_of_a_worker_that_is_asleep_holds_its_stack():
     ):
         runner.step(ROBOT.settings.target)
     assert "last stack" in str(info.value)
-    assert "test_recovery.py" in str(info.value)
+    assert "in sleep_for_ever" in str(info.value)
 
 
 @pytest.mark.slow
