@@ -282,16 +282,17 @@ class NativePassiveForce:
 
     def __call__(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
         """Return the efforts (M, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal forces."""
-        force = self._computed(qpos, qvel if coriolis else np.zeros_like(qvel))
-        return force if gravity else force - self._computed(qpos, np.zeros_like(qvel))
-
-    def _computed(self, qpos: Float64, qvel: Float64) -> Float64:
-        rows, dof = qpos.shape
-        force, state = np.empty((rows, dof)), (np.ascontiguousarray(each, np.float64) for each in (qpos, qvel))
-        self._native.dynamics(
-            self._tree, *state, np.zeros((rows, 1)), np.empty((rows, dof, dof)), force, np.empty((rows, dof))
-        )
+        force, state = np.empty(qpos.shape), (np.ascontiguousarray(each, np.float64) for each in (qpos, qvel))
+        self._native.run(self.bind(gravity, coriolis, *state, force)[0])
         return force
+
+    def bind(self, gravity: bool, coriolis: bool, *arrays: Float64) -> tuple[Any, int]:
+        """Return an object that computes on fixed ``arrays``, and the address of its Call (call.h).
+
+        The arrays are positions, velocities and force (M, dof). The caller keeps them, and this object.
+        """
+        bound: tuple[Any, int] = self._native.bind_force(self._tree, gravity, coriolis, *arrays)
+        return bound
 
 
 def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Float64, bool, bool], Float64]:

@@ -6,6 +6,7 @@ import batchpid as bp
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import xla
+from batchpid.sim.engine.protocol import Engine
 from batchpid.sim.loop.acting_draws import acting_actuators
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.fields import MASSES
@@ -29,10 +30,15 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
 
 
 def _engine_obstacle(options: RunnerOptions) -> str:
-    """Return why native steps of the engine do not read the passive force, or nothing."""
+    """Return why the engine has no native steps, or why these do not read the passive force; or nothing."""
     engine = options.load_engine()
     if "compiled_steps" not in engine.capabilities:
         return f"the sim steps of {engine.name!r} are calls of Python"
+    return _force_obstacle(engine, options)
+
+
+def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
+    """Return why the engine's native steps do not read the passive force, or nothing."""
     if "gravity" in options.compensate and "partial_force" not in engine.capabilities:
         if not options.robot.fixed_base:
             return f"{engine.title} needs NumPy for the passive force of a floating base"
@@ -51,12 +57,17 @@ def native_obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> s
         return "the controller is one of Python"
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
+    engine = options.load_engine()
+    if "compiled_steps" not in engine.capabilities:
+        return f"the sim steps of {engine.name!r} are calls of Python"
+    if options.robot.fixed_base or "gravity" not in options.compensate:
+        return ""
     acting = acting_actuators(options, actuators, None)
     if acting is not None and acting.measures:
-        return "sensors take noise and passive force of NumPy"
-    if "gravity" in options.compensate and randomization is not None and MASSES & randomization.given.keys():
-        return "the passive force of varied masses is NumPy's"
-    return _engine_obstacle(options)
+        return "on a floating base the passive force at a sensor's reading is NumPy's"
+    if randomization is not None and MASSES & randomization.given.keys():
+        return "on a floating base the passive force of varied masses is NumPy's"
+    return _force_obstacle(engine, options)
 
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:

@@ -1,13 +1,13 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Python computes the noise of sensors, the passive force at a measured
-state, and the passive force of robots whose masses vary: with these each sim step is a call, and sensors have another
-program. With coupled joints every four sim steps are a call, since Python updates the mass matrix of the constraint
-efforts. Operational-space control is a native call before the program, which takes its effort as an input. Where the
-control step cannot be traced (a caller's controller, drives whose targets move within a tick), it runs in NumPy, and
-one native call applies the efforts, steps the engine and reads it. A sim step in which the friction model updates its
-mass matrix runs in the same way.
+arrays that hold the state from step to step. Sensors have another program, and Python draws their noise in advance.
+Where the engine's steps do not read the passive force of the model, as at a measured state or with varied masses, a
+native call computes it; on a floating base Python does, and each sim step is a call. With coupled joints every four sim
+steps are a call, since Python updates the mass matrix of the constraint efforts. Operational-space control is a native
+call before the program, which takes its effort as an input. Where the control step cannot be traced (a caller's
+controller, drives whose targets move within a tick), it runs in NumPy, and one native call applies the efforts, steps
+the engine and reads it. A sim step in which the friction model updates its mass matrix runs in the same way.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
+from batchpid.sim.engine.batch_dynamics import NativePassiveForce, passive_force_of
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
@@ -44,6 +45,10 @@ class NativeExecutor(NumPyExecutor):
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._calls_force = self._reads_force and not self._steps_read_force
+        calls_force = self._calls_force or (layout.measures and self._gravity)
+        force = passive_force_of(pack.spec, True) if calls_force else None
+        self._force = force if isinstance(force, NativePassiveForce) else None
+        self._by_step = calls_force and self._force is None
         has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
         if layout.control == "custom":
             has_own_law = options.backend == "numpy" and _is_native(self._controller, layout, constants)
@@ -58,14 +63,14 @@ class NativeExecutor(NumPyExecutor):
         if self._layout.control == "drive" and isinstance(self._pack, DrivenPack):
             rate = command.setpoint_rate
             self._pack.write_drive_target(command.setpoint, np.zeros_like(command.setpoint) if rate is None else rate)
-        by_step, done, status = self._layout.measures or self._calls_force, begin, 0
+        done, status = begin, 0
         while done < end and not status:
             self._update_constraint(done)
             due = end if state.age is None else done + REFRESH_STEPS - int(program.state.age.max())
-            if due > done:
-                if self._layout.measures:
-                    self._measure(program)
-                until = done + 1 if by_step else min(due, end)
+            if is_program := due > done:
+                if self._by_step and self._layout.measures:
+                    program.reading.passive[...] = self._layout.model.passive_force(*program.measure())
+                until = done + 1 if self._by_step else min(due, end)
                 if self._constants.coupling is not None:
                     until = min(until, done - done % COUPLING_STEPS + COUPLING_STEPS)
                 done, status = program.run(self._prepared(), done, until, end)
@@ -74,20 +79,12 @@ class NativeExecutor(NumPyExecutor):
                 program.take(*control_step(self._layout, self._constants, *now, step))
                 status = self._native_step(program.outputs.qf, *program.reading)
                 done += 1
-            if self._calls_force:
+            if self._calls_force and not (is_program and self._force):
                 program.reading.passive[...] = self._pack.passive_force(self._gravity, self._coriolis)
         failed, measured = bool(status & LOOK), program.measured
         if status:
             measured = self._look(status, measured)
         return Ran(program.state, program.outputs, measured, program.before, done, failed)
-
-    def _measure(self, program: TickProgram) -> None:
-        """Advance the sensors, and compute the passive force at the measured state, if it is compensated."""
-        model, motors = self._layout.model, program.state.motors
-        noise = model.noise(self._constants.motors, motors, program.reading.qpos)
-        seen = program.measure(*((None, None) if noise is None else noise))
-        if model.passive_force is not None:
-            program.reading.passive[...] = model.passive_force(*seen)
 
     def _update_constraint(self, index: int) -> None:
         """Update the constraint efforts of coupled joints, if it is time for it before sim step ``index``."""
@@ -137,14 +134,22 @@ class NativeExecutor(NumPyExecutor):
         key = command.setpoint_rate is None, command.feedforward is None
         if key not in self._ticks:
             self._ticks[key] = TickProgram(
-                self._pack, self._layout, self._constants, state, command, self._gravity, self._controller
+                self._pack,
+                self._layout,
+                self._constants,
+                state,
+                command,
+                self._gravity,
+                self._controller,
+                self._force,
+                (self._gravity, self._coriolis),
             )
         return self._ticks[key]
 
 
 def _is_native(controller: Any, layout: Layout, constants: Constants) -> bool:
-    """Return whether a controller is native: operational-space control without sensors or friction compensation."""
-    if not isinstance(controller, OperationalSpace) or layout.measures:
+    """Return whether a controller is native: operational-space control without friction compensation."""
+    if not isinstance(controller, OperationalSpace):
         return False
     return constants.known is None and controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
 

@@ -155,7 +155,12 @@ class NoiseBlocks:
         self._block: tuple[Any, Any] = (None, None)
 
     def __call__(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Any, Any] | None:
-        """Return the noise of positions and velocities; None for sensors without noise.
+        """Return the noise of positions and velocities; None for sensors without noise."""
+        blocks = self.from_step(k, state, like)
+        return None if blocks is None else (_first(blocks[0]), _first(blocks[1]))
+
+    def from_step(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Any, Any] | None:
+        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it has been drawn.
 
         A reset replaces the key. While the key is the same, all envs advance by the same number of steps.
         """
@@ -167,4 +172,8 @@ class NoiseBlocks:
             self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
             self._key, self._first, at = state.key, int(state.step[0]), 0
         position, velocity = self._block
-        return None if position is None else position[at], None if velocity is None else velocity[at]
+        return None if position is None else position[at:], None if velocity is None else velocity[at:]
+
+
+def _first(block: Any) -> Any:
+    return None if block is None else block[0]

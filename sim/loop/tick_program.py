@@ -13,6 +13,7 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Stack, Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.native.trees import filled, leaves, mapped, structure
+from batchpid.sim.engine.batch_dynamics import NativePassiveForce
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
@@ -23,7 +24,9 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 class TickProgram:
     """Control step of a group of envs as a program, and its arrays; with ``gravity`` it reads a passive force.
 
-    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program.
+    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force``
+    computes the passive force where the engine's steps do not read it; its arguments are ``parts``, the arrays of
+    positions and velocities, and the result.
 
     Attributes
     ----------
@@ -44,6 +47,8 @@ class TickProgram:
         command: Command,
         gravity: bool,
         controller: Any = None,
+        force: NativePassiveForce | None = None,
+        parts: tuple[bool, bool] = (True, True),
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
@@ -53,8 +58,16 @@ class TickProgram:
         self.measured = self.reading if gravity else self.reading._replace(passive=None)
         self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
         self._constants = mapped(_stacked, constants)
-        self._sensors: tuple[ArrayProgram, list[Float64], list[Float64]] | None = None
-        self._control = None if controller is None else controller.bound(*self.reading)
+        self.before = np.zeros(shape)
+        at = self.reading[:2] if self._seen is None else self._seen
+        self._control = None if controller is None else controller.bound(*at, self.reading.passive)
+        self._force: tuple[Any, ...] = ()
+        if force is not None:
+            bound, address = force.bind(*parts, *at, self.reading.passive)
+            self._force = force, bound, {"measured_force" if layout.measures else "read_force": address}
+        self._noise = layout.model.noise
+        self._sensors = self._make_sensors() if layout.measures else None
+        self._senses = layout.measures and not (gravity and force is None)
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
             command = command._replace(setpoint=None)  # the controller has its own copy, of any size
@@ -64,7 +77,6 @@ class TickProgram:
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
         if self._control is not None:
             self.outputs = self.outputs._replace(returned=self._control.effort)
-        self.before = np.zeros(shape)
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
         if self._control is not None:
             fixed = fixed._replace(law=None)
@@ -91,6 +103,8 @@ class TickProgram:
             matrix_steps=steps,
             whole=whole,
             control=None if self._control is None else self._control.address,
+            sensors=self._sensors if self._senses else None,
+            **(self._force[-1] if self._force else {}),
             **arrays,
         )
 
@@ -109,30 +123,45 @@ class TickProgram:
                 array[...] = value
 
     def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
-        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status."""
-        done, status = self._tick.run(step.prepare(), begin, until, end)
+        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status.
+
+        Fewer steps are done after an event, and where the noise of the sensors has to be drawn.
+        """
+        noise = self._draw() if self._senses else ()
+        until = min([until, *(begin + len(block) for block in noise if block is not None)])
+        done, status = self._tick.run(step.prepare(), begin, until, end, *noise)
         if self.state.age is not None:
             self.state.age[...] += done - begin
         if self.state.motors is not None and self.state.motors.step is not None:
             self.state.motors.step[...] += done - begin
         return done, status
 
-    def measure(self, *noise: Float64 | None) -> Any:
-        """Advance the sensors with the noise of positions and velocities; return both as measured, but for a step.
+    def measure(self) -> Any:
+        """Advance the sensors; return positions and velocities as measured. Only :meth:`run` counts the step.
 
-        Only :meth:`run` counts the step.
+        It comes before each :meth:`run` of one step where the passive force at a measured state is Python's.
         """
-        drawn = [each for each in noise if each is not None]
-        if self._sensors is None:
-            side, k = _sensor_side(self.state.motors), self._constants.motors
-            inputs = (side, *self.reading[:2])
-            traced = _trace_sensors(*map(structure, (k, *inputs, noise)))
-            fixed, shape = leaves(inputs), self.before.shape
-            program = ArrayProgram(traced, leaves(k), len(fixed) + len(drawn), shape)
-            self._sensors = program, fixed, [*leaves(side.encoder), *leaves(self._seen)]
-        program, fixed, out = self._sensors
-        program(*fixed, *drawn, out=out)
+        assert self._sensors is not None
+        program, inputs, outputs = self._sensors
+        for place, block in zip(self._drawn, filter(_is_given, self._draw()), strict=True):
+            place[...] = block[0]
+        program(*inputs, out=outputs)
         return self._seen
+
+    def _draw(self) -> tuple[Any, Any]:
+        """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
+        return self._noise.from_step(self._constants.motors, self.state.motors, self.before) or (None, None)
+
+    def _make_sensors(self) -> tuple[ArrayProgram, list[Float64], list[Float64]]:
+        """Return the program of the sensors, its inputs and its outputs."""
+        assert self.state.motors is not None
+        side, k = _sensor_side(self.state.motors), self._constants.motors
+        noise = tuple([None if block is None else block[0].copy() for block in self._draw()])
+        self._drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
+        traced = _trace_sensors(*map(structure, (k, side, *self.reading[:2], noise)))
+        inputs = [*fixed, *self._drawn]
+        program = ArrayProgram(traced, leaves(k), len(inputs), self.reading.qpos.shape)
+        return program, inputs, [*leaves(side.encoder), *leaves(self._seen)]
 
     def take(self, state: StepState, outputs: Outputs) -> None:
         """Copy the results of a control step in NumPy."""
@@ -191,6 +220,10 @@ def _trace_sensors(*structures: Any) -> Trace:
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+def _is_given(array: Any) -> bool:
+    return array is not None
 
 
 def _motor_side(motors: ActuatorState | None) -> ActuatorState | None:

@@ -96,6 +96,8 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
+        *((name, ctypes.c_void_p) for name in ("measured_force", "read_force")),
+        ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),
         ("whole", ctypes.c_int32),
@@ -157,7 +159,7 @@ EXTENSIONS = {
     ),
     "_batch_dynamics": Extension(
         "batchpid.sim.engine.native._batch_dynamics",
-        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY),
+        (*_files("batch_dynamics.cpp"), BUFFER, CALL, LANES, RIGID_BODY),
         (*ROUNDED, "-Wno-psabi"),
         _batch_dynamics_tables,
     ),

@@ -31,6 +31,11 @@ class NativeTick:
         Whether ``matrix`` is the whole mass matrix or its diagonal.
     control
         Address of a native controller (``Call`` in call.h), whose effort is one of the program's inputs.
+    measured_force, read_force
+        Address of a call that writes ``passive`` at the measured state before each control step, or at the reading
+        after each sim step.
+    sensors
+        Program of the sensors, its inputs and its outputs. Its last inputs are the noise (:meth:`run`).
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
@@ -49,6 +54,9 @@ class NativeTick:
         matrix_steps: int = 1,
         whole: bool = False,
         control: int | None = None,
+        measured_force: int | None = None,
+        read_force: int | None = None,
+        sensors: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
         **arrays: NDArray[Any] | None,
     ) -> None:
         arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
@@ -58,19 +66,27 @@ class NativeTick:
             if array.dtype != types[name] or not array.flags.c_contiguous:
                 raise ValueError(f"{name} is not a contiguous array of {np.dtype(types[name])}")
         self._native = native.extension("_gateway")
-        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size) for array in inputs])
-        self._program = self._native.bind(program.arguments, pairs, tuple(outputs))
+        self._program = self._bind(program, inputs, outputs)
+        self._sensors = None if sensors is None else self._bind(*sensors)
         addresses = {name: array.ctypes.data for name, array in given.items()}
         dof = program.shape[1]
-        self._tick = Tick(
-            timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, control=control, **addresses
-        )
+        calls = {"control": control, "measured_force": measured_force, "read_force": read_force}
+        self._tick = Tick(timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, **calls, **addresses)
         self._address = ctypes.addressof(self._tick)
-        self._kept = inputs, outputs, given
+        self._kept = inputs, outputs, given, sensors
 
-    def run(self, group: int, begin: int, until: int, end: int) -> tuple[int, int]:
+    def _bind(self, program: ArrayProgram, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]]) -> Any:
+        """Return a program with its arrays."""
+        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size) for array in inputs])
+        return self._native.bind(program.arguments, pairs, tuple(outputs))
+
+    def run(self, group: int, begin: int, until: int, end: int, *noise: NDArray[np.float64] | None) -> tuple[int, int]:
         """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the last status.
 
         ``group`` is the address of the native group: :meth:`batchpid.sim.engine.protocol.CompiledStep.prepare`.
+        ``noise`` is the noise of positions and of velocities in these steps (steps or more, envs, dof), contiguous, or
+        None.
         """
-        return self._native.tick(self._program, self._address, group, begin, until, end)
+        for place, block in enumerate(noise):
+            self._tick.noise[place] = None if block is None else block.ctypes.data
+        return self._native.tick(self._program, self._address, group, begin, until, end, self._sensors)

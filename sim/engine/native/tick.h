@@ -28,6 +28,9 @@ struct Tick {
   double const *multiplier;       // (dof,)
   double *matrix;                 // (robots, dof, dof), or its diagonal, or null
   Call const *control;            // native controller, whose effort is an input of the program, or null
+  Call const *measured_force;     // writes the passive force at the measured state, or null
+  Call const *read_force;         // writes it at the reading after a sim step, or null
+  double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
   double timestep;
   std::int64_t dof;
   std::int32_t whole;             // the law takes the whole matrix
@@ -89,13 +92,25 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
   }
 }
 
-// Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
-inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group &group, std::int64_t &step,
-                             std::int64_t until, std::int64_t end) {
-  auto const robots = group.robots;
+// Run the sensors' program, whose last inputs are the noise, in sim step `at` of those that tick.noise is for.
+inline void measure(BoundProgram &sensors, Tick const &tick, std::int64_t robots, std::int64_t at) {
+  auto place = sensors.inputs.end();
+  for (int i = 1; i >= 0; --i) {
+    if (tick.noise[i] != nullptr) (--place)->data = tick.noise[i] + at * robots * tick.dof;
+  }
+  run(*sensors.program, sensors.inputs.data(), sensors.outputs.data(), 0, robots);
+}
+
+// Run the sim steps from `step` to `until` of a tick of `end` steps, with the program of sensors or null. Advance `step`;
+// return the status of the last.
+inline std::int32_t run_tick(BoundProgram const &bound, BoundProgram *sensors, Tick const &tick, Group &group,
+                             std::int64_t &step, std::int64_t until, std::int64_t end) {
+  auto const robots = group.robots, begin = step;
   auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
   std::int32_t status = 0;
   while (step < until && status == 0) {
+    if (sensors != nullptr) measure(*sensors, tick, robots, step - begin);
+    if (tick.measured_force != nullptr) tick.measured_force->run(*tick.measured_force);
     if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
       write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
     }
@@ -103,6 +118,7 @@ inline std::int32_t run_tick(BoundProgram const &bound, Tick const &tick, Group 
     run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
     std::memcpy(tick.before, tick.qpos, bytes);
     status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
+    if (tick.read_force != nullptr) tick.read_force->run(*tick.read_force);
     ++step;
   }
   return status;

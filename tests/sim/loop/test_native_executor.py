@@ -10,7 +10,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.sim import Randomization, Runner, Uniform
+from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine import native
 from batchpid.sim.engine.batch_dynamics import NativeMassMatrix, NativePassiveForce
 from batchpid.sim.engine.sapien.physics import PHYSICS
@@ -206,6 +206,13 @@ def test_random_settings_of_coupled_joints_give_the_bytes_of_numpy(tmp_path, eng
     check_against_numpy(arm(tmp_path, -0.5, 0.01, joints=3), engine, seed)
 
 
+@pytest.mark.quick_rows(2)
+@pytest.mark.parametrize("seed", range(30, 50))
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_random_settings_on_a_floating_base_give_the_bytes_of_numpy(engine, seed):
+    check_against_numpy(Robot.load("panda", fixed_base=False), engine, seed)
+
+
 @pytest.mark.slow
 def test_many_random_settings_give_the_bytes_of_numpy(panda, engine):
     for seed in range(100, 200):
@@ -294,14 +301,26 @@ def test_control_steps_that_are_a_program(panda):
         ({}, ""),
         ({"control": "effort"}, ""),
         ({"actuators": bp.make_actuators(9, strength=0.9, viscous=0.1)}, ""),
-        ({"actuators": bp.make_actuators(9, position_noise=1e-4)}, "sensors"),
+        ({"actuators": bp.make_actuators(9, position_noise=1e-4)}, ""),
+        ({"compensate": "gravity"}, ""),
         ({"randomization": Randomization(friction=Uniform(0.1, 0.2))}, ""),
-        ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, "varied masses"),
+        ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, ""),
         ({"control": Rest()}, "the controller is one of Python"),
         ({"control": "osc", "tool": "panda_hand"}, ""),
-        ({"control": "osc", "tool": "panda_hand", "actuators": bp.make_actuators(9, position_noise=1e-4)}, "sensors"),
+        ({"control": "osc", "tool": "panda_hand", "actuators": bp.make_actuators(9, position_noise=1e-4)}, ""),
     ],
-    ids=["pid", "effort", "motors", "sensors", "friction", "masses", "controller", "tool", "tool with sensors"],
+    ids=[
+        "pid",
+        "effort",
+        "motors",
+        "sensors",
+        "gravity",
+        "friction",
+        "masses",
+        "controller",
+        "tool",
+        "tool with sensors",
+    ],
 )
 def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, panda, monkeypatch):
     """Runs of the program, of the whole tick or of one sim step, are counted."""
@@ -316,5 +335,21 @@ def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, pan
         begin = runner.reset()
         runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=10)
         assert (spans == [10]) == (not reason)
+        assert ("a call each sim step (" in runner.backend) == bool(reason)
+        assert reason in runner.backend
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({}, ""),
+        ({"compensate": "none", "actuators": bp.make_actuators(9, position_noise=1e-4)}, ""),
+        ({"actuators": bp.make_actuators(9, position_noise=1e-4)}, "a sensor's reading"),
+        ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, "varied masses"),
+    ],
+    ids=["pid", "no compensation", "sensors", "masses"],
+)
+def test_the_reasons_on_a_floating_base(options, reason):
+    with Runner(Robot.load("panda", fixed_base=False), 2, workers=0, **options) as runner:
         assert ("a call each sim step (" in runner.backend) == bool(reason)
         assert reason in runner.backend

@@ -281,6 +281,7 @@ MORE = [
     {"compensate": "gravity"},
     {"compensate": "none"},
     {"actuators": bp.make_actuators(9, command_delay=0.001, effort_limit=60.0)},
+    {"actuators": bp.make_actuators(9, sensor_delay=0.001, position_noise=1e-4, velocity_noise=1e-3)},
     {"arm": "damped", "link": "l6"},
     {"arm": "with_friction", "link": "l6", "compensate": "gravity+coriolis"},
 ]
@@ -295,7 +296,7 @@ ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
     [
         *(("sapien", *each) for each in (ALL[0], *ALL[7:])),
         *(pytest.param("sapien", *each, marks=pytest.mark.slow) for each in ALL[1:7]),
-        *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[8])),
+        *(("mujoco", *each) for each in (ALL[2], ALL[3], ALL[6], ALL[7], ALL[9])),
     ],
 )
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
