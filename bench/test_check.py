@@ -40,7 +40,7 @@ FLOORS = [
     Floor(OURS, PYTHON, 1.0, 1.05, "purpose of the native extension"),
     Floor(OURS, BY_TICKS, 0.95, 0.95, "a rollout is not slower than its ticks one by one"),
     Floor(
-        "closed loop, policy network", OURS, 0.85, 0.85, "a small network at every sim step costs less than the engine"
+        "closed loop, policy network", OURS, 0.8, 0.7, "a small network at every sim step costs less than the engine"
     ),
     Floor("closed loop, no shapes", OURS, 1.08, 1.25, "purpose of collisions=False"),
     Floor(
