@@ -18,7 +18,6 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
-from batchpid.sim.loop.law_program import LawProgram
 from batchpid.sim.loop.stage_program import compiled_stages
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
@@ -115,8 +114,6 @@ def with_model(
     model = Model(mass_matrix_of(pack.spec, _is_native(pack)), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
     if layout.law is not None and jitted:
         model = model._replace(law=partial(jitted_law, options.dtype, pack.size))
-    elif layout.law is not None and constants.k is not None and LawProgram.available(constants.k):
-        model = model._replace(law=LawProgram(layout.law, constants.k).as_advance)
     if controller is not None:
         call = partial(jitted_controller, options.dtype, pack.size, controller) if jitted else controller
         model = model._replace(controller=call)

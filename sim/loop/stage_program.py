@@ -1,6 +1,7 @@
 """Elementwise stages of a sim step as programs of the extension: one call executes all operations of a stage.
 
-As with the law (:mod:`batchpid.sim.loop.law_program`), the only definition is traced, and results are bit-identical.
+The only definition is traced, and results are bit-identical. They are for control steps that are not a program as a
+whole: those with a controller of the caller's, or of the backend "jax".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The law as a native program is bit-identical to the law in NumPy, for all options and inputs."""
+"""The law, traced as in a native program, is bit-identical to the law in NumPy, for all options and inputs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.tracing import trace
+from batchpid.native.trees import filled, leaves, structure
 from batchpid.sim.engine import native
-from batchpid.sim.loop.law_program import LawProgram
 from batchpid.sim.loop.pid_law import PIDLaw
 
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
@@ -65,9 +67,22 @@ def bits(leaf):
     return None if leaf is None else np.where(np.isnan(leaf), np.nan, leaf).tobytes()
 
 
+def run_traced(law, k, *arguments):
+    """Return new state, effort and saturated joints of :meth:`PIDLaw.advance`, traced and run by the extension."""
+
+    def function(*symbols):
+        given = iter(symbols)
+        k, *inputs = (filled(each, given) for each in structures)
+        return leaves(law.advance(k, *inputs, observed=True))
+
+    structures, constants, inputs = [structure(each) for each in (k, *arguments)], leaves(k), leaves(arguments)
+    program = ArrayProgram(trace(function, len(constants), len(inputs)), constants, len(inputs), arguments[2].shape)
+    return program(*inputs)
+
+
 @needs_extension
 @given(OPTIONS, st.integers(1, 20), st.integers(1, 5), st.sampled_from([0.0, 0.1]), st.integers(0, 2**32), st.data())
-def test_the_program_is_bit_identical_to_numpy(options, joints, envs, odd, seed, data):
+def test_the_traced_law_is_bit_identical_to_numpy(options, joints, envs, odd, seed, data):
     params, rng, shape = params_of(joints, options), np.random.default_rng(seed), (envs, joints)
     law, k = PIDLaw.of(params), bp.discretise(params, DT, envs)
     state = bp.PIDState(
@@ -82,14 +97,10 @@ def test_the_program_is_bit_identical_to_numpy(options, joints, envs, odd, seed,
     ends = np.sort(numbers(rng, (2, *shape), odd), axis=0) if data.draw(st.booleans()) else (None, None)
     signals = (numbers(rng, shape, odd), rate), numbers(rng, shape, odd), qvel, feedforward
     arguments = (state, *signals, matrix, viscous, *ends)
-    program = LawProgram(law, k)
     with np.errstate(all="ignore"):
-        new, effort, saturated = law.advance(k, *arguments, observed=True)
-        assert [bits(leaf) for leaf in law.advance(k, *arguments)[0]] == [bits(leaf) for leaf in new]
-    for ours in (program.advance(*arguments, observed=True), program.advance(*arguments)):
-        assert [bits(leaf) for leaf in ours[0]] == [bits(leaf) for leaf in new]
-        assert bits(ours[1]) == bits(effort)
-    assert bits(program.advance(*arguments, observed=True)[2]) == bits(saturated)
+        expected = law.advance(k, *arguments, observed=True)
+    found = run_traced(law, k, *arguments)
+    assert [bits(leaf) for leaf in found] == [bits(leaf) for leaf in leaves(expected)]
 
 
 @needs_extension
@@ -101,37 +112,4 @@ def test_sums_are_in_the_order_of_numpys(joints):
     law, k = PIDLaw.of(params), bp.discretise(params, DT, 3)
     state, zero = bp.init(params, np.zeros_like(vector)), np.zeros_like(vector)
     arguments = (state, (vector, None), zero, None, None, matrix)
-    assert bits(LawProgram(law, k).advance(*arguments)[1]) == bits(law.advance(k, *arguments)[1])
-
-
-@needs_extension
-def test_arrays_need_not_be_contiguous_but_of_the_right_size():
-    params = bp.make_params(2, 3.0, kd=0.1)
-    law, k = PIDLaw.of(params), bp.discretise(params, DT, 3)
-    state, rows = bp.init(params, np.zeros((3, 2))), np.arange(6.0).reshape(2, 3).T
-    program = LawProgram(law, k)
-    effort = program.advance(state, (rows, None), -rows, None, None)[1]
-    np.testing.assert_array_equal(effort, law.advance(k, state, (rows, None), -rows, None, None)[1])
-    for wrong in (rows[:2], rows.astype(np.float32)):
-        with pytest.raises(ValueError, match="do not fit"):
-            program.advance(state, (wrong, None), rows, None, None)
-
-
-def test_float32_and_missing_extensions_are_left_to_numpy(monkeypatch):
-    k = bp.discretise(bp.make_params(2, 3.0), DT, 3)
-    assert LawProgram.available(k) == native.status().active
-    assert not LawProgram.available(bp.discretise(bp.make_params(2, 3.0, dtype=np.float32), DT, 3))
-    monkeypatch.setenv(native.SWITCH, "0")
-    assert not LawProgram.available(k)
-
-
-@needs_extension
-@pytest.mark.parametrize("order", [("zero", "hold"), ("hold", "zero")])
-def test_laws_that_differ_in_a_choice_alone_have_programs_of_their_own(order):
-    for non_finite in order:
-        params = bp.make_params(2, kp=10.0, effort_rate_limit=1e6, non_finite=non_finite)
-        law, k = PIDLaw.of(params), bp.discretise(params, DT, 1)
-        program, state, setpoint = LawProgram(law, k), bp.init(params, np.zeros((1, 2))), np.ones((1, 2))
-        for qpos in (0.5, np.nan):
-            state, effort = program.advance(state, (setpoint, None), np.full((1, 2), qpos), None, None)[:2]
-        assert (effort == {"zero": 0.0, "hold": 5.0}[non_finite]).all()
+    assert bits(run_traced(law, k, *arguments)[-2]) == bits(law.advance(k, *arguments)[1])
