@@ -176,9 +176,9 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
     Measured in this process with a worker's share of the envs, and in NumPy, with native calls into the engine if
-    available: in a native tick the phases cannot be separated. "control" is everything but calls on the engine; a
-    native tick takes a fraction of it. The time of the clock calls is included: about one percent. "waiting" is the mean time of a tick of :meth:`Runner.step`
-    beyond the work of a worker.
+    available: in a native tick the phases cannot be separated. "control" is everything but calls on the engine, of
+    which a native tick takes a fraction. The time of the clock calls is included: about one percent. "waiting" is the
+    mean time of a tick of :meth:`Runner.step` beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot
