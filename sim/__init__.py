@@ -27,7 +27,6 @@ if __name__ == "sim":  # the folder of a checkout, under the name that it had be
     sys.meta_path.insert(0, _Renamed())
 
 from batchpid.sim.command import CommandSpec
-from batchpid.sim.loop.contact_log import MissedContact, MissedContactWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, register_plot
@@ -44,6 +43,7 @@ from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Controller, RunnerKeywords
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 
 if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver

@@ -16,7 +16,6 @@ import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.backend import describe
-from batchpid.sim.loop.contact_log import MissedContact
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo
@@ -24,6 +23,7 @@ from batchpid.sim.options import RunnerOptions, default_params, keyword_paramete
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import RunnerKeywords
 from batchpid.sim.session import Session, TickRecorder
+from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 
 

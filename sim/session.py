@@ -23,7 +23,6 @@ from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.arguments import Arguments
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
@@ -32,6 +31,7 @@ from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.workers.pool import WorkerPool
 from batchpid.sim.workers.requests import (
     ReadPoses,

@@ -139,10 +139,9 @@ class NativeExecutor(NumPyExecutor):
                 self._constants,
                 state,
                 command,
-                self._gravity,
+                (self._gravity, self._coriolis),
                 self._controller,
                 self._force,
-                (self._gravity, self._coriolis),
             )
         return self._ticks[key]
 

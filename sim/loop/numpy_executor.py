@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.errors import ControllerError
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
-from batchpid.sim.loop.custom import OwnController
+from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
 from batchpid.sim.loop.stage_program import compiled_stages
@@ -73,12 +72,8 @@ class NumPyExecutor:
         pack, target, rate = self._pack, None, ()
         for index in range(begin, end):
             step = Step(index, end, index + 1 == end)
-            try:
+            with controller_errors(self._controller, index + 1):
                 state, outputs = control_step(self._layout, self._constants, state, command, measured, step)
-            except Exception as error:
-                if self._controller is None:
-                    raise
-                raise ControllerError(type(self._controller).__name__, error, index + 1) from error
             # Writing the drives' targets costs a call for each joint.
             if outputs.target is not target and isinstance(pack, DrivenPack):
                 known = outputs.target_rate is rate

@@ -22,11 +22,11 @@ from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, O
 
 
 class TickProgram:
-    """Control step of a group of envs as a program, and its arrays; with ``gravity`` it reads a passive force.
+    """Control step of a group of envs as a program, and its arrays.
 
-    A ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force``
-    computes the passive force where the engine's steps do not read it; its arguments are ``parts``, the arrays of
-    positions and velocities, and the result.
+    ``compensated`` says whether gravity is compensated, and whether Coriolis and centrifugal forces are. A
+    ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force`` computes
+    the passive force where the engine's steps do not read it.
 
     Attributes
     ----------
@@ -45,17 +45,16 @@ class TickProgram:
         constants: Constants,
         state: StepState,
         command: Command,
-        gravity: bool,
+        compensated: tuple[bool, bool],
         controller: Any = None,
         force: NativePassiveForce | None = None,
-        parts: tuple[bool, bool] = (True, True),
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
             matrix = np.zeros((*shape, pack.dof) if law.whole else shape)
         self.state = mapped(partial(np.array, order="C"), state._replace(matrix=matrix))
         self.reading = Measured(*np.zeros((3, *shape)))
-        self.measured = self.reading if gravity else self.reading._replace(passive=None)
+        self.measured = self.reading if compensated[0] else self.reading._replace(passive=None)
         self._seen = tuple(np.zeros((2, *shape))) if layout.measures else None
         self._constants = mapped(_stacked, constants)
         self.before = np.zeros(shape)
@@ -63,11 +62,11 @@ class TickProgram:
         self._control = None if controller is None else controller.bound(*at, self.reading.passive)
         self._force: tuple[Any, ...] = ()
         if force is not None:
-            bound, address = force.bind(*parts, *at, self.reading.passive)
+            bound, address = force.bind(*compensated, *at, self.reading.passive)
             self._force = force, bound, {"measured_force" if layout.measures else "read_force": address}
         self._noise = layout.model.noise
         self._sensors = self._make_sensors() if layout.measures else None
-        self._senses = layout.measures and not (gravity and force is None)
+        self._senses = layout.measures and not (compensated[0] and force is None)
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
             command = command._replace(setpoint=None)  # the controller has its own copy, of any size
@@ -127,8 +126,8 @@ class TickProgram:
 
         Fewer steps are done after an event, and where the noise of the sensors has to be drawn.
         """
-        noise = self._draw() if self._senses else ()
-        until = min([until, *(begin + len(block) for block in noise if block is not None)])
+        noise = leaves(self._draw()) if self._senses else []
+        until = min([until, *(begin + len(block) for block in noise)])
         done, status = self._tick.run(step.prepare(), begin, until, end, *noise)
         if self.state.age is not None:
             self.state.age[...] += done - begin
@@ -143,7 +142,7 @@ class TickProgram:
         """
         assert self._sensors is not None
         program, inputs, outputs = self._sensors
-        for place, block in zip(self._drawn, filter(_is_given, self._draw()), strict=True):
+        for place, block in zip(self._drawn, leaves(self._draw()), strict=True):
             place[...] = block[0]
         program(*inputs, out=outputs)
         return self._seen
@@ -156,7 +155,7 @@ class TickProgram:
         """Return the program of the sensors, its inputs and its outputs."""
         assert self.state.motors is not None
         side, k = _sensor_side(self.state.motors), self._constants.motors
-        noise = tuple([None if block is None else block[0].copy() for block in self._draw()])
+        noise = mapped(lambda block: block[0].copy(), self._draw())
         self._drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
         traced = _trace_sensors(*map(structure, (k, side, *self.reading[:2], noise)))
         inputs = [*fixed, *self._drawn]
@@ -220,10 +219,6 @@ def _trace_sensors(*structures: Any) -> Trace:
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
-
-
-def _is_given(array: Any) -> bool:
-    return array is not None
 
 
 def _motor_side(motors: ActuatorState | None) -> ActuatorState | None:

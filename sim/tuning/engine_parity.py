@@ -12,11 +12,11 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.loop.contact_log import MissedContactWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.evaluation import SUBSTEPS, Evaluation, evaluate_gains
 from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.workers.contact_log import MissedContactWarning
 
 ENGINES = ("sapien", "mujoco")
 """The reference, and the engine that is compared with it."""

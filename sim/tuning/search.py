@@ -34,7 +34,6 @@ from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
-from batchpid.sim.loop.contact_log import MissedContactWarning
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
@@ -48,6 +47,7 @@ from batchpid.sim.tuning.history import HistoryFile
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import reseeded
 from batchpid.sim.tuning.weights import Weights
+from batchpid.sim.workers.contact_log import MissedContactWarning
 
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""

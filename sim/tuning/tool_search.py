@@ -18,7 +18,6 @@ import numpy as np
 from batchpid.arrays.digest import digest
 from batchpid.io.versions import package_versions
 from batchpid.metrics import StepMetrics
-from batchpid.sim.loop.contact_log import MissedContactWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -29,6 +28,7 @@ from batchpid.sim.tuning.history import HistoryFile
 from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
+from batchpid.sim.workers.contact_log import MissedContactWarning
 
 MOVES, FINAL_MOVES = 16, 16
 """Moves of the search and of its final round."""

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.errors import CallOrderError, ClosedError, InUseError, WorkerError
-from batchpid.sim.loop.contact_log import MissedContactLog
 from batchpid.sim.loop.faults import FaultLog
 from batchpid.sim.observation import Observation
 from batchpid.sim.randomization.draws import Draws
+from batchpid.sim.workers.contact_log import MissedContactLog
 from batchpid.sim.workers.pool import WorkerPool
 from batchpid.sim.workers.requests import Request
 

@@ -80,13 +80,12 @@ class NativeTick:
         pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size) for array in inputs])
         return self._native.bind(program.arguments, pairs, tuple(outputs))
 
-    def run(self, group: int, begin: int, until: int, end: int, *noise: NDArray[np.float64] | None) -> tuple[int, int]:
+    def run(self, group: int, begin: int, until: int, end: int, *noise: NDArray[np.float64]) -> tuple[int, int]:
         """Run sim steps from ``begin`` to ``until`` of a tick of ``end``; return the steps done, and the last status.
 
         ``group`` is the address of the native group: :meth:`batchpid.sim.engine.protocol.CompiledStep.prepare`.
-        ``noise`` is the noise of positions and of velocities in these steps (steps or more, envs, dof), contiguous, or
-        None.
+        ``noise`` are the last inputs of the sensors' program in these steps (steps or more, envs, dof), contiguous.
         """
         for place, block in enumerate(noise):
-            self._tick.noise[place] = None if block is None else block.ctypes.data
+            self._tick.noise[place] = block.ctypes.data
         return self._native.tick(self._program, self._address, group, begin, until, end, self._sensors)

@@ -30,7 +30,7 @@ struct Tick {
   Call const *control;            // native controller, whose effort is an input of the program, or null
   Call const *measured_force;     // writes the passive force at the measured state, or null
   Call const *read_force;         // writes it at the reading after a sim step, or null
-  double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
+  double const *noise[2];         // (steps, robots, dof): last inputs of the sensors in the next steps, or null
   double timestep;
   std::int64_t dof;
   std::int32_t whole;             // the law takes the whole matrix
@@ -94,7 +94,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
 
 // Run the sensors' program, whose last inputs are the noise, in sim step `at` of those that tick.noise is for.
 inline void measure(BoundProgram &sensors, Tick const &tick, std::int64_t robots, std::int64_t at) {
-  auto place = sensors.inputs.end();
+  auto *place = sensors.inputs.data() + sensors.inputs.size();
   for (int i = 1; i >= 0; --i) {
     if (tick.noise[i] != nullptr) (--place)->data = tick.noise[i] + at * robots * tick.dof;
   }
