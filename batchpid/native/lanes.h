@@ -55,17 +55,47 @@ struct alignas(WIDTH * sizeof(double)) Lanes {  // GCC aligns its vectors otherw
   }
 };
 
+// Write sine and cosine of angles [rad]: x = n pi / 2 + r with pi / 2 in three parts (W. J. Cody and W. Waite, Software
+// Manual for the Elementary Functions, 1980), and the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) for |r| <= pi / 4.
+// The error is at most 2.3e-16, and the bits are the same on every processor, other than those of the C library.
+inline void sine_and_cosine(Lanes x, Lanes &sine, Lanes &cosine) {
+  constexpr double FARTHEST_ANGLE = 1e6, SHIFT = 0x1.8p52;  // adding it rounds to integers
+  constexpr double HALF_PI[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11, 2.02226624871116645580e-21};
+  typedef Lanes::Packed Packed;
+  Packed const n = (x.of * 6.36619772367581382433e-01 + SHIFT) - SHIFT;
+  Packed const r = ((x.of - n * HALF_PI[0]) - n * HALF_PI[1]) - n * HALF_PI[2], z = r * r;
+  Packed const s_tail = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10);
+  Packed const s_head = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s_tail);
+  Packed const s = r + r * z * (-1.66666666666666324348e-01 + z * s_head);
+  Packed const c_tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11);
+  Packed const c_head = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c_tail);
+  Packed const rest = 0.5 * z, w = 1.0 - rest;
+  Packed const c = w + (((1.0 - w) - rest) + z * z * (4.16666666666666019037e-02 + z * c_head));
+  Packed const quarter = n - 4.0 * ((n * 0.25 + SHIFT) - SHIFT);  // -2 to 2
+  auto const odd = (quarter == 1.0) | (quarter == -1.0), half = (quarter == 2.0) | (quarter == -2.0);
+  Packed const a = odd ? c : s, b = odd ? s : c;
+  sine.of = (half | (quarter == -1.0)) ? -a : a;
+  cosine.of = (half | (quarter == 1.0)) ? -b : b;
+  for (int k = 0; k < WIDTH; ++k) {
+    if (std::fabs(x.of[k]) <= FARTHEST_ANGLE) continue;
+    sine.of[k] = std::sin(x.of[k]);
+    cosine.of[k] = std::cos(x.of[k]);
+  }
+}
+
 // Copy a column of each of WIDTH rows, from row `first` on; the last row stands for those that there are not.
-inline Lanes gather(double const *table, std::int64_t columns, std::int64_t column, std::int64_t first,
+template <class T>
+Lanes gather(T const *table, std::int64_t columns, std::int64_t column, std::int64_t first,
                     std::int64_t rows) {
   Lanes out;
   for (int k = 0; k < WIDTH; ++k) out.of[k] = table[std::min(first + k, rows - 1) * columns + column];
   return out;
 }
 
-inline void scatter(Lanes value, double *table, std::int64_t columns, std::int64_t column, std::int64_t first,
+template <class T>
+void scatter(Lanes value, T *table, std::int64_t columns, std::int64_t column, std::int64_t first,
                     std::int64_t rows) {
-  for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = value.of[k];
+  for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = static_cast<T>(value.of[k]);
 }
 
 // Overwrite the lower triangle of a symmetric matrix (n, n) by Cholesky's factor L, with the inverses of its diagonal;

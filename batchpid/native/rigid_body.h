@@ -7,7 +7,6 @@
 
 #include <cmath>
 #include <cstdint>
-#include <vector>
 
 #pragma GCC visibility push(hidden)
 
@@ -141,9 +140,9 @@ void weigh_bodies(std::int64_t dof, BodyRow<T> const *rows, BodyState<N> *body) 
 }
 
 // Write the mass matrix (dof, dof) of the bodies; each then has the inertia of all that its joint moves.
-template <class N, class T>
-void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, T *matrix) {
-  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = T{};
+template <class N>
+void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState<N> *body, N *matrix) {
+  for (std::int64_t at = 0; at < dof * dof; ++at) matrix[at] = N{};
   for (std::int64_t j = dof - 1; j >= 0; --j) {
     Inertia<N> const &moved = body[j].inertia;
     if (tree[2 * j] >= 0) body[tree[2 * j]].inertia.add(moved);
@@ -152,27 +151,9 @@ void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState
     for (std::int64_t i = j; i >= 0; i = tree[2 * i]) {
       Vector<N> const a = body[i].axes[0];
       N const product = tree[2 * i + 1] ? dot(a, linear) : dot(a, angular) + dot(cross(body[i].origin, a), linear);
-      matrix[i * dof + j] = matrix[j * dof + i] = static_cast<T>(product);
+      matrix[i * dof + j] = matrix[j * dof + i] = product;
     }
   }
-}
-
-// Write the mass matrix (dof, dof) at the pose qpos (dof,).
-template <class T>
-void mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *rows, T const *qpos, T *matrix,
-                 std::vector<BodyState<double>> &bodies) {
-  bodies.resize(static_cast<std::size_t>(dof));
-  std::vector<double> angle, cosine, sine;
-  angle.assign(qpos, qpos + dof);
-  cosine.resize(angle.size());
-  sine.resize(angle.size());
-  for (std::size_t j = 0; j < angle.size(); ++j) {
-    cosine[j] = std::cos(angle[j]);
-    sine[j] = std::sin(angle[j]);
-  }
-  place_bodies(dof, tree, rows, cosine.data(), sine.data(), angle.data(), bodies.data());
-  weigh_bodies(dof, rows, bodies.data());
-  composite_mass_matrix(dof, tree, bodies.data(), matrix);
 }
 
 // Velocity and acceleration of a body, and the wrench on it, about the origin.

@@ -29,12 +29,7 @@ struct Tree {
 
 // Write cosines and sines of angles.
 inline void write_cosines(std::int64_t count, Lanes const *angle, Lanes *cosine, Lanes *sine) {
-  for (std::int64_t i = 0; i < count; ++i) {
-    for (int k = 0; k < WIDTH; ++k) {
-      cosine[i].of[k] = std::cos(angle[i].of[k]);
-      sine[i].of[k] = std::sin(angle[i].of[k]);
-    }
-  }
+  for (std::int64_t i = 0; i < count; ++i) sine_and_cosine(angle[i], sine[i], cosine[i]);
 }
 
 // Axes and origin of a tool in the world: columns of its frame.

@@ -87,10 +87,7 @@ void set_state(Tree const &tree, Workspace &work, double const *qpos, double con
       q += tree.multiplier[i] * gather(qpos, tree.joints, tree.leader[i], first, rows);
       work.qvel[i] = tree.multiplier[i] * gather(qvel, tree.joints, tree.leader[i], first, rows);
     }
-    for (int k = 0; k < WIDTH; ++k) {
-      work.cosine[i].of[k] = std::cos(q.of[k]);
-      work.sine[i].of[k] = std::sin(q.of[k]);
-    }
+    sine_and_cosine(q, work.sine[i], work.cosine[i]);
   }
 }
 

@@ -227,11 +227,8 @@ PyObject *mass_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
     return nullptr;
   }
   return without_gil([&] {
-    std::vector<BodyState<double>> states;
-    for (Py_ssize_t row = 0; row < rows; ++row) {
-      mass_matrix(dof, tree.as<std::int32_t>(), bodies.as<BodyRow<double>>(), qpos.as<double>() + row * dof,
-                  out.as<double>() + row * dof * dof, states);
-    }
+    write_mass_matrices({dof, tree.as<std::int32_t>(), bodies.as<double>()}, rows, qpos.as<double>(), nullptr, 0.0,
+                        out.as<double>());
   });
 }
 

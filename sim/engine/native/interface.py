@@ -142,6 +142,7 @@ EXTENSIONS = {
             *_files(
                 "gateway.cpp",
                 "gateway.h",
+                "mass_matrices.h",
                 "mujoco_step.h",
                 "clearance.h",
                 "constraint.h",
@@ -151,10 +152,11 @@ EXTENSIONS = {
             ),
             BUFFER,
             CALL,
+            LANES,
             RIGID_BODY,
             *HEADERS,
         ),
-        (*ROUNDED, "-pthread"),
+        (*ROUNDED, "-pthread", "-Wno-psabi"),
         _gateway_tables,
     ),
     "_batch_dynamics": Extension(

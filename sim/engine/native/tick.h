@@ -7,7 +7,7 @@
 
 #include "batchpid/native/call.h"
 #include "batchpid/native/make_program.h"
-#include "batchpid/native/rigid_body.h"
+#include "mass_matrices.h"
 #include "sim_step.h"
 
 #pragma GCC visibility push(hidden)
@@ -64,31 +64,21 @@ inline void fold(Tick const &tick, std::size_t n, double *matrix) {
 
 // Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
 inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
-  auto const n = static_cast<std::size_t>(tick.dof);
-  thread_local std::vector<BodyState<double>> bodies;
-  thread_local std::vector<double> pose, found;
-  pose.resize(n);
-  found.resize(n * n);
+  auto const n = static_cast<std::size_t>(tick.dof), all = static_cast<std::size_t>(robots) * n * n;
+  thread_local std::vector<double> whole;
+  if (!tick.whole) whole.resize(all);
+  double *found = tick.whole ? tick.matrix : whole.data();
   double const ahead = 0.5 * static_cast<double>(steps - 1) * tick.timestep;
-  for (std::int64_t row = 0; row < robots; ++row) {
-    for (std::size_t j = 0; j < n; ++j) {
-      std::size_t const at = static_cast<std::size_t>(row) * n + j;
-      pose[j] = tick.pose[at] + ahead * tick.rate[at];
-    }
-    auto const *rows = reinterpret_cast<BodyRow<double> const *>(tick.bodies);
-    mass_matrix(tick.dof, tick.tree, rows, pose.data(), found.data(), bodies);
+  write_mass_matrices({tick.dof, tick.tree, tick.bodies}, robots, tick.pose, tick.rate, ahead, found);
+  for (std::int64_t row = 0; row < robots; ++row, found += n * n) {
     for (std::size_t j = 0; j < n; ++j) {
       double &entry = found[j * n + j];
       if (tick.armature != nullptr) entry += tick.armature[j];
       if (tick.damping != nullptr) entry += tick.timestep * tick.damping[j];
     }
-    if (tick.leader != nullptr) fold(tick, n, found.data());
-    double *to = tick.matrix + static_cast<std::size_t>(row) * (tick.whole ? n * n : n);
-    if (tick.whole) {
-      std::copy(found.begin(), found.end(), to);
-    } else {
-      for (std::size_t j = 0; j < n; ++j) to[j] = found[j * n + j];
-    }
+    if (tick.leader != nullptr) fold(tick, n, found);
+    if (tick.whole) continue;
+    for (std::size_t j = 0; j < n; ++j) tick.matrix[static_cast<std::size_t>(row) * n + j] = found[j * n + j];
   }
 }
 

@@ -6,7 +6,7 @@
 
 #pragma once
 
-#include "batchpid/native/rigid_body.h"
+#include "mass_matrices.h"
 #include "sim_step.h"
 
 #pragma GCC visibility push(hidden)
@@ -131,17 +131,6 @@ extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
   return nullptr;
 }
 
-template <class T>
-void mass_matrices(std::int64_t count, std::int64_t dof, Array **in, Array *out) {
-  static_assert(sizeof(BodyRow<T>) == 25 * sizeof(T));
-  std::vector<BodyState<double>> bodies;
-  auto const *rows = reinterpret_cast<BodyRow<T> const *>(in[1]->data);
-  for (std::int64_t n = 0; n < count; ++n) {
-    mass_matrix(dof, data<std::int32_t const>(in[0]), rows, data<T const>(in[2]) + n * dof,
-                data<T>(out) + n * dof * dof, bodies);
-  }
-}
-
 // (tree (dof, 2) s32, bodies (dof, 25), qpos (..., dof)) -> mass matrices (..., dof, dof)
 extern "C" inline Error *batchpid_mass_matrix(CallFrame *frame) {
   if (is_answered(frame)) return nullptr;
@@ -157,10 +146,12 @@ extern "C" inline Error *batchpid_mass_matrix(CallFrame *frame) {
   if (!fits || in[1]->dtype != in[2]->dtype || out->dtype != in[2]->dtype) {
     return invalid(frame->api, "an array has a wrong shape or type");
   }
+  auto const *tree = data<std::int32_t const>(in[0]);
   if (out->dtype == F64) {
-    mass_matrices<double>(count, dof, in, out);
+    write_mass_matrices({dof, tree, data<double const>(in[1])}, count, data<double const>(in[2]), nullptr, 0.0,
+                        data<double>(out));
   } else if (out->dtype == F32) {
-    mass_matrices<float>(count, dof, in, out);
+    write_float_mass_matrices({dof, tree, data<float const>(in[1])}, count, data<float const>(in[2]), data<float>(out));
   } else {
     return invalid(frame->api, "the arrays are neither float32 nor float64");
   }
