@@ -36,6 +36,15 @@ def assert_same(found, wanted, tolerance):
     assert np.abs(found - wanted).max(initial=0) <= tolerance * np.abs(wanted).max(initial=1.0)
 
 
+@given(st.lists(st.floats(-1e9, 1e9) | st.floats(-7.0, 7.0), min_size=1, max_size=9))
+def test_sine_and_cosine_are_exact_to_the_last_bits_at_any_angle(angles):
+    at = np.array(angles)[:, None]
+    jacobian = ts.jacobian(planar((1.0,)), at, "tip")
+    np.testing.assert_allclose(jacobian[:, :2], np.stack([-np.sin(at), np.cos(at)], axis=1), rtol=0, atol=3e-16)
+    for row in range(len(at)):
+        np.testing.assert_array_equal(ts.jacobian(planar((1.0,)), at[row : row + 1], "tip")[0], jacobian[row])
+
+
 @settings(max_examples=25)
 @given(
     name=st.sampled_from(TREES), rows=st.integers(0, 9), seed=st.integers(0, 2**31), pointed=st.sampled_from([0, 1, 2])
