@@ -117,6 +117,7 @@ def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
     assert volume(cube.vertices, cube.faces) == pytest.approx(0.006)
 
 
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")  # pycollada, NumPy 2.5
 @pytest.mark.parametrize(("unit", "factor"), [("", 1.0), ('<unit name="millimeter" meter="0.001"/>', 1e-3)])
 def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
     pytest.importorskip("collada")
