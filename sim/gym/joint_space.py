@@ -50,7 +50,7 @@ class JointSpace:
         return np.concatenate([qpos, observed.qvel[:, self.index]], axis=1)
 
     def of_robot(self, positions: Float64) -> Float64:
-        """Return positions (..., joints) for all joints of the robot (..., dof); those of followers are 0."""
+        """Return positions (..., joints) for all joints of the robot (..., dof); followers have 0."""
         rows = np.zeros((*positions.shape[:-1], self._dof))  # the runner puts followers in place
         rows[..., self.index] = positions
         return rows

@@ -46,7 +46,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and ``build``;
     - :meth:`draw`: the start and the goal of an episode, drawn for one env;
     - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an action;
-    - :meth:`observe`: the observation, from that of the runner;
+    - :meth:`observe`: the observation, made from the runner's;
     - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the observation.
 
     Hooks get and return arrays with a row for each env. Each row may depend on that env alone, so that an episode is

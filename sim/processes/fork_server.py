@@ -163,7 +163,7 @@ def server_pid() -> int | None:
 
 
 def _ask(message: bytes, descriptors: Sequence[int]) -> bytes:
-    """Send a message to the server, or to a new one if there is none or it has ended; return its answer."""
+    """Send a message to the server, or to a new one if none runs; return its answer."""
     global _server
     environment = os.environ | ONE_THREAD
     environment.pop("PYTEST_CURRENT_TEST", None)  # other in each test of a caller, and of no use to a child

@@ -15,7 +15,7 @@ def test_the_motion_keeps_the_limits_and_moves_every_joint(name, request):
     assert (np.ptp(motion.position, axis=0) > [0.02 if unit == "rad" else 0.002 for unit in robot.units]).all()
     np.testing.assert_allclose(motion.position[[0, -1]], motion.position[[0, 0]], atol=1e-4)
     assert (np.abs(motion.velocity[[0, -1]]) < 0.05).all()
-    assert np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100  # no two joints move alike
+    assert np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100  # all motions differ
 
 
 def test_the_seed_decides(panda):
