@@ -76,8 +76,8 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
   return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
 }
 
-// Set positions, velocities, cosines and sines of all joints from those of the logged ones.
-void set_state(Tree const &tree, Workspace &work, double const *qpos, double const *qvel, std::int64_t first,
+// Set positions and velocities of all joints from the given joints', and the bodies' frames, inertias and motions.
+void set_bodies(Tree const &tree, Workspace &work, double const *qpos, double const *qvel, std::int64_t first,
                std::int64_t rows) {
   for (std::int64_t i = 0; i < tree.dof; ++i) {
     Lanes &q = work.qpos[i];
@@ -89,6 +89,11 @@ void set_state(Tree const &tree, Workspace &work, double const *qpos, double con
     }
     sine_and_cosine(q, work.sine[i], work.cosine[i]);
   }
+  std::int32_t const *above = tree.tree.data();
+  BodyState<Lanes> *bodies = work.bodies.data();
+  place_bodies(tree.dof, above, tree.bodies(), work.cosine.data(), work.sine.data(), work.qpos.data(), bodies);
+  weigh_bodies(tree.dof, tree.bodies(), bodies);
+  move_bodies(tree.dof, above, bodies, work.qvel.data(), tree.gravity, work.motions.data());
 }
 
 // Write mass matrix, passive force without payload and passive force of the payload of rows of robots.
@@ -100,12 +105,9 @@ FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, doub
   Workspace work(dof);
   std::vector<Lanes> matrix(static_cast<std::size_t>(joints * joints)), force(joints), loaded(joints);
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    set_state(tree, work, qpos, qvel, first, rows);
     BodyState<Lanes> *bodies = work.bodies.data();
     BodyMotion<Lanes> *motions = work.motions.data();
-    place_bodies(dof, above, tree.bodies(), work.cosine.data(), work.sine.data(), work.qpos.data(), bodies);
-    weigh_bodies(dof, tree.bodies(), bodies);
-    move_bodies(dof, above, bodies, work.qvel.data(), tree.gravity, motions);
+    set_bodies(tree, work, qpos, qvel, first, rows);
     BodyState<Lanes> &carrier = bodies[tree.carrier];
     Vector<Lanes> const place = carrier.origin + in_axes(carrier.axes, tree.point[0], tree.point[1], tree.point[2]);
     Inertia<Lanes> const load = point_mass(gather(payload, 1, 0, first, rows), place);
@@ -144,12 +146,9 @@ FOR_EACH_PROCESSOR void write_forces(Tree const &tree, std::int64_t rows, double
   Workspace work(dof);
   std::vector<Lanes> force(joints);
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    set_state(tree, work, qpos, qvel, first, rows);
     BodyState<Lanes> *bodies = work.bodies.data();
     BodyMotion<Lanes> *motions = work.motions.data();
-    place_bodies(dof, above, tree.bodies(), work.cosine.data(), work.sine.data(), work.qpos.data(), bodies);
-    weigh_bodies(dof, tree.bodies(), bodies);
-    move_bodies(dof, above, bodies, work.qvel.data(), tree.gravity, motions);
+    set_bodies(tree, work, qpos, qvel, first, rows);
     for (std::int64_t i = 0; i < dof; ++i) motions[i].accelerate(bodies[i].inertia);
     efforts_of_wrenches(dof, above, bodies, motions, work.effort.data());
     std::fill(force.begin(), force.end(), Lanes{});

@@ -137,9 +137,8 @@ def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapie
     try:
         returned = build(scene, env)
     except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[
-            -1
-        ]  # in a worker, cloudpickle may have dropped the file's name
+        # In a worker, cloudpickle may have dropped the name of the file.
+        where = traceback.extract_tb(error.__traceback__)[-1]
         raise InvalidArgumentError(
             "build",
             f"raised {type(error).__name__}: {error} (in {where.name}, {where.filename}:{where.lineno})",

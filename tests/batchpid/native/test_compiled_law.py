@@ -18,26 +18,24 @@ from batchpid.native.availability import SWITCH, program_status
 
 needs_extension = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
 DT = 1 / 2000
-OPTIONS = st.fixed_dictionaries(
-    {"kp": st.just(40.0)},
-    optional={
-        "ki": st.sampled_from([0.0, 50.0, [[5.0]]]),
-        "kd": st.sampled_from([0.0, 2.0]),
-        "effort_limit": st.sampled_from([0.0, 5.0, 80.0]),
-        "effort_rate_limit": st.just(900.0),
-        "integral_limit": st.just(0.2),
-        "derivative_filter_time": st.just(0.01),
-        "setpoint_weight": st.just(0.7),
-        "setpoint_weight_derivative": st.just(0.3),
-        "weight_origin": st.just("start"),
-        "first_derivative": st.just("kick"),
-        "deadband": st.just(0.3),
-        "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
-        "integration": st.just("integrate_first"),
-        "non_finite": st.sampled_from(["zero", "hold"]),
-        "continuous": st.just(True),
-    },
-)
+CHOICES = {
+    "ki": st.sampled_from([0.0, 50.0, [[5.0]]]),
+    "kd": st.sampled_from([0.0, 2.0]),
+    "effort_limit": st.sampled_from([0.0, 5.0, 80.0]),
+    "effort_rate_limit": st.just(900.0),
+    "integral_limit": st.just(0.2),
+    "derivative_filter_time": st.just(0.01),
+    "setpoint_weight": st.just(0.7),
+    "setpoint_weight_derivative": st.just(0.3),
+    "weight_origin": st.just("start"),
+    "first_derivative": st.just("kick"),
+    "deadband": st.just(0.3),
+    "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
+    "integration": st.just("integrate_first"),
+    "non_finite": st.sampled_from(["zero", "hold"]),
+    "continuous": st.just(True),
+}
+OPTIONS = st.fixed_dictionaries({"kp": st.just(40.0)}, optional=CHOICES)
 EVERYTHING = {
     "kp": 40.0,
     "ki": 5.0,

@@ -15,32 +15,17 @@ from batchpid.native.tracing import trace
 from batchpid.native.trees import filled, leaves, structure
 from batchpid.sim.engine import native
 from batchpid.sim.loop.pid_law import PIDLaw
+from tests.batchpid.native.test_compiled_law import CHOICES, bits, numbers
 
 needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
 DT = 1 / 2000
-
-
 OPTIONS = st.fixed_dictionaries(
     {"kp": st.just(40.0)},
-    optional={
-        "ki": st.sampled_from([0.0, 50.0]),
-        "kd": st.sampled_from([0.0, 2.0]),
-        "effort_limit": st.sampled_from([0.0, 5.0, 80.0]),
-        "effort_rate_limit": st.just(900.0),
-        "integral_limit": st.just(0.2),
-        "derivative_filter_time": st.just(0.01),
-        "setpoint_weight": st.just(0.7),
-        "setpoint_weight_derivative": st.just(0.3),
-        "weight_origin": st.just("start"),
-        "first_derivative": st.just("kick"),
-        "deadband": st.just(0.3),
-        "anti_windup": st.sampled_from(["none", "conditional", "back_calculation"]),
-        "integration": st.just("integrate_first"),
-        "non_finite": st.sampled_from(["zero", "hold"]),
+    optional=CHOICES
+    | {
         "measurement_rate": st.just("measured"),
         "gain_units": st.sampled_from(["inertia", "mass_matrix"]),
         "discretization": st.just("implicit"),
-        "continuous": st.just(True),
     },
 )
 
@@ -54,17 +39,6 @@ def params_of(joints, options):
     except InvalidArgumentError as error:
         options = {name: value for name, value in options.items() if name not in (error.argument, "anti_windup")}
         return params_of(joints, options)
-
-
-def numbers(rng, shape, odd):
-    """Return numbers of many sizes; a share ``odd`` of them is zero, infinite or not a number."""
-    values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 3, shape)
-    return np.where(rng.random(shape) < odd, rng.choice([0.0, np.inf, -np.inf, np.nan], shape), values)
-
-
-def bits(leaf):
-    """Return the bits of an array, with one NaN for all."""
-    return None if leaf is None else np.where(np.isnan(leaf), np.nan, leaf).tobytes()
 
 
 def run_traced(law, k, *arguments):
@@ -86,16 +60,18 @@ def test_the_traced_law_is_bit_identical_to_numpy(options, joints, envs, odd, se
     params, rng, shape = params_of(joints, options), np.random.default_rng(seed), (envs, joints)
     law, k = PIDLaw.of(params), bp.discretise(params, DT, envs)
     state = bp.PIDState(
-        *(None if leaf is None else numbers(rng, shape, odd) for leaf in bp.init(params, np.zeros(shape)))
+        *(None if leaf is None else numbers(rng, shape, odd, float) for leaf in bp.init(params, np.zeros(shape)))
     )
     rate, qvel, feedforward = (
-        numbers(rng, shape, odd) if given else None for given in data.draw(st.tuples(*[st.booleans()] * 3))
+        numbers(rng, shape, odd, float) if given else None for given in data.draw(st.tuples(*[st.booleans()] * 3))
     )
-    qvel = numbers(rng, shape, odd) if law.measures_rate else qvel
-    matrix, viscous = (numbers(rng, (*shape, joints), odd), numbers(rng, shape, odd)) if law.whole else (None, None)
-    matrix = numbers(rng, shape, odd) if law.per_inertia else matrix
-    ends = np.sort(numbers(rng, (2, *shape), odd), axis=0) if data.draw(st.booleans()) else (None, None)
-    signals = (numbers(rng, shape, odd), rate), numbers(rng, shape, odd), qvel, feedforward
+    qvel = numbers(rng, shape, odd, float) if law.measures_rate else qvel
+    matrix, viscous = (
+        (numbers(rng, (*shape, joints), odd, float), numbers(rng, shape, odd, float)) if law.whole else (None, None)
+    )
+    matrix = numbers(rng, shape, odd, float) if law.per_inertia else matrix
+    ends = np.sort(numbers(rng, (2, *shape), odd, float), axis=0) if data.draw(st.booleans()) else (None, None)
+    signals = (numbers(rng, shape, odd, float), rate), numbers(rng, shape, odd, float), qvel, feedforward
     arguments = (state, *signals, matrix, viscous, *ends)
     with np.errstate(all="ignore"):
         expected = law.advance(k, *arguments, observed=True)
