@@ -224,7 +224,8 @@ class Session:
         next(shown, None)  # the end
         if self._tool_pose is not None:
             seen = seen._replace(tool_pose=self._tool_pose(seen.qpos))
-        info = replace(info, faults=self.state.faults.faults)
+        if (faults := self.state.faults.faults) is not info.faults:
+            info = replace(info, faults=faults)
         return Rollout(times, command.setpoint, seen, options.timestep * options.substeps, info)
 
     def observe(self) -> Observation:
@@ -353,8 +354,10 @@ class Session:
         ticks, timestep = len(setpoint), self.options.timestep
 
         def commit(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
-            faults, contacts, unrecorded = state.faults, state.contacts, state.unrecorded
-            for done, arrays in enumerate(pool.completed, start=1):
+            faults, contacts, unrecorded, count = state.faults, state.contacts, state.unrecorded, len(pool.completed)
+            are_ok = np.logical_and.reduce(pool.arrays.observation.ok[:count], None)
+            is_quiet = are_ok and contacts is None and self.recorder is None
+            for done, arrays in enumerate([] if is_quiet else pool.completed, start=1):
                 faults = faults.with_faults(arrays)
                 if contacts is not None:
                     contacts = contacts.with_contacts(arrays)
@@ -362,13 +365,13 @@ class Session:
                     time = (state.steps + done * substeps) * timestep
                     observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
-            steps = len(pool.completed) * substeps
+            steps = count * substeps
             state = state._replace(
                 faults=faults,
                 contacts=contacts,
                 unrecorded=unrecorded,
                 steps=state.steps + steps,
-                targets=_followed(state.targets, setpoint[: len(pool.completed)]),
+                targets=_followed(state.targets, setpoint[:count]),
                 steps_since_checkpoint=state.steps_since_checkpoint + steps,
                 work=state.work if pool.failure else (tuple(seconds), ticks),
             )

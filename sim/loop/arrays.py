@@ -29,6 +29,10 @@ class Command(NamedTuple):
         """Return a command with ``function`` applied to each array that is given."""
         return Command(*[None if rows is None else function(rows) for rows in self])
 
+    def with_only(self, rate: bool, feedforward: bool) -> Command:
+        """Return the command without rate or feedforward, where they are not used."""
+        return Command(self.setpoint, self.setpoint_rate if rate else None, self.feedforward if feedforward else None)
+
 
 class FaultArrays(NamedTuple):
     """Last fault of each env (envs,): sim step (-1: none), joint, and index into
@@ -85,10 +89,10 @@ class Ticks:
     """Views of :class:`Arrays` (ticks, envs, ...) at each tick, made when first used."""
 
     def __init__(self, arrays: Arrays) -> None:
-        self._arrays, self._views = arrays, list[Arrays]()
+        self.arrays, self._views = arrays, list[Arrays]()
 
     def __len__(self) -> int:
-        return len(self._arrays.observation.ok)
+        return len(self.arrays.observation.ok)
 
     def __getitem__(self, tick: int) -> Arrays:
         """Return the views at a tick, 0 or more."""
@@ -99,5 +103,5 @@ class Ticks:
         """Return the views at the first ``count`` ticks."""
         views = self._views
         while len(views) < count:
-            views.append(self._arrays.at(len(views)))
+            views.append(self.arrays.at(len(views)))
         return views[:count]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,15 @@ from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
-from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.backend import obstacle
 from batchpid.sim.loop.control_step import StepState
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import FaultContainment, far, finite, near
 from batchpid.sim.loop.native_executor import NativeExecutor
-from batchpid.sim.loop.numpy_executor import NumPyExecutor, passive_forces, with_model
+from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Stopped, passive_forces, with_model
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
 from batchpid.sim.loop.step_constants import make_constants, make_layout
 from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
@@ -82,10 +84,11 @@ class EnvGroup:
         else:
             self._executor = NativeExecutor(options, pack, layout, constants)
         self._measured = self._executor.measure()
+        self._quiet: dict[tuple[bool, bool], QuietTicks | None] = {}
 
     def execute_in_numpy(self) -> None:
         """Run sim steps call by call in NumPy until the next change, so that the phases of a step can be timed."""
-        self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
+        self._executor, self._quiet = NumPyExecutor(self._options, self.pack, self._layout, self._constants), {}
 
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
@@ -152,21 +155,46 @@ class EnvGroup:
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
 
-    def run(self, steps: int, substeps: int, command: Command) -> None:
-        """Run ``substeps`` sim steps under ``command``, after ``steps`` earlier sim steps."""
+    def run_quietly(self, arrays: Arrays, used: tuple[bool, bool], first: int, until: int, steps: int) -> Stopped:
+        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, and observe them, while nothing happens.
+
+        ``arrays`` (ticks, envs, ...) are always the same; ``used`` says whether rates and feedforwards are. Next
+        :meth:`run` runs the first tick that is not complete.
+        """
+        executor, containment = self._executor, self._containment
+        if self._contacts is not None or containment.suspended.any():
+            return Stopped(first)
+        if used not in self._quiet:
+            command = arrays.command.with_only(*used)
+            fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
+            shown = Shown(self._motor, self._saturated, self._guarded, fault)
+            self._quiet[used] = executor.quiet_ticks(self._state, command, arrays, shown)
+        if (ticks := self._quiet[used]) is None or not isinstance(executor, NativeExecutor):
+            return Stopped(first)
+        containment.failed[:] = False
+        stopped = executor.run_ticks(ticks, self._state, self._measured, first, until, steps)
+        self._state, self._measured = ticks.program.state, ticks.program.measured
+        return stopped
+
+    def run(self, steps: int, substeps: int, command: Command, finish: Callable[[], Ran] | None = None) -> None:
+        """Run ``substeps`` sim steps under ``command``, after ``steps`` earlier sim steps.
+
+        ``finish`` returns the result of the first of them, if quiet ticks stopped after these.
+        """
         containment, done = self._containment, 0
         self._steps, containment.failed = steps, containment.suspended.copy()
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
         with np.errstate(all="ignore"):  # overflow and invalid values become faults
             while done < substeps:
-                ran = self._executor.run(self._state, self._measured, command, done, substeps)
+                begun, finish = finish, None
+                ran = begun() if begun else self._executor.run(self._state, self._measured, command, done, substeps)
                 self._state, outputs, self._measured, before, done, failed = ran
                 rows = self._executor.rows
                 if done == substeps:
                     self._motor[...] = rows(outputs.motor)
-                    self._saturated = self._mask(outputs.saturated)
-                    self._guarded = self._mask(outputs.guarded)
+                    self._saturated[...] = self._mask(outputs.saturated)
+                    self._guarded[...] = self._mask(outputs.guarded)
                 if failed:
                     self._contain(rows(before), done, outputs.returned)
             if not (near(self._qpos) and finite(self.pack.read_qvel())):
@@ -174,8 +202,8 @@ class EnvGroup:
         if self._contacts is not None:
             self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
 
-    def _mask(self, array: Any) -> NDArray[np.bool_]:
-        return np.zeros(self._motor.shape, bool) if array is None else np.array(self._executor.rows(array))
+    def _mask(self, array: Any) -> Any:
+        return False if array is None else self._executor.rows(array)
 
     def observe(self, rows: Arrays) -> None:
         """Write observation and faults into these envs' rows."""
@@ -220,7 +248,7 @@ class EnvGroup:
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
         state = StepState(states.controller if self._controller else bp.PIDState(**states.controller))
-        self._saturated, self._motor[...] = states.saturated, states.effort
+        self._saturated[...], self._motor[...] = states.saturated, states.effort
         if states.friction:
             leaves = (states.friction[name] for name in FrictionState._fields)
             state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
@@ -229,7 +257,7 @@ class EnvGroup:
             self._episode = motors.pop(EPISODE).copy()
             state = state._replace(motors=ActuatorState(**motors))
         if states.guard:
-            self._guarded = states.guard[CHANGED]
+            self._guarded[...] = states.guard[CHANGED]
             state = state._replace(guard=GuardState(*(states.guard[name] for name in GuardState._fields)))
         self._state = state
         self._prepare()

@@ -17,7 +17,7 @@ from batchpid.errors import ControllerError
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.acting_draws import make_pack
-from batchpid.sim.loop.arrays import Arrays, Command, Ticks
+from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
@@ -104,14 +104,17 @@ class Loop:
         """
         began = time.perf_counter()
         failures = []
+        used = use_rate, use_feedforward
         for group, group_ticks in zip(self.groups, self._group_ticks, strict=True):
             done = 0
             try:
-                for done, rows in enumerate(group_ticks.first(ticks)):
-                    setpoint, rate, feedforward = rows.command
-                    command = Command(setpoint, rate if use_rate else None, feedforward if use_feedforward else None)
-                    group.run(self._steps + done * substeps, substeps, command)
-                    group.observe(rows)
+                while done < ticks:
+                    done, finish = group.run_quietly(group_ticks.arrays, used, done, ticks, substeps)
+                    if done < ticks:
+                        rows = group_ticks[done]
+                        group.run(self._steps + done * substeps, substeps, rows.command.with_only(*used), finish)
+                        group.observe(rows)
+                        done += 1
             except Exception as error:
                 failures.append(self._failure(error, group, done, self._steps + done * substeps))
         if failures:

@@ -12,6 +12,7 @@ the engine and reads it. A sim step in which the friction model updates its mass
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,10 @@ from batchpid.native.trees import leaves, mapped
 from batchpid.sim.engine.batch_dynamics import NativePassiveForce, passive_force_of
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
-from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.control_step import REFRESH_STEPS, Constants, Layout, Measured, Step, StepState, control_step
-from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran
+from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran, Stopped
+from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
 from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
@@ -81,10 +83,29 @@ class NativeExecutor(NumPyExecutor):
                 done += 1
             if self._calls_force and not (is_program and self._force):
                 program.reading.passive[...] = self._pack.passive_force(self._gravity, self._coriolis)
-        failed, measured = bool(status & LOOK), program.measured
-        if status:
-            measured = self._look(status, measured)
-        return Ran(program.state, program.outputs, measured, program.before, done, failed)
+        return self._ran(program, done, status)
+
+    def _ran(self, program: TickProgram, done: int, status: int) -> Ran:
+        """Return the result of ``done`` sim steps of a tick, after the event in ``status`` was handled."""
+        measured = self._look(status, program.measured) if status else program.measured
+        return Ran(program.state, program.outputs, measured, program.before, done, bool(status & LOOK))
+
+    def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
+        """Return the ticks under commands like ``command`` as :meth:`NumPyExecutor.quiet_ticks` does."""
+        layout, needs_force = self._layout, self._calls_force and self._force is None
+        needs_python = self._constants.coupling is not None or state.age is not None or layout.measures or needs_force
+        if needs_python or not (self._compiles and self._reads_qvel) or layout.control not in ("pid", "effort"):
+            return None
+        return QuietTicks(self._program(state, command), arrays, shown)
+
+    def run_ticks(
+        self, ticks: QuietTicks, state: StepState, measured: Measured, first: int, until: int, steps: int
+    ) -> Stopped:
+        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until something needs attention."""
+        program = ticks.program
+        program.load(state, measured, None)
+        tick, done, status = ticks.run(self._prepared(), first, until, steps)
+        return Stopped(tick, partial(self._ran, program, done, status) if done else None)
 
     def _update_constraint(self, index: int) -> None:
         """Update the constraint efforts of coupled joints, if it is time for it before sim step ``index``."""

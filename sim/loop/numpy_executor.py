@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,11 +13,12 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
-from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
+from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
 from batchpid.sim.loop.stage_program import compiled_stages
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
@@ -39,6 +41,16 @@ class Ran(NamedTuple):
     """Sim steps of the tick that are done; fewer than requested after an event: a possible contact or a failed env."""
     failed: bool
     """Whether an env may have failed."""
+
+
+class Stopped(NamedTuple):
+    """End of some quiet ticks."""
+
+    tick: int
+    """Number of the first tick that is not complete."""
+    finish: Callable[[], Ran] | None = None
+    """Function that handles the event which stopped that tick, and returns the result of its sim steps; None if it has
+    not begun."""
 
 
 def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
@@ -84,6 +96,10 @@ class NumPyExecutor:
             if failed:
                 break
         return Ran(state, outputs, measured, before, index + 1, failed)
+
+    def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
+        """Return the ticks under commands like ``command`` in one call; None where each tick needs calls of Python."""
+        return None
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step under efforts ``qf``; return the reading, and whether an env may have failed."""

@@ -30,7 +30,7 @@ class TickProgram:
 
     Attributes
     ----------
-    state, measured, outputs
+    state, command, measured, outputs
         Arrays that the sim steps read and write.
     reading
         ``measured`` with an array for the passive force, even if it is not used.
@@ -70,7 +70,7 @@ class TickProgram:
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
             command = command._replace(setpoint=None)  # the controller has its own copy, of any size
-        self._command = command.map(lambda rows: np.zeros(shape))
+        self.command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
@@ -79,7 +79,7 @@ class TickProgram:
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
         if self._control is not None:
             fixed = fixed._replace(law=None)
-        inputs = (fixed, self._command, self.measured, self._seen, self.outputs.returned)
+        inputs = (fixed, self.command, self.measured, self._seen, self.outputs.returned)
         traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
@@ -107,17 +107,19 @@ class TickProgram:
             **arrays,
         )
 
-    def load(self, state: StepState, measured: Measured, command: Command) -> None:
+    def load(self, state: StepState, measured: Measured, command: Command | None) -> None:
         """Copy the arguments into the program's arrays, where they are not these arrays."""
         if state is not self.state:
             self._copy(state)
-        if self._control is not None:
-            self._control.load(command.setpoint)
         if measured is not self.measured:
             for array, value in zip(self.measured, measured, strict=True):
                 if value is not None:
                     array[...] = value
-        for array, value in zip(self._command, command, strict=True):
+        if command is None:
+            return
+        if self._control is not None:
+            self._control.load(command.setpoint)
+        for array, value in zip(self.command, command, strict=True):
             if array is not None:
                 array[...] = value
 
@@ -129,11 +131,21 @@ class TickProgram:
         noise = leaves(self._draw()) if self._senses else []
         until = min([until, *(begin + len(block) for block in noise)])
         done, status = self._tick.run(step.prepare(), begin, until, end, *noise)
-        if self.state.age is not None:
-            self.state.age[...] += done - begin
-        if self.state.motors is not None and self.state.motors.step is not None:
-            self.state.motors.step[...] += done - begin
+        self._count(done - begin)
         return done, status
+
+    def run_ticks(self, step: CompiledStep, transfers: Any, first: int, until: int, steps: int) -> tuple[int, int, int]:
+        """Run ticks as :meth:`batchpid.sim.engine.native.native_tick.NativeTick.run_ticks` does."""
+        tick, done, status = self._tick.run_ticks(step.prepare(), transfers, first, until, steps)
+        self._count((tick - first) * steps + done)
+        return tick, done, status
+
+    def _count(self, steps: int) -> None:
+        """Count sim steps in the state."""
+        if self.state.age is not None:
+            self.state.age[...] += steps
+        if self.state.motors is not None and self.state.motors.step is not None:
+            self.state.motors.step[...] += steps
 
     def measure(self) -> Any:
         """Advance the sensors; return positions and velocities as measured. Only :meth:`run` counts the step.

@@ -36,10 +36,10 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs that ``Clearance`` in ``clearance.h`` lists, the same for every robot.
 
     None where MuJoCo always runs its collision detection: no pair of shapes may touch, a floating base may touch the
-    ground, a kind of shape is not supported, or the flag for contacts is not found in this version of MuJoCo.
+    ground, a kind of shape is not supported, or the fields to change are not found in this version of MuJoCo.
     """
     model = robot.model
-    pairs = touching_pairs(model) if flags_offset() is not None else np.empty((0, 2))
+    pairs = touching_pairs(model) if places() is not None else np.empty((0, 2))
     floats = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
     world = model.body_weldid[model.geom_bodyid] == 0
     if not len(pairs) or (floats and world[pairs].any()) or not set(model.geom_type.tolist()) <= _KINDS:
@@ -114,21 +114,25 @@ def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[n
 
 
 @cache
-def flags_offset() -> int | None:
-    """Return the offset of ``opt.disableflags`` in ``mjModel`` [bytes], found by flipping a flag; None if ambiguous."""
+def places() -> tuple[int, int] | None:
+    """Return the places of ``opt.disableflags`` and of the pointer ``body_geomnum`` in ``mjModel`` [bytes].
+
+    They are found by flipping a flag, and by the address; None if one is ambiguous.
+    """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
     model.opt.disableflags ^= _NO_CONTACT
     after = ctypes.string_at(model._address, _BEGINNING)
-    found = [place for place in range(_BEGINNING) if before[place] != after[place]]
-    return found[0] if len(found) == 1 and found[0] % 4 == 0 else None
+    flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
+    counts = (8 * np.flatnonzero(np.frombuffer(after, np.uint64) == model.body_geomnum.ctypes.data)).tolist()
+    return (flags[0], counts[0]) if len(flags) == len(counts) == 1 and flags[0] % 4 == 0 else None
 
 
 class GroupClearance:
     """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of ``mj_kinematics``.
 
     ``tables`` come from :func:`shape_tables`; ``models`` and ``data`` have one entry for each robot. Native code
-    disables the contacts of a model during part of a sim step, so no other group may use these models. A reset of a
+    disables the contacts of a model during part of a sim step, so groups with the same model take turns. A reset of a
     robot needs no call: a jump of its positions counts as motion of its joints.
 
     Attributes
@@ -143,16 +147,20 @@ class GroupClearance:
             "models": [model._address for model in models],
             "places": [each.geom_xpos.ctypes.data for each in data],
             "turns": [each.geom_xmat.ctypes.data for each in data],
+            "shapes": [model.body_geomnum.ctypes.data for model in models],
         }
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
         arrays |= tables | {name: np.zeros((robots, dof)) for name in ("last", "moved", "rate")}
         arrays |= {"left": np.full((robots, pairs), -1.0, np.float32), "wait": np.ones(robots, np.int32)}
+        arrays["no_shapes"] = np.zeros_like(models[0].body_geomnum)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         self._kept = models, data
+        flags, counts = places() or (0, 0)
         self._fields = Clearance(
             kinematics=kinematics,
             number=pairs,
-            flags=flags_offset(),
+            flags=flags,
+            counts=counts,
             contact=_NO_CONTACT,
             **{name: array.ctypes.data for name, array in self.arrays.items()},
         )

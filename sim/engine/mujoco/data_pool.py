@@ -7,6 +7,7 @@ of its states; back at work it computes the rest by ``mj_step1``, with the same 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -31,10 +32,13 @@ class User(Protocol):
 
 
 class DataPool:
-    """``mujoco.MjData`` of ``robot`` for one pack at a time."""
+    """``mujoco.MjData`` of ``robot`` for one pack at a time, and the model of robots without variation.
+
+    The model is a copy, since native code disables and enables its contacts within a sim step.
+    """
 
     def __init__(self, robot: RobotMj) -> None:
-        self.robot, self._data, self._taken = robot, list[Any](), list[Any]()
+        self.robot, self.model, self._data, self._taken = robot, copy.copy(robot.model), list[Any](), list[Any]()
         self._user: User | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         mujoco.mj_getState(robot.model, self._new(1)[0], self._initial, STATE)

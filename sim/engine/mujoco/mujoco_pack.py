@@ -85,8 +85,7 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
-        # A copy for this pack, since native code disables and enables its contacts.
-        self.models, self.rows = [copy.copy(robot.model)] * self.size, self._pool.initial(self.size)
+        self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
         self._change_masses(range(self.size))
         self._update(range(self.size))
@@ -97,17 +96,21 @@ class MujocoPack(SingleOwner):
         return self._pool.take(self)
 
     def _update(self, rows: Iterable[int]) -> None:
-        """Compute all that follows from the states of robots ``rows``, after a change of state or model."""
+        """Compute all that follows from the states of robots ``rows``, after a change of models."""
+        self._evaluate(rows)
+        self._calls: object = object()
+        self._own_step: MujocoStep | None = None
+
+    def _evaluate(self, rows: Iterable[int]) -> None:
+        """Compute all that follows from the states of robots ``rows``."""
         data = self._data
         for row in rows:
             mujoco.mj_step1(self.models[row], data[row])
-        self._calls: object = object()
-        self._own_step: MujocoStep | None = None
 
     def _own_model(self, row: int) -> Any:
         """Return the model of robot ``row`` alone, which may be changed."""
         model = self.models[row]
-        if self.models.count(model) > 1:
+        if model is self._pool.model or self.models.count(model) > 1:
             model = self.models[row] = copy.copy(model)
         return model
 
@@ -242,7 +245,7 @@ class MujocoPack(SingleOwner):
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
-        self._update(rows)
+        self._evaluate(rows)
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:

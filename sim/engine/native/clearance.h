@@ -40,8 +40,10 @@ struct Clearance {
   float *left;                       // (robots, pairs): clearances [m], rounded down
   double *rate;                      // (robots, dof): largest arm over clearance [1/rad or 1/m]
   std::int32_t *wait;                // (robots,): 0 while a proof holds; otherwise sim steps until the next attempt
+  std::int32_t const *const *shapes;  // (robots,): numbers of shapes of their bodies, body_geomnum in mjModel
+  std::int32_t const *no_shapes;     // (bodies,): zeros
   std::int64_t number;               // of pairs
-  std::int64_t flags;                // place of opt.disableflags in mjModel [bytes]
+  std::int64_t flags, counts;        // places of opt.disableflags and of the pointer body_geomnum in mjModel [bytes]
   std::int32_t contact, unused;      // mjDSBL_CONTACT
 };
 
@@ -186,10 +188,13 @@ inline bool is_clear(Clearance const &clearance, std::int64_t row, std::int64_t 
   return clear;
 }
 
-// Switch MuJoCo's contacts of one robot off or on.
+// Switch MuJoCo's contacts of one robot off or on. Without them no body has shapes either, so that MuJoCo does not place
+// them: nothing but collision detection and proofs reads their places, and a proof places them first.
 inline void switch_contacts(Clearance const &clearance, std::int64_t row, bool off) {
-  auto &flags = *reinterpret_cast<std::int32_t *>(static_cast<char *>(clearance.models[row]) + clearance.flags);
+  char *model = static_cast<char *>(clearance.models[row]);
+  auto &flags = *reinterpret_cast<std::int32_t *>(model + clearance.flags);
   flags = off ? flags | clearance.contact : flags & ~clearance.contact;
+  *reinterpret_cast<std::int32_t const **>(model + clearance.counts) = off ? clearance.no_shapes : clearance.shapes[row];
 }
 
 }  // namespace batchpid

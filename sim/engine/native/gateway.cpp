@@ -7,7 +7,7 @@
 
 #include "batchpid/native/extension.h"
 #include "sim_step.h"
-#include "tick.h"
+#include "ticks.h"
 #include "xla_call.h"
 
 using namespace batchpid;
@@ -216,6 +216,30 @@ PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return Py_BuildValue("Li", static_cast<long long>(step), static_cast<int>(status));
 }
 
+// ticks(bound program, address of a Tick, address of a Group, address and number of Transfers, first tick, until, steps)
+// -> ticks completed, sim steps of the next one, status.
+PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[0], BOUND));
+  auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
+  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
+  auto *transfers = static_cast<Transfer const *>(PyLong_AsVoidPtr(arguments[3]));
+  if (bound == nullptr || arrays == nullptr || group == nullptr || transfers == nullptr) return nullptr;
+  if (bound->program->rows != static_cast<Index>(group->robots) ||
+      bound->program->columns != static_cast<Index>(group->dof) || arrays->dof != group->dof) {
+    return misfit();
+  }
+  std::int64_t const count = PyLong_AsLongLong(arguments[4]), until = PyLong_AsLongLong(arguments[6]);
+  std::int64_t const steps = PyLong_AsLongLong(arguments[7]);
+  std::int64_t tick = PyLong_AsLongLong(arguments[5]), step = 0;
+  std::int32_t status = 0;
+  PyObject *done = without_gil([&] {
+    status = run_ticks(*bound, *arrays, *group, transfers, count, tick, until, steps, step);
+  });
+  if (done == nullptr) return nullptr;
+  Py_DECREF(done);
+  return Py_BuildValue("LLi", static_cast<long long>(tick), static_cast<long long>(step), static_cast<int>(status));
+}
+
 // mass_matrices(tree, bodies, qpos, out, rows, dof): of each row of qpos (rows, dof), as tick makes them.
 PyObject *mass_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), dof = PyLong_AsSsize_t(arguments[5]);
@@ -263,6 +287,7 @@ PyMethodDef METHODS[] = {
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"tick", method(tick), METH_FASTCALL, nullptr},
+    {"ticks", method(ticks), METH_FASTCALL, nullptr},
     {"mass_matrices", method(mass_matrices), METH_FASTCALL, nullptr},
     {"xla_functions", xla_functions, METH_NOARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},

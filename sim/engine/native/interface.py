@@ -59,8 +59,10 @@ class Clearance(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
         *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
         *((name, ctypes.c_void_p) for name in ("pairs", "arms", "travel", "last", "moved", "left", "rate", "wait")),
+        *((name, ctypes.c_void_p) for name in ("shapes", "no_shapes")),
         ("number", ctypes.c_int64),
         ("flags", ctypes.c_int64),
+        ("counts", ctypes.c_int64),
         ("contact", ctypes.c_int32),
         ("unused", ctypes.c_int32),
     ]
@@ -105,6 +107,20 @@ class Tick(ctypes.Structure):
     ]
 
 
+TRANSFERS = ("read", "write_floats", "write_bytes")
+"""Kinds of a :class:`Transfer`."""
+
+
+class Transfer(ctypes.Structure):
+    """Copy between the arrays of a tick and a table with an entry for each tick, as Transfer in ticks.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("table", "row")),
+        *((name, ctypes.c_int64) for name in ("stride", "size")),
+        *((name, ctypes.c_int32) for name in ("kind", "unused")),
+    ]
+
+
 def _layout(structure: type[ctypes.Structure]) -> list[tuple[str, int, int]]:
     """Return the fields of a structure, with their places and sizes."""
     return [
@@ -126,6 +142,8 @@ def _gateway_tables() -> tuple[Any, ...]:
         _layout(Mujoco),
         _layout(Constraint),
         _layout(Tick),
+        TRANSFERS,
+        _layout(Transfer),
         list(BODY.items()),
         PROGRAM.tables(),
     )
@@ -148,6 +166,7 @@ EXTENSIONS = {
                 "constraint.h",
                 "sim_step.h",
                 "tick.h",
+                "ticks.h",
                 "xla_call.h",
             ),
             BUFFER,

@@ -89,3 +89,13 @@ class NativeTick:
         for place, block in enumerate(noise):
             self._tick.noise[place] = block.ctypes.data
         return self._native.tick(self._program, self._address, group, begin, until, end, self._sensors)
+
+    def run_ticks(self, group: int, transfers: Any, first: int, until: int, steps: int) -> tuple[int, int, int]:
+        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until something needs attention.
+
+        ``transfers`` is a ctypes array of :class:`batchpid.sim.engine.native.interface.Transfer`. Return the number of
+        the tick that is not complete, or ``until``, its sim steps that are done, and the last status. The programs of
+        sensors are not run.
+        """
+        at, count = ctypes.addressof(transfers), len(transfers)
+        return self._native.ticks(self._program, self._address, group, at, count, first, until, steps)

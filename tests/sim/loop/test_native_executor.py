@@ -242,13 +242,18 @@ def test_python_calls_of_a_sim_step(panda, actuators):
 
 
 def test_coupled_joints_take_a_call_for_four_sim_steps(tmp_path, engine, monkeypatch):
-    spans, run = [], TickProgram.run
+    spans, run, run_ticks = [], TickProgram.run, TickProgram.run_ticks
 
     def counted(self, step, begin, until, end):
         spans.append((begin, until))
         return run(self, step, begin, until, end)
 
+    def counted_ticks(self, step, transfers, first, until, steps):
+        spans.extend([steps] * (until - first))
+        return run_ticks(self, step, transfers, first, until, steps)
+
     monkeypatch.setattr(TickProgram, "run", counted)
+    monkeypatch.setattr(TickProgram, "run_ticks", counted_ticks)
     with Runner(arm(tmp_path, joints=3), 2, workers=0, engine=engine) as runner:
         start = runner.reset().qpos
         runner.step(start, substeps=10)
@@ -284,6 +289,10 @@ def test_control_steps_that_are_a_program(panda):
         def run(self, *arguments):
             executors.append(self._compiles)
             return super().run(*arguments)
+
+        def run_ticks(self, *arguments):
+            executors.append(self._compiles)
+            return super().run_ticks(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", Seen)
@@ -324,13 +333,18 @@ def test_control_steps_that_are_a_program(panda):
 )
 def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, panda, monkeypatch):
     """Runs of the program, of the whole tick or of one sim step, are counted."""
-    spans, run = [], TickProgram.run
+    spans, run, run_ticks = [], TickProgram.run, TickProgram.run_ticks
 
     def counted(self, step, begin, until, end):
         spans.append(until - begin)
         return run(self, step, begin, until, end)
 
+    def counted_ticks(self, step, transfers, first, until, steps):
+        spans.extend([steps] * (until - first))
+        return run_ticks(self, step, transfers, first, until, steps)
+
     monkeypatch.setattr(TickProgram, "run", counted)
+    monkeypatch.setattr(TickProgram, "run_ticks", counted_ticks)
     with Runner(panda, 2, workers=0, **options) as runner:
         begin = runner.reset()
         runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=10)

@@ -1,0 +1,54 @@
+"""Ticks of a rollout in one native call: the same as ticks one by one, also where something happens in one of them."""
+
+import numpy as np
+import pytest
+from robots import load_bundled
+
+from batchpid.sim import Runner
+from batchpid.sim.engine import native
+from batchpid.sim.loop.tick_program import TickProgram
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning"),
+    pytest.mark.skipif(not native.status().active, reason="there are no native calls"),
+]
+
+
+@pytest.fixture(params=["sapien", "mujoco"])
+def engine(request):
+    if request.param == "mujoco":
+        pytest.importorskip("mujoco")
+    return request.param
+
+
+@pytest.fixture
+def panda():
+    return load_bundled("panda")
+
+
+@pytest.mark.parametrize("options", [{}, {"speed_limit": 0.5}, {"on_fault": "reset"}], ids=str)
+def test_a_rollout_is_its_ticks_one_by_one(panda, engine, options):
+    options = {"workers": 0, "substeps": 7, "engine": engine, "on_invalid_input": "contain", **options}
+    setpoints = np.broadcast_to(panda.settings.target, (9, 3, panda.dof)).copy()
+    setpoints[4, 1, 2] = np.nan
+    with Runner(panda, 3, **options) as whole, Runner(panda, 3, **options) as single:
+        rollout = whole.rollout(setpoints)
+        ticks = [single.step(rows) for rows in setpoints]
+        assert not rollout.ok[4].all()
+        for name in ("qpos", "qvel", "effort", "saturated", "ok", "guarded"):
+            np.testing.assert_array_equal(getattr(rollout, name), np.stack([getattr(tick, name) for tick in ticks]))
+        assert whole.faults == single.faults
+        np.testing.assert_array_equal(whole.observe().qpos, rollout.qpos[-1])
+
+
+def test_quiet_ticks_are_one_call(panda, engine, monkeypatch):
+    calls, run_ticks = [], TickProgram.run_ticks
+
+    def counted(self, step, transfers, first, until, steps):
+        calls.append(until - first)
+        return run_ticks(self, step, transfers, first, until, steps)
+
+    monkeypatch.setattr(TickProgram, "run_ticks", counted)
+    with Runner(panda, 2, workers=0, substeps=2, engine=engine) as runner:
+        runner.rollout(np.broadcast_to(panda.settings.start, (30, panda.dof)))
+    assert calls == [30]
