@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identical import assert_identical
+from processes import have_ended
 
 from batchpid.errors import ClosedError, InUseError
 from batchpid.sim import Runner
@@ -117,6 +118,19 @@ def test_a_signal_handler_may_close_the_runner(runner, panda, on_alarm):
     assert memory_files() < before
     with pytest.raises(ClosedError):
         runner.observe()
+
+
+def test_an_interrupted_close_raises_and_ends_the_workers(panda, on_alarm):
+    def handler():
+        raise KeyboardInterrupt
+
+    runner = Runner(panda, 2, params=panda.params(), workers=1)
+    os.kill(runner.pids[0], signal.SIGSTOP)  # close waits for it
+    pids = runner.pids
+    on_alarm(handler)
+    with pytest.raises(KeyboardInterrupt):
+        runner.close()
+    assert have_ended(pids)
 
 
 def test_another_thread_may_close_the_runner(panda):
