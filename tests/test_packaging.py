@@ -18,6 +18,8 @@ from setuptools import find_packages
 from setuptools.config.expand import read_attr
 
 import batchpid
+from batchpid.sim.cli import main
+from batchpid.sim.engine import native
 
 ROOT = Path(__file__).parents[1]
 LIMITED_API = "cp311"
@@ -128,6 +130,13 @@ def test_published_wheels_have_native_code_and_the_tag_of_the_limited_api():
     assert f'"py_limited_api": "{LIMITED_API}"' in (ROOT / "setup.py").read_text()
     oldest = PROJECT["project"]["requires-python"].removeprefix(">=3.")
     assert f"cp3{oldest}" == LIMITED_API
+
+
+def test_a_wheel_is_tried_for_the_text_that_the_command_prints(capsys):
+    places = [(ROOT / name).read_text() for name in ("Makefile", ".github/workflows/wheels.yml")]
+    (text,) = {found for place in places for found in re.findall(r'inspect panda --engine \| grep "(.*)"', place)}
+    assert main(["inspect", "panda", "--engine"]) == 0
+    assert (text in capsys.readouterr().out) == native.status().active
 
 
 @pytest.mark.slow

@@ -224,7 +224,7 @@ def make_params(
         (do not integrate further into saturation) or "back_calculation"; or a nested list of these of shape
         (joints,) or (envs, joints).
     tracking_time
-        Back-calculation's time constant [s]; steps shorter than it are needed for more than a one-step correction.
+        Time constant of back-calculation [s]; one below the time step corrects the whole excess in one step.
         None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID Control, 2006, sec. 3.5).
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the short way round.

@@ -161,7 +161,7 @@ class KinematicTree:
 
     @cached_property
     def chains(self) -> Float64:
-        """1.0 for the joints between the base and each body (dof + 1, dof); the last row is that of the base, -1."""
+        """1.0 for the joints between the base and each body (dof + 1, dof); the last row, body -1, is the base."""
         rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
         rows.setflags(write=False)
         return rows

@@ -57,7 +57,7 @@ class Velocities(NamedTuple):
 def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None, *, point: Any = None) -> Any:
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
 
-    With a ``point`` (3,) of the links [m] the positions are those of the point.
+    With a ``point`` (3,) in the frame of the links [m], the positions of this point.
 
     Raises
     ------

@@ -128,7 +128,7 @@ def parse(arguments: Sequence[str]) -> Any:
         tyro.conf.FlagCreatePairsOff,  # --viewer without --no-viewer
         tyro.conf.PositionalMetavarFromFieldName,
     )
-    about = "Joint-level PID control for many robots at once, in SAPIEN."
+    about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
     return app.cli(prog="batchpid", description=about, args=arguments, config=options)
 
 

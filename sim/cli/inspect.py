@@ -65,7 +65,8 @@ class InspectCommand:
         if self.engine:
             from batchpid.sim.engine.native import status
 
-            print(f"\nEngine: SAPIEN {package_versions(['sapien'])['sapien']}, {status()}.")
+            version = package_versions(["sapien"])["sapien"]
+            print(f"\nEngine: {status().describe(f'SAPIEN {version}')}.")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 

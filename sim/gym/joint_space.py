@@ -18,8 +18,8 @@ MAX_SPEED = 100.0
 class JointSpace:
     """Independent joints of ``robot`` (:attr:`batchpid.sim.Robot.independent`), with a finite range each.
 
-    The range is that of the limits; of a continuous joint [-pi, pi]; of another joint without limits half a turn, or
-    pi m, on either side of its start.
+    The range is the joint's limits. For a continuous joint it is [-pi, pi], for another joint without limits half a
+    turn, or pi m, on either side of its start.
     """
 
     def __init__(self, robot: Robot) -> None:

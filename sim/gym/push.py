@@ -38,8 +38,8 @@ class PushVectorEnv(ToolVectorEnv):
     - *Observation*: qpos, qvel (joints), pose of the tool (7), pose of the box (7), goal of the box (2): positions
       [m] and quaternions (w, x, y, z).
     - *Action*: see :class:`batchpid.sim.gym.tool_vector_env.ToolVectorEnv`; along z the workspace has no extent.
-    - *Reward*: minus the distance of the box to its goal [m], minus a tenth of that of the tool to the box, plus 1 at
-      the goal; horizontal distances.
+    - *Reward*: minus the distance of the box to its goal [m], minus a tenth of the distance of the tool to the box,
+      plus 1 at the goal; horizontal distances.
     - *Success*: the distance of the box to its goal is at most ``tolerance``.
     - *Info*: "success", "distance" [m], "diverged".
 

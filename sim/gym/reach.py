@@ -117,7 +117,7 @@ class ReachVectorEnv(RobotVectorEnv):
         return observation, spaces.Box(-1.0, 1.0, (len(names),), np.float32)
 
     def draw(self, env: int, random: np.random.Generator) -> Float64:
-        """Draw a start around that of the robot, and a goal within the joint limits."""
+        """Draw a start near the robot's start pose, and a goal within the joint limits."""
         joints = self._joints
         drawn = joints.start + random.uniform(-SPREAD, SPREAD, len(joints.names))
         self._goal[env] = random.uniform(self.low + self._margin, self.high - self._margin)

@@ -185,7 +185,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
 
-        ``setpoint`` are those of the last step. Default: the action is the setpoint.
+        ``setpoint`` are the setpoints of the last step. Default: the action is the setpoint.
         """
         return action
 

@@ -17,7 +17,7 @@ from batchpid.task_space.kinematic_tree import KinematicTree
 def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
     """Return the tree of ``robot``; ``options`` are its armature and gravity.
 
-    Masses are those of the URDF; SAPIEN has those of links without ``<inertial>`` but with collision shapes.
+    Masses are from the URDF, or from SAPIEN for links without ``<inertial>`` but with collision shapes.
 
     Raises RobotError if the base is not fixed, or SAPIEN cannot build a link whose mass comes from its shapes.
     """

@@ -52,8 +52,8 @@ class OperationalSpace:
     are the tool's twist, acceleration and wrench (6,), where these are True, and the positions of ``joints``.
 
     The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the joints' known damping and
-    friction. Friction is that of the motion to the setpoint: its direction is dq = J^T (J J^T + 1e-4)^-1 e, with the
-    error e of the pose. Jacobian and mass matrix are those of ``tree``.
+    friction. Friction is compensated for the motion to the setpoint. Its direction is dq = J^T (J J^T + 1e-4)^-1 e,
+    with the error e of the pose. Jacobian and mass matrix are computed from ``tree``.
     The state is the posture of each env, which a reset restores, and the integral. An env that has failed holds the
     pose of the posture. A runner sets time step and ``compensate``; elsewhere they are 1/2000 s and "none".
 

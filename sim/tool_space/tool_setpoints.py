@@ -50,7 +50,7 @@ class ToolSetpoints:
     ) -> Float64:
         """Return joint setpoints (envs, dof), or (ticks, envs, dof), for poses after ``last`` (envs, dof).
 
-        Setpoints have 7 entries, or those of :attr:`command`; without them the other joints keep their setpoint. A
+        Setpoints have 7 entries, or all entries of :attr:`command`; with 7 the other joints keep their setpoint. A
         quaternion is normalised. If invalid numbers are allowed (not ``finite``), they make their env's setpoint NaN.
 
         Raises

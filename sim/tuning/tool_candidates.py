@@ -92,7 +92,7 @@ class ToolMoves(NamedTuple):
 
 
 def tool_moves(robot: Robot, control: OperationalSpace, count: int, seed: int) -> ToolMoves:
-    """Return ``count`` seeded moves between poses of the tool near that of the control's posture.
+    """Return ``count`` seeded moves between poses of the tool near its pose in the control's posture.
 
     Their ends touch nothing, and joints stay within their limits on the way under the control's gains.
 

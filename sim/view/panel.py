@@ -42,7 +42,7 @@ class Panel:
         self.requests = Requests(refuse)
         """Requests of the page, which are carried out between two frames."""
         self.only_watched = True
-        """True if a target is that of the watched robot alone."""
+        """True if a target applies to the watched robot alone."""
         self.frames_left = math.inf
         """Frames to run before the next pause."""
         self._names = short_names(data.robot)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identical import assert_identical
+from processes import have_ended
 
 from batchpid.errors import ClosedError, InUseError
 from batchpid.sim import Runner
@@ -39,6 +40,18 @@ def on_alarm():
     yield on_alarm
     signal.setitimer(signal.ITIMER_REAL, 0)
     signal.signal(signal.SIGALRM, before)
+
+
+def memory_files():
+    """Return the number of this process's descriptors of memory that it shares with workers, or with itself."""
+    links = (os.readlink(path) for path in Path("/proc/self/fd").iterdir() if path.is_symlink())
+    return sum(link.startswith("/memfd:batchpid") for link in links)
+
+
+def test_a_closed_runner_gives_its_memory_back(runner):
+    before = memory_files()
+    runner.close()
+    assert memory_files() < before
 
 
 def test_a_call_from_another_thread_raises(runner, panda):
@@ -85,8 +98,9 @@ def test_a_call_from_a_signal_handler_raises(runner, panda, on_alarm):
     raised = []
 
     def handler():
-        with pytest.raises(InUseError, match="that this one interrupted"):
-            runner.step(panda.start)
+        for _ in range(2):  # the first error does not end the call that is in progress
+            with pytest.raises(InUseError, match="that this one interrupted"):
+                runner.step(panda.start)
         raised.append(True)
 
     on_alarm(handler)
@@ -96,12 +110,27 @@ def test_a_call_from_a_signal_handler_raises(runner, panda, on_alarm):
 
 
 def test_a_signal_handler_may_close_the_runner(runner, panda, on_alarm):
+    before = memory_files()
     on_alarm(runner.close)
     with pytest.raises(ClosedError):  # noqa: PT012
         while True:
             runner.step(panda.start, substeps=500)
+    assert memory_files() < before
     with pytest.raises(ClosedError):
         runner.observe()
+
+
+def test_an_interrupted_close_raises_and_ends_the_workers(panda, on_alarm):
+    def handler():
+        raise KeyboardInterrupt
+
+    runner = Runner(panda, 2, params=panda.params(), workers=1)
+    os.kill(runner.pids[0], signal.SIGSTOP)  # close waits for it
+    pids = runner.pids
+    on_alarm(handler)
+    with pytest.raises(KeyboardInterrupt):
+        runner.close()
+    assert have_ended(pids)
 
 
 def test_another_thread_may_close_the_runner(panda):

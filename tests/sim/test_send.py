@@ -38,6 +38,15 @@ def test_send_and_recv_are_bit_identical_to_step(workers):
         assert runner.time == model.time
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_runner_that_was_closed_after_send_has_nothing_to_settle(workers):
+    with make(workers) as runner:
+        runner.send(SETPOINTS[0])
+    runner.settle()
+    with pytest.raises(ClosedError):
+        runner.recv()
+
+
 def test_halves_in_turns_are_bit_identical_to_the_whole():
     def policy(obs):
         return np.clip(obs.qpos + 0.1, ROBOT.lower, ROBOT.upper)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from batchpid.sim import Runner, Snapshot
+from batchpid.sim import Randomization, Runner, Snapshot, Uniform
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +176,37 @@ def test_numbers_that_do_not_agree_are_refused(good, changes, message, tmp_path)
             np.savez(tmp_path / "bad.npz", **{**file, "head": np.array('{"format": 3, "about": null}')})
     else:
         rewrite(good, tmp_path / "bad.npz", **changes)
+    with pytest.raises(InvalidArgumentError, match=message):
+        Snapshot.load(tmp_path / "bad.npz")
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Snapshot of a runner with episodes and targets."""
+    from robots import load_bundled
+
+    path = tmp_path_factory.mktemp("snapshot") / "drawn.npz"
+    options = {"setpoint_space": "tool", "tool": "panda_hand", "randomization": Randomization(payload=Uniform(0, 0.5))}
+    with Runner(load_bundled("panda"), 2, workers=0, **options) as runner:
+        runner.snapshot().save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"episodes": np.zeros((1, 2), np.int64)}, "not counts"),
+        ({"episodes": np.zeros((2, 2))}, "not counts"),
+        ({"episodes": np.full((2, 2), -1)}, "not counts"),
+        ({"about": {"randomization": None}}, "episodes do not fit"),
+        ({"targets": np.zeros((1, 9))}, "not positions"),
+        ({"targets": np.full((2, 9), np.nan)}, "not positions"),
+        ({"about": {"setpoint_space": "joints"}}, "targets do not fit"),
+    ],
+)
+def test_episodes_and_targets_that_do_not_agree_are_refused(drawn, changes, message, tmp_path):
+    assert Snapshot.load(drawn).episodes.shape == (2, 2)
+    rewrite(drawn, tmp_path / "bad.npz", **changes)
     with pytest.raises(InvalidArgumentError, match=message):
         Snapshot.load(tmp_path / "bad.npz")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pickle
 import subprocess
@@ -254,6 +255,15 @@ def test_its_repr_is_one_line(panda):
         snapshot = runner.snapshot()
     assert repr(snapshot) == "Snapshot(panda, 2 envs, control 'pid', after 20 sim steps)"
     assert repr(snapshot.states) == "EnvStates(2 envs, 9 joints)"
+
+
+def test_it_is_immutable_and_equals_itself_alone(panda):
+    with Runner(panda, 1, params=panda.params(), workers=0) as runner:
+        snapshot = runner.snapshot()
+    for each in (snapshot, snapshot.states):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(each, dataclasses.fields(each)[0].name, None)
+        assert len({each, dataclasses.replace(each)}) == 2
 
 
 @pytest.mark.parametrize("effect", [{"command_delay": 2e-3}, {"sensor_delay": 2e-3}], ids=str)

@@ -103,6 +103,35 @@ def test_a_lost_worker_is_replaced(undisturbed):
     assert_identical(undisturbed, rollout)
 
 
+class WritesDots:
+    """Controller that adds a byte to a file at each sim step."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def init(self, robot, num_envs):
+        return np.zeros(num_envs)
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        with open(self.path, "ab") as file:
+            file.write(b".")
+        return state, passive
+
+
+def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path):
+    path = tmp_path / "steps"
+    options = {"workers": 1, "control": WritesDots(path), "params": None, "substeps": 5, "checkpoint_steps": 20}
+    with make_runner(**options) as runner:
+        for _ in range(9):
+            runner.step(ROBOT.start)  # checkpoints after 20 and 40 sim steps
+        before = path.stat().st_size
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            runner.step(ROBOT.start)
+    assert before >= 45
+    assert 10 <= path.stat().st_size - before <= 20
+
+
 @pytest.mark.slow
 def test_workers_that_end_with_their_fork_server_are_replaced(undisturbed):
     with make_runner() as runner:
