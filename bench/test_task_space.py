@@ -1,7 +1,8 @@
 """Cost of operational-space control and of inverse kinematics of a panda: native rows against NumPy.
 
 "regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a straight arm, where
-each needs its eigenvalues. ``step`` is the law with the dynamics of a tree; the shares below it are timed alone.
+each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in one call; the parts below it are calls
+of their own.
 Searches start 0.3 rad away from a solution.
 """
 
@@ -54,10 +55,10 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     state, goal = ts.init(params, qpos), ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0]
     d = ts.task_dynamics(tree, qpos, qvel, LINK)
 
-    def step(advance=ts.advance):
-        return advance(k, state, goal, qpos, qvel, ts.task_dynamics(tree, qpos, qvel, LINK))
+    def step(step=ts.step):
+        return step(params, state, goal, qpos, qvel, 1 / 2000, tree=tree, link=LINK)
 
-    near = step(ts.advance_terms)[1].near_singular
+    near = step(ts.step_terms)[1].near_singular
     assert near.all() if pose == "bounded" else not near.any()
     seconds = min(0.3, most.seconds)
     with mock.patch.dict(os.environ, {SWITCH: "0"}):

@@ -71,7 +71,7 @@ class PoseSearch {
     for (int pass = 0; pass < PASSES; ++pass) {
       Lanes rest[AXES];
       std::copy(error, error + AXES, rest);
-      factorize(damping, rest);
+      set_factor(damping, rest);
       solve(rest);
       Lanes stopped{};
       for (std::int64_t j = 0; j < size; ++j) {
@@ -97,7 +97,7 @@ class PoseSearch {
   std::int64_t count() const { return static_cast<std::int64_t>(joints_.size()); }
 
   // Set the columns of the free joints and the factor of their damped J J^T; take the moves of the others off `rest`.
-  void factorize(Lanes damping, Lanes *rest) {
+  void set_factor(Lanes damping, Lanes *rest) {
     for (int a = 0; a < AXES; ++a) {
       for (int b = 0; b <= a; ++b) factor_[a * AXES + b] = Lanes{};
     }
@@ -111,13 +111,12 @@ class PoseSearch {
       }
     }
     for (int a = 0; a < AXES; ++a) factor_[a * AXES + a] += damping;
-    cholesky(AXES, factor_);
+    factorize(AXES, factor_);
   }
 
   // Set the changes J^T (J J^T + damping 1)^-1 v of the free joints; v is overwritten.
   void solve(Lanes *v) {
-    solve_lower<1>(AXES, factor_, v);
-    solve_upper<1>(AXES, factor_, v);
+    solve_both<1>(AXES, factor_, v);
     for (std::int64_t j = 0; j < count(); ++j) {
       Lanes sum{};
       for (int axis = 0; axis < AXES; ++axis) sum += part_[j * AXES + axis] * v[axis];
@@ -162,7 +161,7 @@ FOR_EACH_PROCESSOR static void search_poses(Tree const &tree, std::int64_t body,
   double const *largest = table[LARGEST].data;
   std::int64_t row[WIDTH], step[WIDTH], next = 0, running = 0;
   double smallest[WIDTH];
-  Lanes frame[FRAME], error[AXES];
+  Lanes frame[FRAME], goal[POSE], pose[POSE], error[AXES];
   table[TOOL_FRAME].load(0, frame);
   auto const start = [&](int lane) {
     row[lane] = next < rows ? next++ : -1;
@@ -171,18 +170,19 @@ FOR_EACH_PROCESSOR static void search_poses(Tree const &tree, std::int64_t body,
     step[lane] = 0;
     smallest[lane] = std::numeric_limits<double>::infinity();
     search.set_qpos(lane, table[FOUND].row(row[lane]));
+    for (int k = 0; k < POSE; ++k) goal[k].of[lane] = table[GOAL].row(row[lane])[k];
   };
   for (int lane = 0; lane < WIDTH; ++lane) start(lane);
   while (running > 0) {
     Tool const tool = search.place(frame);
+    tool.write_pose(pose);
+    write_error(goal, pose, error);
+    Lanes const away = length_of(error), turned = length_of(error + 3);
     bool ended[WIDTH];
     for (int lane = 0; lane < WIDTH; ++lane) {
       ended[lane] = row[lane] < 0;
       if (ended[lane]) continue;
-      double pose[POSE], e[AXES];
-      tool.write_pose(lane, pose);
-      write_error(table[GOAL].row(row[lane]), pose, e);
-      double const lengths[2] = {length_of(e), length_of(e + 3)};
+      double const lengths[2] = {away.of[lane], turned.of[lane]};
       double const size = std::max(lengths[0] / largest[0], lengths[1] / largest[1]);
       bool reached = false;
       if (size < smallest[lane]) {
@@ -192,7 +192,6 @@ FOR_EACH_PROCESSOR static void search_poses(Tree const &tree, std::int64_t body,
         *table[STEPS].row(row[lane]) = static_cast<double>(step[lane]);
         reached = lengths[0] <= largest[0] && lengths[1] <= largest[1];
       }
-      for (int axis = 0; axis < AXES; ++axis) error[axis].of[lane] = e[axis];
       ended[lane] = reached || step[lane]++ == iterations;
     }
     search.step(error, tool.place());

@@ -21,6 +21,10 @@ template <class N>
 Vector<N> operator+(Vector<N> a, Vector<N> b) {
   return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
+template <class N>
+Vector<N> operator-(Vector<N> a, Vector<N> b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
 template <class S, class N>
 Vector<N> operator*(S s, Vector<N> a) {
   return {s * a.x, s * a.y, s * a.z};
@@ -40,41 +44,39 @@ struct BodyRow {
   T rotation[3][3], position[3], mass, center[3], tensor[3][3];
 };
 
-// Mass, first moment and inertia tensor (its rows), in the axes of the base and about its origin.
+// Mass, first moment and inertia tensor, in the axes of the base and about its origin.
 template <class N>
 struct Inertia {
   N mass;
   Vector<N> first;
-  Vector<N> tensor[3];
+  Vector<N> diagonal, rest;  // of the tensor: xx, yy, zz, and yz, xz, xy
 
   void add(Inertia const &other) {
     mass += other.mass;
     first = first + other.first;
-    for (int k = 0; k < 3; ++k) tensor[k] = tensor[k] + other.tensor[k];
+    diagonal = diagonal + other.diagonal;
+    rest = rest + other.rest;
   }
   Vector<N> linear(Vector<N> turning, Vector<N> moving) const { return mass * moving + cross(turning, first); }
   Vector<N> angular(Vector<N> turning, Vector<N> moving) const {
-    Vector<N> const turned{dot(tensor[0], turning), dot(tensor[1], turning), dot(tensor[2], turning)};
+    Vector<N> const turned{dot({diagonal.x, rest.z, rest.y}, turning), dot({rest.z, diagonal.y, rest.x}, turning),
+                           dot({rest.y, rest.x, diagonal.z}, turning)};
     return turned + cross(first, moving);
   }
 };
 
 template <class N>
 Inertia<N> point_mass(N mass, Vector<N> place) {
-  Inertia<N> made{mass, mass * place, {}};
-  N const square = dot(place, made.first);
-  made.tensor[0] = {square, N{}, N{}};
-  made.tensor[1] = {N{}, square, N{}};
-  made.tensor[2] = {N{}, N{}, square};
-  N const places[3] = {place.x, place.y, place.z};
-  for (int k = 0; k < 3; ++k) made.tensor[k] = made.tensor[k] + -places[k] * made.first;
-  return made;
+  Vector<N> const first = mass * place;
+  N const x = place.x * first.x, y = place.y * first.y, z = place.z * first.z;
+  return {mass, first, {y + z, x + z, x + y}, {-place.y * first.z, -place.x * first.z, -place.x * first.y}};
 }
 
-// Body at a pose: axes and origin of its frame, and the inertia of it, or of all that its joint moves.
+// Body at a pose: axes and origin of its frame, the velocity of the base's origin with the body per rate of its joint,
+// and the inertia of it, or of all that its joint moves.
 template <class N>
 struct BodyState {
-  Vector<N> axes[3], origin;
+  Vector<N> axes[3], origin, moving;
   Inertia<N> inertia;
 };
 
@@ -91,10 +93,6 @@ Vector<N> along_axes(Vector<N> const (&axes)[3], T const (&v)[3]) {
 template <class N>
 Vector<N> turning(BodyState<N> const &body, bool slides) {
   return slides ? Vector<N>{} : body.axes[0];
-}
-template <class N>
-Vector<N> moving(BodyState<N> const &body, bool slides) {
-  return slides ? body.axes[0] : cross(body.origin, body.axes[0]);
 }
 
 // Write the frames of the bodies at a pose. tree (dof, 2): the joint above, or -1; whether it slides.
@@ -114,7 +112,9 @@ void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *
     at.origin = above.origin + along_axes(above.axes, row.position);
     if (tree[2 * j + 1]) {
       at.origin = at.origin + qpos[j] * at.axes[0];
+      at.moving = at.axes[0];
     } else {
+      at.moving = cross(at.origin, at.axes[0]);
       Vector<N> const y = at.axes[1], z = at.axes[2];
       at.axes[1] = cosine[j] * y + sine[j] * z;
       at.axes[2] = cosine[j] * z + -sine[j] * y;
@@ -128,13 +128,12 @@ void weigh_bodies(std::int64_t dof, BodyRow<T> const *rows, BodyState<N> *body) 
   for (std::int64_t j = 0; j < dof; ++j) {
     BodyRow<T> const &row = rows[j];
     BodyState<N> &at = body[j];
-    at.inertia = point_mass(N(double(row.mass)), at.origin + along_axes(at.axes, row.center));
+    Inertia<N> &to = at.inertia;
+    to = point_mass(N(double(row.mass)), at.origin + along_axes(at.axes, row.center));
     for (int k = 0; k < 3; ++k) {  // R T R^T: the sum of (T column k in the base's axes) times axis k
-      Vector<N> const turned = along_axes(at.axes, row.tensor[k]);
-      Vector<N> *tensor = at.inertia.tensor;
-      tensor[0] = tensor[0] + turned.x * at.axes[k];
-      tensor[1] = tensor[1] + turned.y * at.axes[k];
-      tensor[2] = tensor[2] + turned.z * at.axes[k];
+      Vector<N> const turned = along_axes(at.axes, row.tensor[k]), axis = at.axes[k];
+      to.diagonal = to.diagonal + Vector<N>{turned.x * axis.x, turned.y * axis.y, turned.z * axis.z};
+      to.rest = to.rest + Vector<N>{turned.y * axis.z, turned.x * axis.z, turned.x * axis.y};
     }
   }
 }
@@ -146,11 +145,11 @@ void composite_mass_matrix(std::int64_t dof, std::int32_t const *tree, BodyState
   for (std::int64_t j = dof - 1; j >= 0; --j) {
     Inertia<N> const &moved = body[j].inertia;
     if (tree[2 * j] >= 0) body[tree[2 * j]].inertia.add(moved);
-    Vector<N> const w = turning(body[j], tree[2 * j + 1]), v = moving(body[j], tree[2 * j + 1]);
+    Vector<N> const w = turning(body[j], tree[2 * j + 1]), v = body[j].moving;
     Vector<N> const linear = moved.linear(w, v), angular = moved.angular(w, v);
     for (std::int64_t i = j; i >= 0; i = tree[2 * i]) {
-      Vector<N> const a = body[i].axes[0];
-      N const product = tree[2 * i + 1] ? dot(a, linear) : dot(a, angular) + dot(cross(body[i].origin, a), linear);
+      N product = dot(body[i].moving, linear);
+      if (!tree[2 * i + 1]) product += dot(body[i].axes[0], angular);
       matrix[i * dof + j] = matrix[j * dof + i] = product;
     }
   }
@@ -162,11 +161,12 @@ struct BodyMotion {
   Vector<N> turning, moving, turning_change, moving_change;
   Vector<N> torque, force;
 
-  // Add the wrench that moves an inertia with the body.
-  void accelerate(Inertia<N> const &inertia) {
+  // Add the wrench that moves an inertia with the body, with the base accelerated by -gravity in addition.
+  void accelerate(Inertia<N> const &inertia, Vector<N> gravity = {}) {
+    Vector<N> const change = moving_change - gravity;
     Vector<N> const linear = inertia.linear(turning, moving), angular = inertia.angular(turning, moving);
-    force = force + inertia.linear(turning_change, moving_change) + cross(turning, linear);
-    torque = torque + inertia.angular(turning_change, moving_change) + cross(turning, angular) + cross(moving, linear);
+    force = force + inertia.linear(turning_change, change) + cross(turning, linear);
+    torque = torque + inertia.angular(turning_change, change) + cross(turning, angular) + cross(moving, linear);
   }
 };
 
@@ -176,7 +176,8 @@ void efforts_of_wrenches(std::int64_t dof, std::int32_t const *tree, BodyState<N
                          N *effort) {
   for (std::int64_t j = dof - 1; j >= 0; --j) {
     BodyMotion<N> const &at = motion[j];
-    effort[j] = dot(turning(body[j], tree[2 * j + 1]), at.torque) + dot(moving(body[j], tree[2 * j + 1]), at.force);
+    effort[j] = dot(body[j].moving, at.force);
+    if (!tree[2 * j + 1]) effort[j] += dot(body[j].axes[0], at.torque);
     if (tree[2 * j] < 0) continue;
     BodyMotion<N> &above = motion[tree[2 * j]];
     above.torque = above.torque + at.torque;
@@ -192,7 +193,7 @@ void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const 
   base.moving_change = {N(-gravity[0]), N(-gravity[1]), N(-gravity[2])};
   for (std::int64_t j = 0; j < dof; ++j) {
     BodyMotion<N> const &above = tree[2 * j] < 0 ? base : motion[tree[2 * j]];
-    Vector<N> const w = qvel[j] * turning(body[j], tree[2 * j + 1]), v = qvel[j] * moving(body[j], tree[2 * j + 1]);
+    Vector<N> const w = qvel[j] * turning(body[j], tree[2 * j + 1]), v = qvel[j] * body[j].moving;
     BodyMotion<N> &at = motion[j];
     at = BodyMotion<N>{above.turning + w, above.moving + v, above.turning_change, above.moving_change, {}, {}};
     at.turning_change = at.turning_change + cross(at.turning, w);

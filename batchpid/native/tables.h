@@ -2,7 +2,9 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
+#include <utility>
 
 #include "batchpid/native/buffer.h"
 #include "batchpid/native/lanes.h"
@@ -10,6 +12,31 @@
 #pragma GCC visibility push(hidden)
 
 namespace batchpid {
+
+// WIDTH numbers anywhere in an array.
+typedef double Unaligned __attribute__((vector_size(WIDTH * sizeof(double)), aligned(sizeof(double)), may_alias));
+
+// Transpose WIDTH vectors.
+inline void transpose(Lanes *v) {
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define BATCHPID_SHUFFLES
+#endif
+#endif
+#ifdef BATCHPID_SHUFFLES
+  Lanes::Packed const a = v[0].of, b = v[1].of, c = v[2].of, d = v[3].of;
+  auto const ab = __builtin_shufflevector(a, b, 0, 4, 2, 6), cd = __builtin_shufflevector(c, d, 0, 4, 2, 6);
+  auto const ab_odd = __builtin_shufflevector(a, b, 1, 5, 3, 7), cd_odd = __builtin_shufflevector(c, d, 1, 5, 3, 7);
+  v[0].of = __builtin_shufflevector(ab, cd, 0, 1, 4, 5);
+  v[1].of = __builtin_shufflevector(ab_odd, cd_odd, 0, 1, 4, 5);
+  v[2].of = __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+  v[3].of = __builtin_shufflevector(ab_odd, cd_odd, 2, 3, 6, 7);
+#else
+  for (int i = 0; i < WIDTH; ++i) {
+    for (int j = 0; j < i; ++j) std::swap(v[i].of[j], v[j].of[i]);
+  }
+#endif
+}
 
 // Array (rows, columns), or (1, columns) for all rows; without data if it is left out.
 struct Table {
@@ -22,7 +49,12 @@ struct Table {
   void load(std::int64_t first, std::int64_t count, Lanes *out) const {
     double const *const end = data + (rows - 1) * columns, *from[WIDTH];
     for (int k = 0; k < WIDTH; ++k) from[k] = first + k < rows ? data + (first + k) * columns : end;
-    for (std::int64_t c = 0; c < count; ++c) {
+    std::int64_t c = 0;
+    for (; c + WIDTH <= count; c += WIDTH) {
+      for (int k = 0; k < WIDTH; ++k) out[c + k].of = *reinterpret_cast<Unaligned const *>(from[k] + c);
+      transpose(out + c);
+    }
+    for (; c < count; ++c) {
       for (int k = 0; k < WIDTH; ++k) out[c].of[k] = from[k][c];
     }
   }
@@ -30,13 +62,13 @@ struct Table {
   void store(std::int64_t first, std::int64_t count, Lanes const *values) const {
     if (data == nullptr) return;
     double *const to = data + first * columns;
-    if (first + WIDTH <= rows) {
-      for (std::int64_t c = 0; c < count; ++c) {
-        for (int k = 0; k < WIDTH; ++k) to[k * columns + c] = values[c].of[k];
-      }
-    } else {
-      for (std::int64_t c = 0; c < count; ++c) scatter(values[c], data, columns, c, first, rows);
+    std::int64_t c = 0;
+    for (; c + WIDTH <= count && first + WIDTH <= rows; c += WIDTH) {
+      Lanes block[WIDTH] = {values[c], values[c + 1], values[c + 2], values[c + 3]};
+      transpose(block);
+      for (int k = 0; k < WIDTH; ++k) *reinterpret_cast<Unaligned *>(to + k * columns + c) = block[k].of;
     }
+    for (; c < count; ++c) scatter(values[c], data, columns, c, first, rows);
   }
   void store(std::int64_t first, Lanes const *values) const { store(first, columns, values); }
 };

@@ -22,7 +22,7 @@ LAW = (
     *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
     *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
     *("effort_min", "effort_max"),
-    *("effort", "next_integral", "error", "force", "task", "posture_effort", "unsaturated"),
+    *("effort", "next_integral", "limited", "error", "force", "task", "posture_effort", "unsaturated"),
     *("task_share", "posture_share", "near_singular"),
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
@@ -34,7 +34,10 @@ DECOUPLING = ("full", "partial", "none")
 BUFFER, CALL, LANES, RIGID_BODY = (
     f"batchpid/native/{name}" for name in ("buffer.h", "call.h", "lanes.h", "rigid_body.h")
 )
-_HEADERS = tuple(f"batchpid/native/{name}" for name in ("extension.h", "pose_search.h", "tables.h", "tool.h"))
+_HEADERS = tuple(
+    f"batchpid/native/{name}.h"
+    for name in ("extension", "mobility", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
+)
 
 
 def _tables() -> tuple[Any, ...]:

@@ -46,8 +46,8 @@ struct Tool {
     }
   }
   Vector<Lanes> const &place() const { return columns[3]; }
-  // Write the pose of a lane: position and quaternion.
-  void write_pose(int lane, double *pose) const;
+  // Write the pose (7,): position and quaternion.
+  void write_pose(Lanes *pose) const;
 };
 
 inline void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
@@ -60,7 +60,7 @@ inline void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
 inline void write_column(BodyState<Lanes> const &body, bool slides, Vector<Lanes> const &place, Lanes *out,
                          std::int64_t stride = 1) {
   Vector<Lanes> const w = turning(body, slides);
-  put(moving(body, slides) + cross(w, place), out, stride);
+  put(body.moving + cross(w, place), out, stride);
   put(w, out + 3 * stride, stride);
 }
 
@@ -92,49 +92,46 @@ struct Turn {
   }
 };
 
-// Write the unit quaternion (w, x, y, z), w >= 0, of a rotation with these columns: wxyz_of in frames.py.
-inline void write_quaternion(double const (&x)[3], double const (&y)[3], double const (&z)[3], double *out) {
-  double const squares[4] = {1 + x[0] + y[1] + z[2], 1 + x[0] - y[1] - z[2], 1 - x[0] + y[1] - z[2],
-                             1 - x[0] - y[1] + z[2]};
-  double const wx = y[2] - z[1], wy = z[0] - x[2], wz = x[1] - y[0];
-  double const xy = x[1] + y[0], xz = x[2] + z[0], yz = y[2] + z[1];
-  double const rows[4][4] = {
+// Write the unit quaternion (w, x, y, z), w >= 0, of the rotation with columns x, y, z: wxyz_of in frames.py.
+inline void write_quaternion(Vector<Lanes> const &x, Vector<Lanes> const &y, Vector<Lanes> const &z, Lanes *out) {
+  Lanes const same = 1.0 + x.x, other = 1.0 - x.x, sum = y.y + z.z, difference = y.y - z.z;
+  Lanes const squares[4] = {same + sum, same - sum, other + difference, other - difference};
+  Lanes const wx = y.z - z.y, wy = z.x - x.z, wz = x.y - y.x, xy = x.y + y.x, xz = x.z + z.x, yz = y.z + z.y;
+  Lanes const rows[4][4] = {
       {squares[0], wx, wy, wz}, {wx, squares[1], xy, xz}, {wy, xy, squares[2], yz}, {wz, xz, yz, squares[3]}};
-  int best = 0;
-  for (int k = 1; k < 4; ++k) best = squares[k] > squares[best] ? k : best;
-  double const *q = rows[best];
-  double const length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int k = 0; k < 4; ++k) out[k] = q[0] < 0 ? -q[k] / length : q[k] / length;
-}
-
-inline void Tool::write_pose(int lane, double *pose) const {
-  double axes[4][3];
-  for (int c = 0; c < 4; ++c) {
-    axes[c][0] = columns[c].x.of[lane];
-    axes[c][1] = columns[c].y.of[lane];
-    axes[c][2] = columns[c].z.of[lane];
+  Lanes q[4], most = squares[0];
+  std::copy(rows[0], rows[0] + 4, q);
+  for (int row = 1; row < 4; ++row) {
+    Lanes const larger = squares[row] - most;
+    most = where_positive(larger, squares[row], most);
+    for (int k = 0; k < 4; ++k) q[k] = where_positive(larger, rows[row][k], q[k]);
   }
-  for (int k = 0; k < 3; ++k) pose[k] = axes[3][k];
-  write_quaternion(axes[0], axes[1], axes[2], pose + 3);
+  Lanes const length = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  Lanes const scale = where_positive(-q[0], -1.0, 1.0) / length;
+  for (int k = 0; k < 4; ++k) out[k] = scale * q[k];
 }
 
-inline double length_of(double const *v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+inline void Tool::write_pose(Lanes *pose) const {
+  put(columns[3], pose);
+  write_quaternion(columns[0], columns[1], columns[2], pose + 3);
+}
+
+inline Lanes length_of(Lanes const *v) { return root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
 // Write the error (6,) from a pose to a goal: pose_error in frames.py.
-inline void write_error(double const *goal, double const *pose, double *out) {
-  for (int k = 0; k < 3; ++k) out[k] = goal[k] - pose[k];
-  double const *g = goal + 4, *q = pose + 4, gw = goal[3], qw = pose[3];
-  double w = gw * qw + (g[0] * q[0] + g[1] * q[1] + g[2] * q[2]);
-  double v[3];
+inline void write_error(Lanes const *goal, Lanes const *pose, Lanes *out) {
+  Lanes const *g = goal + 4, *q = pose + 4, gw = goal[3], qw = pose[3];
+  Lanes const w = gw * qw + (g[0] * q[0] + g[1] * q[1] + g[2] * q[2]), sign = where_positive(-w, -1.0, 1.0);
+  Lanes v[3];
   for (int k = 0; k < 3; ++k) {
     int const next = (k + 1) % 3, last = (k + 2) % 3;
-    v[k] = qw * g[k] - gw * q[k] - (g[next] * q[last] - g[last] * q[next]);
+    out[k] = goal[k] - pose[k];
+    v[k] = sign * (qw * g[k] - gw * q[k] - (g[next] * q[last] - g[last] * q[next]));
   }
-  double const sign = w < 0 ? -1.0 : 1.0;
-  w = sign * w;
-  double const length = length_of(v);
-  double const scale = length < 1e-12 * w ? 2 / w : 2 * std::atan2(length, w) / length;
-  for (int k = 0; k < 3; ++k) out[3 + k] = sign * v[k] * scale;
+  Lanes const size = sign * w, length = length_of(v), large = at_least_mask(length, 1e-12 * size);
+  Lanes const over = where_positive(large, length, size);  // small angles are 2 sin
+  Lanes const scale = where_positive(large, angle_of(length, size), 1.0) / over;
+  for (int k = 0; k < 3; ++k) out[3 + k] = 2.0 * scale * v[k];
 }
 
 }  // namespace batchpid

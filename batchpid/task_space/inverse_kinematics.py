@@ -12,7 +12,8 @@ Robotics 27 (2011): damping in proportion to the error. M. K. Transtrum and J. P
 Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885 (2012): geodesic acceleration,
 which takes the curvature of the tool's path into account. An active set keeps the joint limits: joints that v would
 move past a limit stop at it, and the other joints take over the remaining error. If a search does not reach the pose,
-further searches begin at other poses.
+further searches begin at other poses. In these, a joint with a full turn between its limits passes them, and is turned
+back at the end.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ Float64 = NDArray[np.float64]
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
 _LARGEST_ACCELERATION = 0.75  # relative to the velocity
+_FULL_TURN = 2 * np.pi - 1e-6  # [rad]; limits are often rounded
 _PASSES = 4  # of the active set; joints that pass a limit after the last are clipped
 
 
@@ -125,7 +127,7 @@ def inverse_kinematics(
             left, drawn = np.flatnonzero(~best.success), shares[first:last]
             if len(left) and len(drawn):
                 began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
-                found = search.solve(np.tile(goal[left], (len(drawn), 1)), began)
+                found = search.solve_past_limits(np.tile(goal[left], (len(drawn), 1)), began)
                 for number, part in enumerate(np.arange(len(began)).reshape(len(drawn), -1), start=first + 1):
                     _replace(best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance)
     if how != "return" and not best.success.all():
@@ -142,25 +144,48 @@ class _Search:
         self._tree, self._index, self._point = tree, index, point
         self._tolerance, self._iterations = tolerance, iterations
         self._chain = tree.chain(tree.links[index])
+        self._limits: tuple[Float64, Float64] = np.asarray(tree.lower), np.asarray(tree.upper)
+        turn = self._limits[1] - self._limits[0]
+        self._full = self._chain & (tree.bodies.slides[:, 0] == 0) & (turn > _FULL_TURN) & np.isfinite(turn)
 
     def drawn(self, rows: Float64, share: Float64) -> Float64:
         """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about ``rows`` without limits."""
-        low = np.where(np.isfinite(self._tree.lower), self._tree.lower, rows - np.pi)
-        high = np.where(np.isfinite(self._tree.upper), self._tree.upper, rows + np.pi)
+        low, high = self._limits
+        low, high = np.where(np.isfinite(low), low, rows - np.pi), np.where(np.isfinite(high), high, rows + np.pi)
         return np.where(self._chain, low + share * (high - low), rows)
 
-    def solve(self, goal: Float64, qpos: Float64) -> IKResult:
-        """Return the results of searches that begin at ``qpos`` (n, dof)."""
-        arrays = goal, qpos, self._tolerance, self._iterations
-        found = native_rows.search(self._tree, self._index, self._point, *arrays)
+    def solve_past_limits(self, goal: Float64, qpos: Float64) -> IKResult:
+        """Return the results of searches in which joints with a full turn between their limits pass these."""
+        low, high = self._limits
+        if not self._full.any():
+            return self.solve(goal, qpos)
+        found = self.solve(goal, qpos, (np.where(self._full, -np.inf, low), np.where(self._full, np.inf, high)))
+        over, turn = found.qpos - np.where(self._full, high, np.inf), 2 * np.pi
+        under = np.where(self._full, low, -np.inf) - found.qpos
+        back = turn * (np.ceil(np.maximum(under, 0) / turn) - np.ceil(np.maximum(over, 0) / turn))
+        past = back.any(axis=1)
+        if past.any():  # what a turn and the limits leave out is within the tolerance, or is searched again
+            within = self.solve(goal[past], np.clip(found.qpos[past] + back[past], low, high))
+            for whole, part in zip(
+                found, within._replace(iterations=within.iterations + found.iterations[past]), strict=True
+            ):
+                whole[past] = part
+        return found
+
+    def solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64] | None = None) -> IKResult:
+        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``, by default the tree's."""
+        limits = limits or self._limits
+        found = native_rows.search(
+            self._tree, self._index, self._point, limits, goal, qpos, self._tolerance, self._iterations
+        )
         if found is None:
-            found = self._solve(goal, qpos)
+            found = self._solve(goal, qpos, limits)
         nearest, lengths, steps = found
         near, start = lengths <= self._tolerance, np.zeros(len(goal), np.intp)
         success, count = near[:, 0] & near[:, 1], steps[:, 0].astype(np.intp)
         return IKResult(nearest, lengths[:, 0], lengths[:, 1], success, start, count)
 
-    def _solve(self, goal: Float64, qpos: Float64) -> list[Float64]:
+    def _solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]) -> list[Float64]:
         """Compute the results of :func:`native_rows.search` in NumPy."""
         count = len(goal)
         nearest, lengths, steps = [qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1))]
@@ -173,7 +198,7 @@ class _Search:
             rows = going[better]
             nearest[rows], lengths[rows], steps[rows] = q[better], found[better], step
             stay = ~(found <= self._tolerance).all(1)
-            going, q = going[stay], _stepped(self._tree, at, q, error)[stay]
+            going, q = going[stay], _stepped(limits, at, q, error)[stay]
             if not len(going):
                 break
         return [nearest, lengths, steps]
@@ -194,7 +219,7 @@ class _At:
         return rate_at(self._tree, velocities_of(self._tree, self._motions, qvel, np), self._index, self._place)
 
 
-def _stepped(tree: KinematicTree, at: _At, qpos: Float64, error: Float64) -> Float64:
+def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Float64) -> Float64:
     """Return the positions (n, dof) after a step within the limits."""
     damping = _DAMPING + _DAMPING_PER_ERROR * (error * error).sum(-1)[:, None, None] / 2
     free, move = np.ones(qpos.shape, bool), np.zeros_like(qpos)
@@ -203,7 +228,7 @@ def _stepped(tree: KinematicTree, at: _At, qpos: Float64, error: Float64) -> Flo
         rest = error - product(at.jacobian, np.where(free, 0.0, move))
         move = np.where(free, _damped(part, damping, rest), move)
         target = qpos + move
-        within = np.clip(target, tree.lower, tree.upper)
+        within = np.clip(target, *limits)
         beyond = free & (target != within)
         move, free = np.where(beyond, within - qpos, move), free & ~beyond
         if not beyond.any():
@@ -211,7 +236,7 @@ def _stepped(tree: KinematicTree, at: _At, qpos: Float64, error: Float64) -> Flo
     acceleration = -_damped(part, damping, at.rate(move))
     size, most = (np.sqrt((x * x).sum(-1, keepdims=True)) for x in (acceleration, _LARGEST_ACCELERATION * move))
     share = np.where(size > most, most / size, 1.0) / 2
-    return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), tree.lower, tree.upper)
+    return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *limits)
 
 
 def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, LAW
+from batchpid.native.task_space_extension import DECOUPLING, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients
@@ -30,29 +30,52 @@ def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tupl
     native = native_rows.for_rows(qpos, *arrays)
     if native is None:
         return None
-    (rows, dof), sizes = qpos.shape, _SIZES
-    found = {name: np.empty((rows, sizes.get(name, dof))) for name in wanted}
-    native_rows.call(native.law, rows, dof, *_kind(k), *arrays, *map(found.get, _RESULTS))
+    found = _empty(qpos.shape, wanted)
+    native_rows.call(native.law, *qpos.shape, *_kind(k), *arrays, *map(found.get, _RESULTS))
+    return list(found.values())
+
+
+def step(
+    tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, inputs: tuple[Any, ...], wanted: tuple[str, ...]
+) -> list[Float64] | None:
+    """Return the results of :func:`law` with the dynamics of ``tree``: a ``point`` (3,) of ``link`` is the tool."""
+    qpos = inputs[1]
+    if (native := native_rows.for_rows(qpos, *inputs, *k[:-2], point)) is None:
+        return None
+    found = _empty(qpos.shape, wanted)
+    fixed, chain = _of_tree(native, tree, link, point, len(qpos), k)
+    native_rows.call(native.step, *fixed, *[None] * 5, chain, *inputs, *k[:-2], *map(found.get, _RESULTS))
     return list(found.values())
 
 
 def bind(
     tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
-    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs a step of the law on them.
+    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`step` on them.
 
-    ``arrays`` are contiguous float64 arrays by their names in LAW, with ``bias`` among them. The tool is at a ``point``
-    (3,) of ``link``, by default at its origin. The result is None where native code is not used.
+    ``arrays`` are contiguous float64 arrays by their names in LAW; without ``bias`` it is the tree's. The tool is at a
+    ``point`` (3,) of ``link``, by default at its origin. The result is None where native code is not used.
     """
     if (native := native_rows.in_use()) is None:
         return None
-    own, index, (rows, dof) = native_rows.native_tree(native, tree), tree.index(link), arrays["qpos"].shape
+    fixed, chain = _of_tree(native, tree, link, point, len(arrays["qpos"]), k)
+    known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, "chain": chain}
+    return native.bind(*fixed, *map(known.get, LAW))
+
+
+def _of_tree(
+    native: Any, tree: KinematicTree, link: str, point: Any, rows: int, k: OSCCoefficients
+) -> tuple[tuple[Any, ...], Float64]:
+    """Return the arguments of ``step`` and ``bind`` before the arrays of the law, and the chain to the tool (dof,)."""
+    own, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
-    dynamics = native_rows.empty(("pose", "jacobian", "jacobian_rate", "mass_matrix"), (rows,), dof)
-    fixed = {"tool": native_rows.tool(own, index, point), "chain": np.array(tree.chains[body], np.float64)}
-    known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, **dynamics, **fixed}
-    motion = [None if name == "bias" else known[name] for name in KINEMATICS]
-    return native.bind(own.tree, body, rows, *_kind(k), *motion, *map(known.get, LAW))
+    fixed = own.tree, body, rows, native_rows.tool(own, index, point), *_kind(k)
+    return fixed, np.array(tree.chains[body], np.float64)
+
+
+def _empty(shape: tuple[int, int], wanted: tuple[str, ...]) -> dict[str, Float64]:
+    """Return arrays for the results ``wanted``."""
+    return {name: np.empty((shape[0], _SIZES.get(name, shape[1]))) for name in wanted}
 
 
 def _kind(k: OSCCoefficients) -> tuple[int, bool]:

@@ -83,9 +83,17 @@ def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[s
 
 
 def search(
-    tree: KinematicTree, index: int, point: Any, goal: Any, start: Any, tolerance: Any, iterations: int
+    tree: KinematicTree,
+    index: int,
+    point: Any,
+    limits: tuple[Float64, Float64],
+    goal: Any,
+    start: Any,
+    tolerance: Any,
+    iterations: int,
 ) -> list[Float64] | None:
-    """Search, from ``start`` (n, dof), for joint positions that bring a tool to the poses ``goal`` (n, 7).
+    """Search, from ``start`` (n, dof), for joint positions within ``limits`` (dof,) that bring a tool to the poses
+    ``goal`` (n, 7).
 
     Return the nearest positions (n, dof), their errors (n, 2) and their numbers of steps (n, 1). The tool is at a
     ``point`` (3,) of the link ``index``; ``tolerance`` is (2,).
@@ -94,8 +102,7 @@ def search(
         return None
     own, rows = native_tree(native, tree), len(start)
     found = [start.copy(), np.full((rows, 2), np.inf), np.zeros((rows, 1))]
-    limits = np.atleast_2d(tree.lower), np.atleast_2d(tree.upper)
-    arrays = goal, tool(own, index, point), *limits, tolerance[None]
+    arrays = goal, tool(own, index, point), *(limit[None] for limit in limits), tolerance[None]
     call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
     return found
 

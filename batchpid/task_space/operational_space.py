@@ -37,6 +37,8 @@ IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +53,7 @@ from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
 from batchpid.task_space.projections import Projections, projections
 from batchpid.task_space.symmetric import product, quiet
+from batchpid.task_space.tree_kinematics import prepared, read_point
 
 
 def init(params: OSCParams, qpos: Any) -> OSCState:
@@ -113,8 +116,10 @@ def step(
     """
     inputs = {"twist": twist, "acceleration": acceleration, "wrench": wrench, "feedforward": feedforward}
     _check_shapes(params, tree, setpoint, qpos, **inputs)
-    dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
-    return advance(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, **inputs)
+    k, tool = discretise(params, dt), (tree, link, point)
+    if (found := _native_step(k, state, tool, setpoint, qpos, qvel, ("effort",), **inputs)) is not None:
+        return found[0], found[1][0]
+    return advance(k, state, setpoint, qpos, qvel, task_dynamics(tree, qpos, qvel, link, point=point), **inputs)
 
 
 def step_terms(
@@ -132,8 +137,11 @@ def step_terms(
 ) -> tuple[OSCState, OSCTerms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
     _check_shapes(params, tree, setpoint, qpos, **inputs)
+    k, tool = discretise(params, dt), (tree, link, point)
+    if (found := _native_step(k, state, tool, setpoint, qpos, qvel, _TERMS, **inputs)) is not None:
+        return found[0], _terms(found[1])
     dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
-    return advance_terms(discretise(params, dt), state, setpoint, qpos, qvel, dynamics, **inputs)
+    return advance_terms(k, state, setpoint, qpos, qvel, dynamics, **inputs)
 
 
 def advance(
@@ -150,7 +158,7 @@ def advance(
 ) -> tuple[OSCState, Any]:
     """Advance the law with given coefficients and dynamics, such as an engine's; otherwise as :func:`step`."""
     inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
-    if (found := _native(k, state, dynamics, inputs, ("effort",))) is not None:
+    if (found := _native(state, partial(native_law.law, k, dynamics), inputs, ("effort",))) is not None:
         return found[0], found[1][0]
     with quiet():
         sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
@@ -172,9 +180,8 @@ def advance_terms(
 ) -> tuple[OSCState, OSCTerms]:
     """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
     inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
-    if (found := _native(k, state, dynamics, inputs, _TERMS)) is not None:
-        state, (error, force, task, posture, whole, effort, s1, s2, near) = found
-        return state, OSCTerms(error, force, task, posture, whole, effort, s1[:, 0], s2[:, 0], near[:, 0] > 0)
+    if (found := _native(state, partial(native_law.law, k, dynamics), inputs, _TERMS)) is not None:
+        return found[0], _terms(found[1])
     with quiet():
         sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
         effort, whole, s1, s2 = _saturated(*sums.parts)
@@ -190,13 +197,41 @@ _TERMS = (
 )
 
 
+def _terms(results: list[Any]) -> OSCTerms:
+    """Return the terms of the results _TERMS of native code."""
+    *arrays, s1, s2, near = results
+    return OSCTerms._make([*arrays, s1[:, 0], s2[:, 0], near[:, 0] > 0])
+
+
+def _native_step(
+    k: OSCCoefficients,
+    state: OSCState,
+    tool: tuple[KinematicTree, str, Any],
+    setpoint: Any,
+    qpos: Any,
+    qvel: Any,
+    wanted: tuple[str, ...],
+    twist: Any = None,
+    acceleration: Any = None,
+    wrench: Any = None,
+    feedforward: Any = None,
+) -> tuple[OSCState, list[Any]] | None:
+    """Return the results of :func:`_native` with the dynamics of a tree, computed in the same call."""
+    tree, link, point = tool
+    (q, v), _, _ = prepared(tree, qpos=qpos, qvel=qvel)
+    native = partial(native_law.step, tree, link, read_point(q, point), k)
+    return _native(state, native, (setpoint, q, v, twist, acceleration, wrench, feedforward), wanted)
+
+
 def _native(
-    k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics, inputs: tuple[Any, ...], wanted: tuple[str, ...]
+    state: OSCState,
+    native: Callable[[tuple[Any, ...], tuple[str, ...]], list[Any] | None],
+    inputs: tuple[Any, ...],
+    wanted: tuple[str, ...],
 ) -> tuple[OSCState, list[Any]] | None:
     """Return the state after a step in native code and the results ``wanted``; None where native code is not used."""
     arrays, wanted = (*inputs, None, None, *state), wanted if state.integral is None else (*wanted, "next_integral")
-    found = native_law.law(k, dynamics, arrays, wanted)
-    if found is None:
+    if (found := native(arrays, wanted)) is None:
         return None
     return (state, found) if state.integral is None else (state._replace(integral=found.pop()), found)
 

@@ -159,7 +159,8 @@ class Model(NamedTuple):
     law: Callable[..., Any] = PIDLaw.advance
     """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
     controller: Any = None
-    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort)."""
+    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and, if it limits efforts
+    itself, the mask of joints with limited efforts."""
     noise: Any = None
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
     stages: Stages = STAGES
@@ -298,9 +299,12 @@ def _custom(layout: Layout, constants: Constants, state: StepState, given: Input
     """qf = sat(effort of the caller's own controller). The feedforward is an input of the controller."""
     seen = given.seen
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    law, returned = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
+    law, returned, *limited = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
     total = returned if constants.coupling is None else constants.coupling.efforts(returned)
-    return state._replace(law=law), _saturated(constants, total, given)._replace(returned=returned)
+    outputs = _saturated(constants, total, given)._replace(returned=returned)
+    if limited and outputs.saturated is not None:
+        outputs = outputs._replace(saturated=outputs.saturated | limited[0])
+    return state._replace(law=law), outputs
 
 
 _CONTROLS: dict[str, Callable[..., tuple[StepState, Outputs]]] = {

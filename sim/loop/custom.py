@@ -28,6 +28,7 @@ class OwnController:
     def __init__(self, options: RunnerOptions) -> None:
         assert not isinstance(options.control, str)
         self._options, self._controller = options, options.control
+        self._call = getattr(options.control, "reporting", None) or options.control
         self._structure: Any = None
         self._like: dict[str, Any] = {}
 
@@ -56,19 +57,22 @@ class OwnController:
             leaf[mask] = fresh[name][mask]
         return rows
 
-    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[dict[str, Any], Float64]:
+    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Any, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
+
+        A controller that limits efforts itself may have a call ``reporting``, whose third result are the joints with
+        limited efforts (M, dof).
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape or dtype.
         """
         own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
-        new, wanted = self._controller(unflatten(self._structure, state), *own)
+        new, wanted, *limited = self._call(unflatten(self._structure, state), *own)
         leaves = _like(state, flatten(new, read=np.array))
         effort = np.array(wanted, np.float64)
         _check_effort(effort, inputs[1])
-        return leaves, effort
+        return leaves, effort, *limited
 
-    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[dict[str, Any], Any]:
+    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Any, ...]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
         Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a state of a wrong
@@ -78,7 +82,7 @@ class OwnController:
 
         qpos = inputs[1]
         try:
-            state, wanted = self._controller(unflatten(self._structure, leaves), *inputs)
+            state, wanted, *limited = self._call(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
             effort = jax.numpy.asarray(wanted, qpos.dtype)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
@@ -88,7 +92,7 @@ class OwnController:
                 remedy="write it in jax.numpy, or use backend='numpy'",
             ) from error
         _check_effort(effort, qpos)
-        return new, effort
+        return new, effort, *limited
 
 
 def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:

@@ -79,7 +79,8 @@ class TickProgram:
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
         if self._control is not None:
             fixed = fixed._replace(law=None)
-        inputs = (fixed, self.command, self.measured, self._seen, self.outputs.returned)
+        limited = None if self._control is None else self._control.limited
+        inputs = (fixed, self.command, self.measured, self._seen, self.outputs.returned, limited)
         traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
@@ -196,14 +197,16 @@ class TickProgram:
 def _trace(layout: Layout, *structures: Any) -> Trace:
     """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
 
-    ``structures`` describe constants, state, command, reading, measured positions and velocities, and the effort of a
-    controller. No update of mass matrix or friction is due.
+    ``structures`` describe constants, state, command, reading, measured positions and velocities, and of a controller
+    the effort and the joints where it is limited. No update of mass matrix or friction is due.
     """
 
     def function(*symbols: Symbol) -> list[Any]:
         given = iter(symbols)
-        k, before, command, measured, seen, effort = (filled(each, given) for each in structures)
-        model = Model(when=lambda due, function, otherwise: otherwise, controller=lambda law, *_: (law, effort))
+        k, before, command, measured, seen, effort, limited = (filled(each, given) for each in structures)
+        model = Model(when=lambda due, function, otherwise: otherwise)
+        if limited is not None:
+            model = model._replace(controller=lambda law, *_: (law, effort, limited > 0))
         if seen is not None:
             model = model._replace(measure=lambda k, motors, *_: (motors, *seen))
         rubs = k.friction.coulomb is not None

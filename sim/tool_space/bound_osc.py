@@ -22,6 +22,8 @@ class BoundOSC:
         Arrays of the state by name; a call updates the integral in place.
     effort
         Efforts of the last call (envs, dof).
+    limited
+        1 for joints whose effort the limits have changed in the last call, else 0 (envs, dof).
     address
         Address of the call: ``control`` of :class:`batchpid.sim.engine.native.interface.Tick`.
     """
@@ -44,12 +46,13 @@ class BoundOSC:
         self.state = {"posture": np.zeros_like(qpos)}
         if k.ki_dt is not None:
             self.state["integral"] = np.zeros((rows, 6))
-        self.effort = np.zeros_like(qpos)
+        self.effort, self.limited = np.zeros((2, *qpos.shape))
         integral, known = (
             self.state.get("integral"),
             dict[str, Any](zip(("qpos", "qvel", "bias"), reading, strict=True)),
         )
         known |= {"posture": self._posture, "integral": integral, "next_integral": integral, "effort": self.effort}
+        known["limited"] = self.limited
         if damping is not None:
             known |= {"damping": damping, "added_inertia": timestep * damping}
         tree, link, point = tool

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -178,6 +178,16 @@ class OperationalSpace:
 
     def __call__(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any]:
         """Return the state and the efforts (envs, dof) [N m or N]."""
+        return self._advance(state, setpoint, qpos, qvel, passive)[:2]
+
+    @property
+    def reporting(self) -> Callable[..., tuple[Any, Any, Any]] | None:
+        """Call that also returns the joints (envs, dof) whose effort the limits have changed; None in a subclass with a
+        call of its own.
+        """
+        return self._advance if type(self).__call__ is OperationalSpace.__call__ else None
+
+    def _advance(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any, Any]:
         xp = namespace(setpoint, qpos)
         aimed = state
         if self._columns.any():
@@ -192,8 +202,8 @@ class OperationalSpace:
             friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture - qpos, dynamics)
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
-        new, effort = ts.advance(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
-        return new._replace(posture=state.posture), effort
+        new, terms = ts.advance_terms(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
+        return new._replace(posture=state.posture), terms.effort, terms.effort != terms.unsaturated
 
     @property
     def is_native(self) -> bool:

@@ -87,3 +87,32 @@ def serial() -> KinematicTree:
         lower=-3.0,
         upper=3.0,
     )
+
+
+def offset_wrist() -> KinematicTree:
+    """Return a massless arm of six joints with three parallel axes, an offset wrist, and a full turn of each joint."""
+    return KinematicTree(
+        links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
+        parent=np.arange(-1, 7),
+        joint_types=("fixed", *["revolute"] * 6, "fixed"),
+        joint_names=tuple(f"joint{n}" for n in range(1, 7)),
+        position=np.array(
+            [
+                [0, 0, 0],
+                [0, 0, 0.15],
+                [0, 0.12, 0],
+                [0, -0.09, 0.24],
+                [0, 0, 0.21],
+                [0, 0.08, 0],
+                [0, 0, 0.08],
+                [0, 0.08, 0],
+            ]
+        ),
+        wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (8, 1)),
+        axis=np.array([[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], float),
+        mass=np.zeros(8),
+        center=np.zeros((8, 3)),
+        inertia=np.zeros((8, 3, 3)),
+        lower=-3.14159265,
+        upper=3.14159265,
+    )

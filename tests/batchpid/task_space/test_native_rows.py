@@ -186,3 +186,27 @@ def test_a_stale_extension_is_a_warning_and_numpy_computes():
     finally:
         native_rows._extension.cache_clear()
     assert native_rows.in_use() is not None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_with_a_tree_has_the_bytes_of_its_two_parts(seed):
+    tree, link, rng = tree_of("panda"), tool_of("panda"), np.random.default_rng(seed)
+    qpos, qvel = states(tree, 6, seed)
+    params = ts.make_osc_params(tree, effort_limit=60.0, frame=("world", "tool")[seed % 2])
+    state, dt, point = ts.init(params, qpos), 1 / 500, rng.normal(size=3)
+    goal = ts.link_poses(tree, qpos, [link])[:, 0] + 0.1 * rng.normal(size=(6, 7))
+    _, effort = ts.step(params, state, goal, qpos, qvel, dt, tree=tree, link=link, point=point)
+    dynamics = ts.task_dynamics(tree, qpos, qvel, link, point=point)
+    _, terms = ts.advance_terms(ts.discretise(params, dt), state, goal, qpos, qvel, dynamics)
+    np.testing.assert_array_equal(effort, terms.effort)
+
+
+@given(st.lists(st.floats(0.0, np.pi) | st.floats(0.0, 1e-3), min_size=1, max_size=9))
+def test_rotation_errors_are_exact_to_the_last_bits(angles):
+    angle, zero = np.array(angles), np.zeros(len(angles))
+    tree = planar((1.0,))
+    params = ts.make_osc_params(tree)
+    goal = np.stack([zero, zero, zero, np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1)
+    at = zero[:, None]
+    _, terms = ts.step_terms(params, ts.init(params, at), goal, at, at, 1 / 500, tree=tree, link="tip")
+    np.testing.assert_allclose(np.abs(terms.error[:, 5]), angle, rtol=2e-15, atol=1e-300)

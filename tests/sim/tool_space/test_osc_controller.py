@@ -329,3 +329,20 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
     for native, called in zip(*seen, strict=True):
         np.testing.assert_array_equal(native, called)
     assert np.flatnonzero(~seen[0][-1].all(0)).tolist() == [3]
+
+
+@pytest.mark.quick_rows(2)
+@pytest.mark.parametrize("kind", [OperationalSpace, Called])
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
+    """The law scales its efforts to the limits, so that the runner has nothing to clip."""
+    if backend == "jax":
+        pytest.importorskip("jax")
+    control = kind(panda, HAND, effort_limit=np.where(np.arange(9) < 7, 30.0, 100.0))
+    goals = np.tile(control.command.neutral, (4, 2, 1))
+    goals[:, 1, 2] += 0.3
+    with Runner(panda, 2, control=control, compensate="gravity", backend=backend, **OPTIONS) as runner:
+        rollout = runner.rollout(goals)
+    assert not rollout.saturated[:, 0].any()
+    assert rollout.saturated[0, 1, :7].any()
+    assert not rollout.saturated[0, 1, 7:].any()

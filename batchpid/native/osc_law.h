@@ -1,0 +1,361 @@
+// Law of operational-space control for WIDTH robots. The equations stand in batchpid/task_space: operational_space.py and
+// projections.py.
+
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "batchpid/native/lanes.h"
+#include "batchpid/native/mobility.h"
+#include "batchpid/native/tables.h"
+#include "batchpid/native/tool.h"
+#include "batchpid/native/tool_dynamics.h"
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+enum Decoupling { FULL, PARTIAL, NONE };
+
+// Arrays of `law`: LAW in task_space_extension.py.
+enum Law {
+  TASK_POSE,
+  TASK_JACOBIAN,
+  TASK_RATE,
+  TASK_MASS,
+  TASK_BIAS,
+  CHAIN,
+  SETPOINT,
+  LAW_QPOS,
+  LAW_QVEL,
+  TWIST,
+  ACCELERATION,
+  WRENCH,
+  FEEDFORWARD,
+  DAMPING,
+  ADDED_INERTIA,
+  POSTURE,
+  INTEGRAL,
+  KP,  // coefficients: fields of OSCCoefficients
+  KD,
+  C,
+  ACCELERATION_SHARE,
+  KI_DT,
+  KI_DT2,
+  POSTURE_KP,
+  POSTURE_KD,
+  LIMIT_KP,
+  LIMIT_KD,
+  LIMIT_MARGIN,
+  LIMIT_LOW,
+  LIMIT_HIGH,
+  INTEGRAL_LIMIT,
+  POSITION_LIMIT,
+  ROTATION_LIMIT,
+  SMALLEST,
+  SELECTED,
+  FORCE_AXES,
+  EFFORT_MIN,
+  EFFORT_MAX,
+  EFFORT,  // results
+  NEXT_INTEGRAL,
+  LIMITED,
+  TASK_ERROR,
+  FORCE,
+  TASK_EFFORT,
+  POSTURE_EFFORT,
+  UNSATURATED,
+  TASK_SHARE,
+  POSTURE_SHARE,
+  NEAR_SINGULAR,
+  LAW
+};
+
+inline Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size) {
+  Lanes sum{};
+  for (std::int64_t k = 0; k < size; ++k) sum += row[k] * vector[k];
+  return sum;
+}
+
+// Inputs of a law for WIDTH rows. A row that stands for all is loaded once.
+class Given {
+ public:
+  explicit Given(Tables const &table) : table_(table) {
+    std::size_t size = 0;
+    for (int i = 0; i < EFFORT; ++i) size += table[i] ? static_cast<std::size_t>(table[i].columns) : 0;
+    of_.resize(size);
+    Lanes *next = of_.data();
+    for (int i = 0; i < EFFORT; ++i) {
+      if (!table[i]) continue;
+      at_[i] = next;
+      next += table[i].columns;
+      if (table[i].rows == 1) {
+        table[i].load(0, at_[i]);
+      } else {
+        each_.push_back(i);
+      }
+    }
+  }
+  void load(std::int64_t first) {
+    for (int const i : each_) table_[i].load(first, at_[i]);
+  }
+  void set(int i, Lanes *columns) { at_[i] = columns; }
+  // The columns of an array; null if it is left out.
+  Lanes *operator[](int i) const { return at_[i]; }
+
+ private:
+  Tables const &table_;
+  Lanes *at_[EFFORT] = {};
+  std::vector<int> each_;
+  std::vector<Lanes> of_;
+};
+
+// Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
+inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
+                          Lanes const *high) {
+  Lanes const infinite = std::numeric_limits<double>::infinity();
+  Lanes share = 1.0;
+  for (std::int64_t i = 0; i < dof; ++i) {
+    Lanes const least = low == nullptr ? -infinite : low[i], most = high == nullptr ? infinite : high[i];
+    Lanes const able = at_least_mask(base[i], least) * at_least_mask(most, base[i]);
+    Lanes const room = at_least(where_positive(effort[i], most - at[i], at[i] - least), 0.0);
+    Lanes const size = absolute(effort[i]);
+    Lanes const limited = where_positive(size - room, able, Lanes{});
+    if (!any_positive(limited)) continue;
+    share = at_most(where_positive(limited, room / where_positive(limited, size, 1.0), 1.0), share);
+  }
+  return share;
+}
+
+// A law on arrays of some robots; `dynamics`, where it is given, has the arrays of the task that are left out.
+class OSCLaw {
+ public:
+  OSCLaw(std::int64_t dof, Decoupling decoupling, bool in_tool_axes, Tables const &table,
+         ToolDynamics *dynamics = nullptr)
+      : dof_(dof), decoupling_(decoupling), in_tool_axes_(in_tool_axes), table_(table), given_(table) {
+    for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain_ : others_).push_back(i);
+    auto const n = static_cast<std::size_t>(dof), links = chain_.size();
+    factor_.resize(links * links);
+    white_.resize(links * AXES);
+    both_.resize(links * 2);
+    for (auto *leaf : {&a_n_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_}) {
+      leaf->resize(n);
+    }
+    if (dynamics == nullptr) return;
+    given_.set(TASK_POSE, dynamics->pose);
+    given_.set(TASK_JACOBIAN, dynamics->jacobian.data());
+    given_.set(TASK_RATE, dynamics->rate);
+    given_.set(TASK_MASS, dynamics->mass.data());
+    if (!table[TASK_BIAS]) given_.set(TASK_BIAS, dynamics->bias.data());
+  }
+
+  // Load WIDTH rows.
+  void load(std::int64_t first) { given_.load(first); }
+  Lanes const *qpos() const { return given_[LAW_QPOS]; }
+  Lanes const *qvel() const { return given_[LAW_QVEL]; }
+
+  // Write the results of the rows loaded.
+  void advance(std::int64_t first) {
+    for (std::int64_t i = 0; i < dof_ && given_[ADDED_INERTIA] != nullptr; ++i) {
+      given_[TASK_MASS][i * dof_ + i] += given_[ADDED_INERTIA][i];
+    }
+    set_accelerations();
+    set_inertias();
+    set_efforts();
+    saturate(first);
+  }
+
+ private:
+  std::int64_t links() const { return static_cast<std::int64_t>(chain_.size()); }
+
+  // Set error, a and a_n.
+  void set_accelerations() {
+    Lanes *jacobian = given_[TASK_JACOBIAN], *rate = given_[TASK_RATE];
+    Lanes const *qpos = given_[LAW_QPOS], *qvel = given_[LAW_QVEL];
+    Lanes const *target = given_[TWIST], *target_rate = given_[ACCELERATION];
+    Lanes twist[AXES];
+    write_error(given_[SETPOINT], given_[TASK_POSE], error_);
+    for (int half = 0; half < AXES; half += 3) {
+      Lanes const *e = error_ + half, length = length_of(e);
+      Lanes const limit = *given_[half == 0 ? POSITION_LIMIT : ROTATION_LIMIT];
+      Lanes const scale = where_positive(length - limit, limit / length, 1.0);
+      for (int k = 0; k < 3; ++k) near_error_[half + k] = scale * e[k];
+    }
+    std::fill(twist, twist + AXES, Lanes{});
+    for (std::int64_t const j : chain_) {  // J q'
+      for (int axis = 0; axis < AXES; ++axis) twist[axis] += jacobian[axis * dof_ + j] * qvel[j];
+    }
+    if (in_tool_axes_) {
+      Turn const turn(given_[TASK_POSE] + 3);
+      if (target != nullptr) target = std::copy(target, target + AXES, turned_[0]) - AXES;
+      if (target_rate != nullptr) target_rate = std::copy(target_rate, target_rate + AXES, turned_[1]) - AXES;
+      for (Lanes *vector : {error_, near_error_, twist, rate, turned_[0], turned_[1]}) turn.reverse(vector, 1);
+      for (std::int64_t const j : chain_) turn.reverse(jacobian + j, dof_);
+    }
+    target_ = target;
+    for (int axis = 0; axis < AXES; ++axis) {
+      a_[axis] = given_[KP][axis] * near_error_[axis] - given_[KD][axis] * twist[axis];
+      if (target != nullptr) a_[axis] += given_[C][axis] * target[axis];
+      if (target_rate != nullptr) a_[axis] += given_[ACCELERATION_SHARE][axis] * target_rate[axis];
+      if (given_[INTEGRAL] != nullptr) a_[axis] += given_[INTEGRAL][axis];
+    }
+    for (std::int64_t j = 0; j < dof_; ++j) {
+      a_n_[j] = given_[POSTURE_KP][j] * (given_[POSTURE][j] - qpos[j]) - given_[POSTURE_KD][j] * qvel[j];
+      if (given_[LIMIT_KP] == nullptr) continue;
+      Lanes const low = given_[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LIMIT_HIGH][j];
+      Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0), within = absolute(depth);
+      if (!any_positive(within)) continue;
+      Lanes const damped = given_[LIMIT_KD][j] * qvel[j] * within / given_[LIMIT_MARGIN][j];
+      Lanes const pushed = a_n_[j] + given_[CHAIN][j] * (given_[LIMIT_KP][j] * depth - damped);
+      a_n_[j] = where_positive(within, pushed, a_n_[j]);
+    }
+  }
+
+  // Set the factor of M_cc, L and L_n.
+  void set_inertias() {
+    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS], *axes = given_[SELECTED];
+    std::int64_t const size = links();
+    for (std::int64_t i = 0; i < size; ++i) {
+      for (std::int64_t j = 0; j <= i; ++j) factor_[i * size + j] = mass[chain_[i] * dof_ + chain_[j]];
+      for (int axis = 0; axis < AXES; ++axis) white_[i * AXES + axis] = jacobian[axis * dof_ + chain_[i]];
+    }
+    factorize(size, factor_.data());
+    solve_lower<AXES>(size, factor_.data(), white_.data());  // L^-1 J^T, with M_cc = L D L^T
+    Lanes mobility[AXES * AXES], allowed[AXES];
+    for (std::int64_t i = 0; i < size; ++i) {
+      Lanes const *row = &white_[i * AXES], inverse = factor_[i * size + i];
+      for (int a = 0; a < AXES; ++a) {
+        Lanes const part = inverse * row[a];
+        for (int b = 0; b <= a; ++b) mobility[a * AXES + b] += part * row[b];
+      }
+    }
+    for (int a = 0; a < AXES; ++a) {
+      for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
+    }
+    bool const force_too = axes != nullptr && given_[FORCE_AXES] != nullptr;
+    for (int axis = 0; axis < AXES && axes != nullptr; ++axis) {
+      allowed[axis] = force_too ? at_least(axes[axis], given_[FORCE_AXES][axis]) : axes[axis];
+    }
+    Lanes const s0 = *given_[SMALLEST];
+    near_ = {};
+    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_);
+    inertia_ = null_inertia_;
+    if (decoupling_ != PARTIAL && !(decoupling_ == FULL && force_too)) return;
+    for (int i = 0; i < AXES && decoupling_ == PARTIAL; ++i) {
+      for (int j = 0; j < AXES; ++j) {
+        if ((i < 3) != (j < 3)) mobility[i * AXES + j] = mobility[i * AXES + j] * 0.0;
+      }
+    }
+    selected_inverse(mobility, axes, s0, task_inertia_, near_);
+    inertia_ = task_inertia_;
+  }
+
+  // Set the efforts of base, task and posture.
+  void set_efforts() {
+    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS], *axes = given_[SELECTED];
+    Lanes moved[AXES], pulled[AXES];
+    for (int axis = 0; axis < AXES; ++axis) {
+      moved[axis] = decoupling_ == NONE ? a_[axis] : a_[axis] - given_[TASK_RATE][axis];
+    }
+    for (std::int64_t const i : chain_) {  // J a_n of the chain
+      for (int axis = 0; axis < AXES; ++axis) pulled[axis] += jacobian[axis * dof_ + i] * a_n_[i];
+    }
+    Lanes drop[AXES];
+    for (int axis = 0; axis < AXES; ++axis) {
+      force_[axis] = decoupling_ != NONE ? along(inertia_ + axis * AXES, moved, AXES)
+                     : axes != nullptr   ? axes[axis] * moved[axis]
+                                         : moved[axis];
+      if (given_[WRENCH] != nullptr) force_[axis] += given_[WRENCH][axis];
+      drop[axis] = along(null_inertia_ + axis * AXES, pulled, AXES);
+    }
+    for (std::size_t c = 0; c < chain_.size(); ++c) {
+      std::int64_t const i = chain_[c];
+      Lanes x{}, y{};
+      for (int axis = 0; axis < AXES; ++axis) {
+        x += jacobian[axis * dof_ + i] * force_[axis];
+        y -= jacobian[axis * dof_ + i] * drop[axis];
+      }
+      for (std::int64_t const j : chain_) y += mass[i * dof_ + j] * a_n_[j];
+      task_[i] = both_[2 * c] = x;
+      posture_[i] = both_[2 * c + 1] = y;
+    }
+    for (std::int64_t i = 0; i < dof_; ++i) {
+      Lanes sum = given_[TASK_BIAS][i];
+      for (std::int64_t const j : others_) sum += mass[i * dof_ + j] * a_n_[j];
+      if (given_[FEEDFORWARD] != nullptr) sum += given_[FEEDFORWARD][i];
+      if (given_[DAMPING] != nullptr) sum += given_[DAMPING][i] * given_[LAW_QVEL][i];
+      base_[i] = sum;
+    }
+    if (others_.empty()) return;
+    solve_both<2>(links(), factor_.data(), both_.data());  // M_oc M_cc^-1 of task and posture
+    for (std::int64_t const i : others_) {
+      Lanes x{}, y{};
+      for (std::size_t c = 0; c < chain_.size(); ++c) {
+        x += mass[i * dof_ + chain_[c]] * both_[2 * c];
+        y += mass[i * dof_ + chain_[c]] * both_[2 * c + 1];
+      }
+      of_task_[i] = x;
+      of_posture_[i] = y;
+    }
+  }
+
+  // Write the results: efforts within their limits, and the integral.
+  void saturate(std::int64_t first) {
+    Lanes const *low = given_[EFFORT_MIN], *high = given_[EFFORT_MAX], *integral = given_[INTEGRAL];
+    Lanes const s1 = share_within(dof_, task_.data(), base_.data(), base_.data(), low, high);
+    for (std::int64_t i = 0; i < dof_; ++i) effort_[i] = base_[i] + s1 * task_[i];
+    Lanes const s2 = share_within(dof_, posture_.data(), effort_.data(), base_.data(), low, high);
+    Lanes held = near_;
+    for (std::int64_t i = 0; i < dof_; ++i) {
+      Lanes const rest = s1 * of_task_[i] + s2 * of_posture_[i];
+      whole_[i] = base_[i] + task_[i] + posture_[i] + rest;
+      Lanes sum = effort_[i] + s2 * posture_[i] + rest;
+      if (low != nullptr) sum = at_least(sum, low[i]);
+      if (high != nullptr) sum = at_most(sum, high[i]);
+      effort_[i] = sum;
+      limited_[i] = differs_mask(sum, whole_[i]);
+      held = where_positive(limited_[i], 1.0, held);
+    }
+    table_[EFFORT].store(first, effort_.data());
+    if (integral != nullptr) {
+      Lanes next[AXES];
+      for (int axis = 0; axis < AXES; ++axis) {
+        next[axis] = integral[axis] + given_[KI_DT][axis] * near_error_[axis];
+        if (given_[KI_DT2] != nullptr && target_ != nullptr) next[axis] -= given_[KI_DT2][axis] * target_[axis];
+        Lanes const limit = given_[INTEGRAL_LIMIT][axis];
+        Lanes const grows = held * where_positive(a_[axis] * near_error_[axis], 1.0, 0.0);
+        next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -limit), limit));
+      }
+      table_[NEXT_INTEGRAL].store(first, next);
+    }
+    table_[LIMITED].store(first, limited_.data());
+    table_[TASK_ERROR].store(first, error_);
+    table_[FORCE].store(first, force_);
+    table_[TASK_EFFORT].store(first, task_.data());
+    table_[POSTURE_EFFORT].store(first, posture_.data());
+    table_[UNSATURATED].store(first, whole_.data());
+    table_[TASK_SHARE].store(first, &s1);
+    table_[POSTURE_SHARE].store(first, &s2);
+    table_[NEAR_SINGULAR].store(first, &near_);
+  }
+
+  std::int64_t dof_;
+  Decoupling decoupling_;
+  bool in_tool_axes_;
+  Tables const &table_;
+  Given given_;
+  std::vector<std::int64_t> chain_, others_;
+  std::vector<Lanes> factor_, white_, both_;
+  std::vector<Lanes> a_n_, base_, task_, posture_, of_task_, of_posture_;  // 0 for joints without a part in an effort
+  std::vector<Lanes> effort_, whole_, limited_;
+  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_;
+  Lanes const *target_ = nullptr;  // twist of the setpoint in the law's axes
+  Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], *inertia_ = null_inertia_;
+};
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop
