@@ -16,6 +16,7 @@ from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 class OwnController:
@@ -28,7 +29,7 @@ class OwnController:
     def __init__(self, options: RunnerOptions) -> None:
         assert not isinstance(options.control, str)
         self._options, self._controller = options, options.control
-        self._call = getattr(options.control, "reporting", None) or options.control
+        self._reporting = options.control.reporting if isinstance(options.control, OperationalSpace) else None
         self._structure: Any = None
         self._like: dict[str, Any] = {}
 
@@ -60,17 +61,22 @@ class OwnController:
     def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Any, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
 
-        A controller that limits efforts itself may have a call ``reporting``, whose third result are the joints with
-        limited efforts (M, dof).
+        Operational-space control limits efforts itself; a third result are the joints with limited efforts (M, dof).
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape or dtype.
         """
         own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
-        new, wanted, *limited = self._call(unflatten(self._structure, state), *own)
+        new, wanted, *limited = self._called(unflatten(self._structure, state), *own)
         leaves = _like(state, flatten(new, read=np.array))
         effort = np.array(wanted, np.float64)
         _check_effort(effort, inputs[1])
         return leaves, effort, *limited
+
+    def _called(self, *arguments: Any) -> tuple[Any, ...]:
+        if self._reporting is not None:
+            return self._reporting(*arguments)
+        state, effort = self._controller(*arguments)
+        return state, effort
 
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Any, ...]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
@@ -82,7 +88,7 @@ class OwnController:
 
         qpos = inputs[1]
         try:
-            state, wanted, *limited = self._call(unflatten(self._structure, leaves), *inputs)
+            state, wanted, *limited = self._called(unflatten(self._structure, leaves), *inputs)
             new = _like(leaves, flatten(state, read=jax.numpy.asarray))
             effort = jax.numpy.asarray(wanted, qpos.dtype)
         except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
