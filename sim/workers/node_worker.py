@@ -32,7 +32,8 @@ class NodeWorker(Worker):
         self._start, self._shared = start, shared
         self._arrays = Arrays.from_fields(shared.arrays)
         ticks = len(self._arrays.observation.ok)
-        self._message = pickled((cluster.pool_type, start, ticks, cluster.canonical)) if message is None else message
+        whole = cluster.pool_type, start, ticks, cluster.canonical
+        self._message = pickled(whole, start.options) if message is None else message
         self._bell = _Bell()
         self._actor: Any = None
         self._call: Future[Answer] | None = None

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,6 +30,7 @@ from batchpid.sim.engine.engines import MODULES
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.processes.background import BACKGROUND, Job
 from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
@@ -140,7 +142,7 @@ class ProcessWorker(Worker):
 
     def __init__(self, start: Start, shared: SharedArrays, message: bytes | None = None) -> None:
         self._start, self._shared = start, shared
-        self._message = pickled((start, shared.layout)) if message is None else message
+        self._message = pickled((start, shared.layout), start.options) if message is None else message
         self._name = f"worker {start.index} (envs {start.numbers.start} to {start.numbers.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
         self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
@@ -250,22 +252,30 @@ class ProcessWorker(Worker):
         return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
 
 
-def pickled(start: Any) -> bytes:
-    """Return the start request of a worker as bytes, with a ``build`` that the worker cannot import.
+def pickled(message: Any, options: RunnerOptions) -> bytes:
+    """Return the start message of a worker as bytes, with functions and classes that the worker cannot import.
 
     Raises
     ------
     InvalidArgumentError
-        It cannot be pickled.
+        One of ``options`` cannot be pickled.
     """
     try:
-        return cloudpickle.dumps(start)
+        return cloudpickle.dumps(message)
     except Exception as error:
         raise InvalidArgumentError(
-            "build",
+            next((each.name for each in fields(options) if _refuses(getattr(options, each.name))), "options"),
             f"cannot be sent to a worker process: {error}",
-            remedy="let the function use nothing that cannot be pickled, or pass workers=0",
+            remedy="let it hold nothing that cannot be pickled, or pass workers=0",
         ) from error
+
+
+def _refuses(value: Any) -> bool:
+    try:
+        cloudpickle.dumps(value)
+    except Exception:
+        return True
+    return False
 
 
 def _signal_name(number: int) -> str:

@@ -30,6 +30,9 @@ class MujocoDynamics:
         self._spec, self._robot, self._lock = spec, robot_model(spec), RLock()
         self._coupling = coupling_of(spec.joints)
 
+    def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
+        return scene_dynamics, (self._spec,)
+
     @cached_property
     def bodies(self) -> RigidBodies:
         """Bodies of the robot on a fixed base."""

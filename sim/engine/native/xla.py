@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine import native
 
 _lock = threading.Lock()
@@ -68,9 +69,18 @@ def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
 
     ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :class:`batchpid.sim.engine.rigid_body.RigidBodies`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Programs of JAX cannot call the extension.
     """
     import jax
 
+    if not (calls := status()).active:
+        problem = f"is an array of JAX, for which the mass matrix needs native calls ({calls.reason})"
+        remedy = "use batchpid.task_space.mass_matrix(robot.kinematic_tree(), qpos), or an array of NumPy"
+        raise InvalidArgumentError("qpos", problem, remedy=remedy)
     result = jax.ShapeDtypeStruct((*qpos.shape, qpos.shape[-1]), qpos.dtype)
     call = jax.ffi.ffi_call("batchpid_mass_matrix", result, vmap_method="sequential")
     return call(tree, jax.numpy.asarray(bodies, qpos.dtype), qpos)

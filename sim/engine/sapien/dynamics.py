@@ -57,7 +57,7 @@ class Dynamics:
     """
 
     def __init__(self, spec: SceneSpec, payload: float = 0.0, link: str | None = None) -> None:
-        self._spec, self._lock = spec, RLock()
+        self._spec, self._lock, self._load = spec, RLock(), (payload, link)
         self._system = new_system(replace(spec, timestep=1e-6))
         self._scene, self._robot = build_scene(spec, self._system)
         if link is not None:
@@ -74,6 +74,11 @@ class Dynamics:
         }
         # Rigid body of each link, by number; the last is the ground's (WORLD), which counts as the base.
         self._bodies = [bodies[link.name] for link in (*self._robot.links, self._robot.links[0])]
+
+    def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
+        if self._load == (0.0, None):
+            return scene_dynamics, (self._spec,)
+        return Dynamics, (self._spec, *self._load)
 
     @cached_property
     def bodies(self) -> RigidBodies:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from robots import load_bundled
@@ -46,3 +50,26 @@ def test_a_row_does_not_depend_on_the_others(panda):
     with jax.enable_x64(True):
         each = jax.vmap(panda.dynamics().mass_matrix)(jax.numpy.asarray(qpos))
     np.testing.assert_array_equal(each, whole)
+
+
+FIRST_CALL = """
+import sys
+import jax.numpy as jnp
+from batchpid.sim import Robot
+from batchpid.sim.engine import native
+
+robot = Robot.load("panda")
+if sys.argv[1:]:
+    with native.python_calls():
+        robot.dynamics().mass_matrix(jnp.zeros((2, robot.dof)))
+print(robot.dynamics().mass_matrix(jnp.zeros((2, robot.dof))).shape)
+"""
+
+
+def test_it_is_there_before_any_runner():
+    def run(*arguments):
+        command = [sys.executable, "-c", FIRST_CALL, *arguments]
+        return subprocess.run(command, env=os.environ, capture_output=True, text=True, timeout=120)
+
+    assert run().stdout == "(2, 9, 9)\n"
+    assert "batchpid.errors.InvalidArgumentError: qpos: is an array of JAX" in run("python").stderr

@@ -5,15 +5,17 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import threading
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from identical import assert_identical
+from tiny_urdf import LIMIT, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import FaultWarning, Runner, Snapshot
+from batchpid.sim import FaultWarning, Robot, Runner, Snapshot
 from batchpid.sim.loop.custom import flatten, unflatten
 from batchpid.sim.loop.faults import CAUSES
 
@@ -327,3 +329,39 @@ def test_a_state_keeps_its_dtype(panda):
         snapshot = runner.snapshot()
         runner.restore(snapshot)
     assert [snapshot.states.controller[name].dtype for name in ("steps", "count")] == [np.float64, np.int64]
+
+
+class KeepsDynamics:
+    """Computed torque, with the dynamics of the robot as an attribute from ``init`` on."""
+
+    def init(self, robot, num_envs):
+        self.dynamics = robot.dynamics()
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        acceleration = 100 * (setpoint - qpos) - 20 * qvel
+        return state, (self.dynamics.mass_matrix(qpos) * acceleration[:, None]).sum(-1) + passive
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_a_controller_that_has_run_here_can_be_sent_to_workers(panda, engine):
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
+    controller = KeepsDynamics()
+    here = rollout(panda, controller, engine=engine)
+    assert_identical(rollout(panda, controller, engine=engine, workers=2), here)
+
+
+def test_an_error_names_the_option_that_cannot_be_sent(panda):
+    controller = KeepsDynamics()
+    controller.lock = threading.Lock()
+    with pytest.raises(InvalidArgumentError, match=r"^control: cannot be sent to a worker process.* or pass workers=0"):
+        rollout(panda, controller, workers=1)
+
+
+def test_jax_controllers_of_coupled_robots_have_the_mass_matrix(tmp_path):
+    pytest.importorskip("jax")
+    follower = joint("tail", "a", "b", inner=LIMIT + '<mimic joint="lead" multiplier="-0.5"/>')
+    parts = link("base"), link("a"), link("b"), joint("lead", "base", "a"), follower
+    coupled = Robot.load(write(tmp_path, robot(*parts)))
+    here = rollout(coupled, KeepsDynamics(), backend="jax", workers=1)
+    np.testing.assert_allclose(here.qpos, rollout(coupled, KeepsDynamics()).qpos, atol=1e-6)
