@@ -563,24 +563,110 @@ PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Kinematics and law of some robots on fixed arrays.
+// Arrays of `friction`: FRICTION in task_space_extension.py.
+enum Friction {
+  AT_POSE,
+  AT_JACOBIAN,
+  ON_CHAIN,
+  GOAL_POSE,
+  GOAL_TWIST,
+  OTHERS_GOAL,
+  AT_QPOS,
+  AT_QVEL,
+  VISCOUS,
+  COULOMB,
+  BAND,
+  RUBBING,
+  FRICTION
+};
+
+// Write the efforts of damping and Coulomb friction on the way to the setpoint: OperationalSpace in osc_controller.py.
+FOR_EACH_PROCESSOR void write_friction(std::int64_t rows, std::int64_t dof, Tables const &table) {
+  constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
+  auto const n = static_cast<std::size_t>(dof);
+  std::vector<Lanes> jacobian(AXES * n), chain(n), posture(n), qpos(n), qvel(n), damping(n), coulomb(n), band(n), out(n);
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    table[AT_JACOBIAN].load(first, jacobian.data());
+    table[ON_CHAIN].load(first, chain.data());
+    table[OTHERS_GOAL].load(first, posture.data());
+    table[AT_QPOS].load(first, qpos.data());
+    table[COULOMB].load(first, coulomb.data());
+    table[BAND].load(first, band.data());
+    Lanes ahead[AXES], twist[AXES], mobility[AXES * AXES];
+    for (int k = 0; k < WIDTH; ++k) {
+      std::int64_t const row = std::min(first + k, rows - 1);
+      double e[AXES];
+      write_error(table[GOAL_POSE].row(row), table[AT_POSE].row(row), e);
+      for (int axis = 0; axis < AXES; ++axis) ahead[axis].of[k] = e[axis];
+    }
+    if (table[GOAL_TWIST]) {
+      table[GOAL_TWIST].load(first, twist);
+      for (int axis = 0; axis < AXES; ++axis) ahead[axis] += LOOKAHEAD * twist[axis];
+    }
+    for (int a = 0; a < AXES; ++a) {
+      for (int b = 0; b <= a; ++b) {
+        mobility[a * AXES + b] = along(&jacobian[a * dof], &jacobian[b * dof], dof);
+        mobility[b * AXES + a] = mobility[a * AXES + b];
+      }
+      mobility[a * AXES + a] += 1e-4;
+    }
+    cholesky(AXES, mobility);
+    solve_lower<1>(AXES, mobility, ahead);
+    solve_upper<1>(AXES, mobility, ahead);
+    for (std::int64_t j = 0; j < dof; ++j) {
+      Lanes moved{};
+      for (int axis = 0; axis < AXES; ++axis) moved += jacobian[axis * dof + j] * ahead[axis];
+      Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (posture[j] - qpos[j]);
+      out[j] = at_most(at_least(way * (coulomb[j] / band[j]), -coulomb[j]), coulomb[j]);
+    }
+    if (table[VISCOUS]) {
+      table[VISCOUS].load(first, damping.data());
+      table[AT_QVEL].load(first, qvel.data());
+      for (std::int64_t j = 0; j < dof; ++j) out[j] = damping[j] * qvel[j] + out[j];
+    }
+    table[RUBBING].store(first, out.data());
+  }
+}
+
+bool open_friction(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
+  for (int i = 0; i < FRICTION; ++i) {
+    std::int64_t const columns = i == AT_POSE || i == GOAL_POSE ? POSE : i == AT_JACOBIAN ? AXES * dof
+                                 : i == GOAL_TWIST              ? AXES
+                                                                : dof;
+    if (!table.open(arrays[i], columns, i == ON_CHAIN ? 1 : rows, i == RUBBING)) return false;
+  }
+  return true;
+}
+
+// friction(rows, dof, *arrays)
+PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
+  Tables table;
+  if (PyErr_Occurred() || !open_friction(table, arguments + 2, rows, dof)) return nullptr;
+  write_friction(rows, dof, table);
+  Py_RETURN_NONE;
+}
+
+// Kinematics and law of some robots on fixed arrays, with friction where it has a result.
 struct BoundLaw : Call {
   Tree tree;
   std::int64_t body, rows;
   Decoupling decoupling;
   bool in_tool_axes;
-  Tables kinematics, law;
+  Tables kinematics, law, friction;
 
   static void run_both(Call const &call) {
     auto const &bound = static_cast<BoundLaw const &>(call);
     write_kinematics(bound.tree, bound.body, bound.rows, bound.kinematics);
+    if (bound.friction[RUBBING]) write_friction(bound.rows, bound.tree.dof, bound.friction);
     write_law(bound.rows, bound.tree.dof, bound.decoupling, bound.in_tool_axes, bound.law);
   }
 };
 
 char const *const BOUND = "batchpid.BoundLaw";
 
-// bind(tree, body, rows, decoupling, in_tool_axes, *arrays of kinematics, *arrays of law) -> (object, address of Call)
+// bind(tree, body, rows, decoupling, in_tool_axes, *arrays of kinematics, *arrays of law, *arrays of friction)
+//   -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
   if (tree == nullptr) return nullptr;
@@ -592,7 +678,8 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   bound->decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[3]));
   bound->in_tool_axes = PyLong_AsLong(arguments[4]) != 0;
   if (PyErr_Occurred() || !open_kinematics(bound->kinematics, arguments + 5, bound->rows, tree->dof) ||
-      !open_law(bound->law, arguments + 5 + KINEMATICS, bound->rows, tree->dof)) {
+      !open_law(bound->law, arguments + 5 + KINEMATICS, bound->rows, tree->dof) ||
+      !open_friction(bound->friction, arguments + 5 + KINEMATICS + LAW, bound->rows, tree->dof)) {
     return nullptr;
   }
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
@@ -627,6 +714,7 @@ PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
+    {"friction", method(friction), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},

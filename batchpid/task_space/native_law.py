@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.task_space_extension import DECOUPLING, KINEMATICS, LAW
+from batchpid.native.task_space_extension import DECOUPLING, FRICTION, KINEMATICS, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients
@@ -36,13 +36,28 @@ def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tupl
     return list(found.values())
 
 
+def friction(arrays: Mapping[str, Any]) -> Float64 | None:
+    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in FRICTION.
+
+    The result is None where native code is not used. With ``damping`` the efforts of damping are included.
+    """
+    qpos = arrays["qpos"]
+    native = native_rows.for_rows(qpos, *arrays.values())
+    if native is None:
+        return None
+    found = np.empty(qpos.shape)
+    native_rows.call(native.friction, *qpos.shape, *({**arrays, "feedforward": found}.get(name) for name in FRICTION))
+    return found
+
+
 def bind(
     tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
     """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs a step of the law on them.
 
     ``arrays`` are contiguous float64 arrays by their names in LAW, with ``bias`` among them. The tool is at a ``point``
-    (3,) of ``link``, by default at its origin. The result is None where native code is not used.
+    (3,) of ``link``, by default at its origin. With ``coulomb`` and ``band`` the feedforward is friction. The result is
+    None where native code is not used.
     """
     if (native := native_rows.in_use()) is None:
         return None
@@ -52,7 +67,12 @@ def bind(
     fixed = {"tool": native_rows.tool(own, index, point), "chain": np.array(tree.chains[body], np.float64)}
     known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, **dynamics, **fixed}
     motion = [None if name == "bias" else known[name] for name in KINEMATICS]
-    return native.bind(own.tree, body, rows, *_kind(k), *motion, *map(known.get, LAW))
+    rubbing = [None] * len(FRICTION)
+    if "coulomb" in arrays:
+        known["feedforward"] = np.zeros((rows, dof))
+        rubbing = [known.get(name) for name in FRICTION]
+        known["damping"] = None  # part of the feedforward
+    return native.bind(own.tree, body, rows, *_kind(k), *motion, *map(known.get, LAW), *rubbing)
 
 
 def _kind(k: OSCCoefficients) -> tuple[int, bool]:

@@ -13,10 +13,9 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Stack, Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.native.trees import filled, leaves, mapped, structure
-from batchpid.sim.engine.batch_dynamics import NativePassiveForce
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
+from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 
@@ -25,8 +24,9 @@ class TickProgram:
     """Control step of a group of envs as a program, and its arrays.
 
     ``compensated`` says whether gravity is compensated, and whether Coriolis and centrifugal forces are. A
-    ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force`` computes
-    the passive force where the engine's steps do not read it.
+    ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force`` is the
+    model of the passive force where the engine's steps do not read it. Constraint efforts keep their mass matrix for
+    ``coupling_steps``.
 
     Attributes
     ----------
@@ -46,8 +46,9 @@ class TickProgram:
         state: StepState,
         command: Command,
         compensated: tuple[bool, bool],
-        controller: Any = None,
-        force: NativePassiveForce | None = None,
+        controller: Any,
+        force: CompiledModel | None,
+        coupling_steps: int,
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
@@ -60,13 +61,9 @@ class TickProgram:
         self.before = np.zeros(shape)
         at = self.reading[:2] if self._seen is None else self._seen
         self._control = None if controller is None else controller.bound(*at, self.reading.passive)
-        self._force: tuple[Any, ...] = ()
-        if force is not None:
-            bound, address = force.bind(*compensated, *at, self.reading.passive)
-            self._force = force, bound, {"measured_force" if layout.measures else "read_force": address}
+        self._kept = force, layout.model.refresh
         self._noise = layout.model.noise
         self._sensors = self._make_sensors() if layout.measures else None
-        self._senses = layout.measures and not (compensated[0] and force is None)
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
             command = command._replace(setpoint=None)  # the controller has its own copy, of any size
@@ -74,6 +71,12 @@ class TickProgram:
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
+        arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
+        if moves_drives(layout, constants):
+            target, rate = np.zeros((2, *shape))
+            arrays |= {"target": target, "target_rate": rate}
+            known = None if command.setpoint_rate is None else rate
+            self.outputs = self.outputs._replace(target=target, target_rate=known)
         if self._control is not None:
             self.outputs = self.outputs._replace(returned=self._control.effort)
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
@@ -84,12 +87,14 @@ class TickProgram:
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
         results = [*leaves(_returned(fixed)), *leaves(self.outputs._replace(returned=None))]
-        arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
+        if self._seen is not None:
+            arrays |= zip(("pose", "rate"), self._seen, strict=True)
+        if (age := self.state.age) is not None:
+            arrays |= {"age": age, "gain": self.state.friction.gain, "memory": self.state.friction.memory}
         if matrix is not None:
             bodies = scene_dynamics(pack.spec).bodies
             tree = np.ascontiguousarray(bodies.tree, np.int32)
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
-            arrays |= {} if self._seen is None else dict(zip(("pose", "rate"), self._seen, strict=True))
             arrays |= {"armature": constants.armature, "damping": constants.damping}
             if (coupling := constants.coupling) is not None:
                 arrays |= {"leader": coupling.leader.astype(np.int32), "multiplier": coupling.multiplier}
@@ -102,8 +107,12 @@ class TickProgram:
             matrix_steps=steps,
             whole=whole,
             control=None if self._control is None else self._control.address,
-            sensors=self._sensors if self._senses else None,
-            **(self._force[-1] if self._force else {}),
+            compensated=compensated,
+            refresh=None if age is None else layout.model.refresh.address,
+            coupling_steps=coupling_steps,
+            sensors=self._sensors,
+            measured_force=force.address if force is not None and layout.measures else None,
+            read_force=None if force is None or layout.measures else force.address,
             **arrays,
         )
 
@@ -121,31 +130,17 @@ class TickProgram:
             if array is not None:
                 array[...] = value
 
-    def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
-        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status.
+    def run(self, step: CompiledStep, begin: int, end: int) -> tuple[int, int]:
+        """Run sim steps from ``begin`` on of a tick of ``end`` steps; return steps done and status.
 
         Fewer steps are done after an event, and where the noise of the sensors has to be drawn.
         """
-        noise = leaves(self._draw()) if self._senses else []
-        until = min([until, *(begin + len(block) for block in noise)])
+        noise = [] if self._sensors is None else leaves(self._draw())
+        until = min([end, *(begin + len(block) for block in noise)])
         done, status = self._tick.run(step.prepare(), begin, until, end, *noise)
-        if self.state.age is not None:
-            self.state.age[...] += done - begin
         if self.state.motors is not None and self.state.motors.step is not None:
             self.state.motors.step[...] += done - begin
         return done, status
-
-    def measure(self) -> Any:
-        """Advance the sensors; return positions and velocities as measured. Only :meth:`run` counts the step.
-
-        It comes before each :meth:`run` of one step where the passive force at a measured state is Python's.
-        """
-        assert self._sensors is not None
-        program, inputs, outputs = self._sensors
-        for place, block in zip(self._drawn, leaves(self._draw()), strict=True):
-            place[...] = block[0]
-        program(*inputs, out=outputs)
-        return self._seen
 
     def _draw(self) -> tuple[Any, Any]:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
@@ -156,19 +151,11 @@ class TickProgram:
         assert self.state.motors is not None
         side, k = _sensor_side(self.state.motors), self._constants.motors
         noise = mapped(lambda block: block[0].copy(), self._draw())
-        self._drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
+        drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
         traced = _trace_sensors(*map(structure, (k, side, *self.reading[:2], noise)))
-        inputs = [*fixed, *self._drawn]
+        inputs = [*fixed, *drawn]
         program = ArrayProgram(traced, leaves(k), len(inputs), self.reading.qpos.shape)
         return program, inputs, [*leaves(side.encoder), *leaves(self._seen)]
-
-    def take(self, state: StepState, outputs: Outputs) -> None:
-        """Copy the results of a control step in NumPy."""
-        self._copy(state)
-        self.before[...] = self.measured.qpos
-        for name in ("qf", "motor", "saturated", "guarded"):
-            if (array := getattr(outputs, name)) is not None:
-                getattr(self.outputs, name)[...] = array
 
     def _copy(self, state: StepState) -> None:
         if self._control is not None:
@@ -180,9 +167,14 @@ class TickProgram:
             self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
 
 
+def moves_drives(layout: Layout, constants: Constants) -> bool:
+    """Return whether the targets of the engine's drives move within a tick."""
+    return layout.control == "drive" and (constants.driven is not None or constants.guard is not None)
+
+
 @lru_cache(maxsize=64)
 def _trace(layout: Layout, *structures: Any) -> Trace:
-    """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
+    """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints, targets.
 
     ``structures`` describe constants, state, command, reading, measured positions and velocities, and the effort of a
     controller. No update of mass matrix or friction is due.
@@ -199,7 +191,11 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
         new, outputs = control_step(layout._replace(model=model), k, start, command, measured, Step(0, 1))
         results = leaves(_returned(new._replace(age=None)))
         assert len(results) == len(leaves(_returned(before)))
-        return [*results, *leaves(outputs._replace(returned=None, target=None, target_rate=None))]
+        outputs = outputs._replace(returned=None)
+        return [
+            *results,
+            *leaves(outputs if moves_drives(layout, k) else outputs._replace(target=None, target_rate=None)),
+        ]
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))

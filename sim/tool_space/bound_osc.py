@@ -33,6 +33,7 @@ class BoundOSC:
         parts: Mapping[str, slice],
         columns: NDArray[np.intp],
         damping: Float64 | None,
+        friction: tuple[Float64, Float64] | None,
         timestep: float,
         reading: tuple[Float64, Float64, Float64],
     ) -> None:
@@ -52,6 +53,8 @@ class BoundOSC:
         known |= {"posture": self._posture, "integral": integral, "next_integral": integral, "effort": self.effort}
         if damping is not None:
             known |= {"damping": damping, "added_inertia": timestep * damping}
+        if friction is not None:
+            known |= dict(zip(("coulomb", "band"), friction, strict=True))
         tree, link, point = tool
         bound = native_law.bind(tree, link, point, k, {**self._given, **known})
         assert bound is not None
