@@ -197,7 +197,7 @@ def control_step(
         limits = stages.limits(constants.motors, seen, seen_rate)
         if layout.measures and layout.model.passive_force is not None:
             passive = layout.model.passive_force(seen, seen_rate)
-    forward = _feedforward(constants, command, seen, passive)
+    forward = feedforward(constants, command, seen, passive)
     given = Inputs(command, Measured(seen, seen_rate, forward), limits, step)
     state, outputs = _CONTROLS[layout.control](layout, constants, state, given)
     motor = outputs.motor
@@ -244,7 +244,7 @@ def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple
     return state, command._replace(setpoint=setpoint, setpoint_rate=rate), changed
 
 
-def _feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
+def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
     if forward is not None and constants.coupling is not None:

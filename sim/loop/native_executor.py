@@ -1,13 +1,12 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Sensors have another program, and Python draws their noise in advance.
-Where the engine's steps do not read the passive force of the model, as at a measured state or with varied masses, a
-native call computes it; on a floating base Python does, and each sim step is a call. With coupled joints every four sim
-steps are a call, since Python updates the mass matrix of the constraint efforts. Operational-space control is a native
-call before the program, which takes its effort as an input. Where the control step cannot be traced (a caller's
-controller, drives whose targets move within a tick), it runs in NumPy, and one native call applies the efforts, steps
-the engine and reads it. A sim step in which the friction model updates its mass matrix runs in the same way.
+arrays that hold the state from step to step. Before and after it, native code updates the inertia of the friction model
+and the constraint of coupled joints, writes the targets of drives, and computes the passive force where the engine's
+steps do not read that of the model. Sensors have another program; Python draws their noise in advance, for 64 sim steps
+at once. Operational-space control is a native call before the program, which takes its effort as an input. With a
+controller of Python, or more joints than a program sums, the control step runs in NumPy, and one native call applies
+the efforts, steps the engine and reads it.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class NativeExecutor(NumPyExecutor):
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
-        if not self._compiles or (self._controller is not None and command.feedforward is not None):
+        if not self._compiles:
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
         program.load(state, measured, command)

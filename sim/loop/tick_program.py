@@ -17,7 +17,17 @@ from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.control_step import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    control_step,
+    feedforward,
+)
 
 
 class TickProgram:
@@ -60,14 +70,17 @@ class TickProgram:
         self._constants = mapped(_stacked, constants)
         self.before = np.zeros(shape)
         at = self.reading[:2] if self._seen is None else self._seen
-        self._control = None if controller is None else controller.bound(*at, self.reading.passive)
+        self._command = command.map(lambda rows: np.zeros(shape))
+        if controller is not None:  # it has its own copy of setpoints, of any size
+            self._command = self._command._replace(setpoint=None)
+        forward = None if controller is None else self._make_forward()
+        bias = self.reading.passive if forward is None else forward[-1][0]
+        self._control = None if controller is None else controller.bound(*at, bias)
         self._kept = force, layout.model.refresh
         self._noise = layout.model.noise
         self._sensors = self._make_sensors() if layout.measures else None
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
-            command = command._replace(setpoint=None)  # the controller has its own copy, of any size
-        self._command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
@@ -111,6 +124,7 @@ class TickProgram:
             refresh=None if age is None else layout.model.refresh.address,
             coupling_steps=coupling_steps,
             sensors=self._sensors,
+            forward=forward,
             measured_force=force.address if force is not None and layout.measures else None,
             read_force=None if force is None or layout.measures else force.address,
             **arrays,
@@ -145,6 +159,16 @@ class TickProgram:
     def _draw(self) -> tuple[Any, Any]:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
         return self._noise.from_step(self._constants.motors, self.state.motors, self.before) or (None, None)
+
+    def _make_forward(self) -> tuple[ArrayProgram, list[Float64], list[Float64]] | None:
+        """Return the program of a controller's feedforward, its inputs and its output; None for the passive force."""
+        command, passive = self._command, self.measured.passive
+        if command.feedforward is None and (passive is None or self._constants.coupling is None):
+            return None
+        inputs, k = leaves((command, passive)), self._constants
+        traced = _trace_forward(*map(structure, (k, command, passive)))
+        program = ArrayProgram(traced, leaves(k), len(inputs), self.reading.qpos.shape)
+        return program, inputs, [np.zeros_like(self.reading.qpos)]
 
     def _make_sensors(self) -> tuple[ArrayProgram, list[Float64], list[Float64]]:
         """Return the program of the sensors, its inputs and its outputs."""
@@ -212,6 +236,19 @@ def _trace_sensors(*structures: Any) -> Trace:
         given = iter(symbols)
         new, *seen = advance_measurement(*(filled(each, given) for each in structures))
         return [*leaves(new.encoder), *seen]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+@lru_cache(maxsize=64)
+def _trace_forward(*structures: Any) -> Trace:
+    """Return the trace of the feedforward; ``structures`` describe constants, command and passive force."""
+
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        k, command, passive = (filled(each, given) for each in structures)
+        return [feedforward(k, command, None, passive)]
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))

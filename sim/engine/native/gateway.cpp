@@ -192,26 +192,27 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   });
 }
 
-// tick(bound program, address of a Tick, address of a Group, begin, until, end, program of the sensors or None)
-//   -> (steps done, Status)
+// tick(bound program, address of a Tick, address of a Group, begin, until, end, programs of sensors and feedforward)
+//   -> (steps done, Status); a program may be None
 PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[0], BOUND));
-  bool const measures = arguments[6] != Py_None;
-  auto *sensors = measures ? static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[6], BOUND)) : nullptr;
-  if (measures && sensors == nullptr) return nullptr;
   auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
-  if (bound == nullptr || arrays == nullptr || group == nullptr) return nullptr;
-  if (bound->program->rows != static_cast<Index>(group->robots) ||
-      bound->program->columns != static_cast<Index>(group->dof) || arrays->dof != group->dof ||
-      (measures && (sensors->program->rows != bound->program->rows ||
-                    sensors->program->columns != bound->program->columns))) {
-    return misfit();
-  }
+  if (arrays == nullptr || group == nullptr) return nullptr;
+  bool fits = arrays->dof == group->dof;
+  auto const program = [&](PyObject *object) -> BoundProgram * {
+    if (object == Py_None) return nullptr;
+    auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(object, BOUND));
+    fits = fits && bound != nullptr && bound->program->rows == static_cast<Index>(group->robots) &&
+           bound->program->columns == static_cast<Index>(group->dof);
+    return bound;
+  };
+  Programs const programs{program(arguments[0]), program(arguments[6]), program(arguments[7])};
+  if (PyErr_Occurred()) return nullptr;
+  if (!fits || programs.step == nullptr) return misfit();
   std::int64_t step = PyLong_AsLongLong(arguments[3]);
   std::int64_t const until = PyLong_AsLongLong(arguments[4]), end = PyLong_AsLongLong(arguments[5]);
   std::int32_t status = 0;
-  PyObject *done = without_gil([&] { status = run_tick(*bound, sensors, *arrays, *group, step, until, end); });
+  PyObject *done = without_gil([&] { status = run_tick(programs, *arrays, *group, step, until, end); });
   if (done == nullptr) return nullptr;
   Py_DECREF(done);
   return Py_BuildValue("Li", static_cast<long long>(step), static_cast<int>(status));

@@ -45,6 +45,8 @@ class NativeTick:
         Sim steps for which the constraint efforts of coupled joints keep their mass matrix.
     sensors
         Program of the sensors, its inputs and its outputs. Its last inputs are the noise (:meth:`run`).
+    forward
+        Program that runs before the controller, its inputs and its outputs: of the feedforward that it takes.
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
@@ -70,6 +72,7 @@ class NativeTick:
         refresh: int | None = None,
         coupling_steps: int = 1,
         sensors: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
+        forward: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
         **arrays: NDArray[Any] | None,
     ) -> None:
         arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
@@ -80,14 +83,14 @@ class NativeTick:
                 raise ValueError(f"{name} is not a contiguous array of {wanted}")
         self._native = native.extension("_gateway")
         self._program = self._bind(program, inputs, outputs)
-        self._sensors = None if sensors is None else self._bind(*sensors)
+        self._others = [None if each is None else self._bind(*each) for each in (sensors, forward)]
         addresses = {name: array.ctypes.data for name, array in given.items()}
         calls = {"control": control, "refresh": refresh, "measured_force": measured_force, "read_force": read_force}
         steps = {"matrix_steps": matrix_steps, "coupling_steps": coupling_steps, "dof": program.shape[1]}
         parts = dict(zip(("gravity", "coriolis"), compensated, strict=True))
         self._tick = Tick(timestep=timestep, whole=whole, **steps, **parts, **calls, **addresses)
         self._address = ctypes.addressof(self._tick)
-        self._kept = inputs, outputs, given, sensors
+        self._kept = inputs, outputs, given, sensors, forward
 
     def _bind(self, program: ArrayProgram, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]]) -> Any:
         """Return a program with its arrays."""
@@ -102,4 +105,4 @@ class NativeTick:
         """
         for place, block in enumerate(noise):
             self._tick.noise[place] = block.ctypes.data
-        return self._native.tick(self._program, self._address, group, begin, until, end, self._sensors)
+        return self._native.tick(self._program, self._address, group, begin, until, end, *self._others)

@@ -79,16 +79,23 @@ inline void measure(BoundProgram &sensors, Tick const &tick, std::int64_t robots
   run(*sensors.program, sensors.inputs.data(), sensors.outputs.data(), 0, robots);
 }
 
-// Run the sim steps from `step` to `until` of a tick of `end` steps, with the program of sensors or null. Advance `step`;
-// return the status of the last.
-inline std::int32_t run_tick(BoundProgram const &bound, BoundProgram *sensors, Tick const &tick, Group &group,
-                             std::int64_t &step, std::int64_t until, std::int64_t end) {
+// Programs of a tick: the control step, and sensors and the feedforward of a native controller, or null.
+struct Programs {
+  BoundProgram *step, *sensors, *forward;
+};
+
+// Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
+inline std::int32_t run_tick(Programs const &programs, Tick const &tick, Group &group, std::int64_t &step,
+                             std::int64_t until, std::int64_t end) {
   auto const robots = group.robots, begin = step;
   auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
+  auto const run_bound = [&](BoundProgram const &bound) {
+    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+  };
   Parts const parts{tick.gravity != 0, tick.coriolis != 0};
   std::int32_t status = 0;
   while (step < until && status == 0) {
-    if (sensors != nullptr) measure(*sensors, tick, robots, step - begin);
+    if (programs.sensors != nullptr) measure(*programs.sensors, tick, robots, step - begin);
     if (tick.measured_force != nullptr) {
       write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
     }
@@ -96,8 +103,9 @@ inline std::int32_t run_tick(BoundProgram const &bound, BoundProgram *sensors, T
     if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
       write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
     }
+    if (programs.forward != nullptr) run_bound(*programs.forward);
     if (tick.control != nullptr) tick.control->run(*tick.control);
-    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+    run_bound(*programs.step);
     if (tick.target != nullptr) write_targets(group, tick.target, tick.target_rate);
     if (group.constraint != nullptr && step % tick.coupling_steps == 0) {
       update_constraint(group, tick.qpos, tick.qvel);
