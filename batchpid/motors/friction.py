@@ -86,10 +86,13 @@ def init(
     """
     if friction.coulomb is None:
         return FrictionState()
-    xp = namespace(velocity, load, mass_matrix, *friction)
-    zero = xp.zeros_like(velocity)
-    state = FrictionState(load + zero, velocity + zero, zero, zero, zero)
-    return refresh(friction, state, mass_matrix, dt, damping, stiffness)
+    return refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
+
+
+def started(velocity: Any, load: Any) -> FrictionState:
+    """Return the state of :func:`init` without K and w, which :func:`refresh` sets."""
+    zero = namespace(velocity, load).zeros_like(velocity)
+    return FrictionState(load + zero, velocity + zero, zero, zero, zero)
 
 
 def refresh(

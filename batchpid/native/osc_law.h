@@ -156,6 +156,8 @@ class OSCLaw {
   void load(std::int64_t first) { given_.load(first); }
   Lanes const *qpos() const { return given_[LAW_QPOS]; }
   Lanes const *qvel() const { return given_[LAW_QVEL]; }
+  Given &given() { return given_; }
+  Given const &given() const { return given_; }
 
   // Write the results of the rows loaded.
   void advance(std::int64_t first) {

@@ -38,10 +38,17 @@ Vector<N> cross(Vector<N> a, Vector<N> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// Constants of one body and its joint, a row of 25 numbers: BODY in interface.py.
+// Mass, center and inertia tensor about it of one body, in the axes of its frame.
+template <class T>
+struct BodyInertia {
+  T mass, center[3], tensor[3][3];
+};
+
+// Constants of one body and its joint, a row of 25 numbers: BODY in task_space_extension.py.
 template <class T>
 struct BodyRow {
-  T rotation[3][3], position[3], mass, center[3], tensor[3][3];
+  T rotation[3][3], position[3];
+  BodyInertia<T> inertia;
 };
 
 // Mass, first moment and inertia tensor, in the axes of the base and about its origin.
@@ -87,7 +94,7 @@ Vector<N> in_axes(Vector<N> const (&axes)[3], T x, T y, T z) {
 
 template <class N, class T>
 Vector<N> along_axes(Vector<N> const (&axes)[3], T const (&v)[3]) {
-  return in_axes(axes, double(v[0]), double(v[1]), double(v[2]));
+  return in_axes(axes, v[0], v[1], v[2]);
 }
 
 template <class N>
@@ -122,20 +129,21 @@ void place_bodies(std::int64_t dof, std::int32_t const *tree, BodyRow<T> const *
   }
 }
 
-// Write the inertia of each body, from its frame.
+// Write the inertia of a body, from its frame.
+template <class N, class T>
+void weigh(BodyInertia<T> const &row, BodyState<N> &at) {
+  Inertia<N> &to = at.inertia;
+  to = point_mass(N(row.mass), at.origin + along_axes(at.axes, row.center));
+  for (int k = 0; k < 3; ++k) {  // R T R^T: the sum of (T column k in the base's axes) times axis k
+    Vector<N> const turned = along_axes(at.axes, row.tensor[k]), axis = at.axes[k];
+    to.diagonal = to.diagonal + Vector<N>{turned.x * axis.x, turned.y * axis.y, turned.z * axis.z};
+    to.rest = to.rest + Vector<N>{turned.y * axis.z, turned.x * axis.z, turned.x * axis.y};
+  }
+}
+
 template <class N, class T>
 void weigh_bodies(std::int64_t dof, BodyRow<T> const *rows, BodyState<N> *body) {
-  for (std::int64_t j = 0; j < dof; ++j) {
-    BodyRow<T> const &row = rows[j];
-    BodyState<N> &at = body[j];
-    Inertia<N> &to = at.inertia;
-    to = point_mass(N(double(row.mass)), at.origin + along_axes(at.axes, row.center));
-    for (int k = 0; k < 3; ++k) {  // R T R^T: the sum of (T column k in the base's axes) times axis k
-      Vector<N> const turned = along_axes(at.axes, row.tensor[k]), axis = at.axes[k];
-      to.diagonal = to.diagonal + Vector<N>{turned.x * axis.x, turned.y * axis.y, turned.z * axis.z};
-      to.rest = to.rest + Vector<N>{turned.y * axis.z, turned.x * axis.z, turned.x * axis.y};
-    }
-  }
+  for (std::int64_t j = 0; j < dof; ++j) weigh(rows[j].inertia, body[j]);
 }
 
 // Write the mass matrix (dof, dof) of the bodies; each then has the inertia of all that its joint moves.
@@ -185,12 +193,10 @@ void efforts_of_wrenches(std::int64_t dof, std::int32_t const *tree, BodyState<N
   }
 }
 
-// Write the motions of the bodies, without acceleration of the joints; gravity (3,) is an acceleration of the base.
+// Write the motions of the bodies on a base with a given motion, without acceleration of the joints.
 template <class N>
 void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, N const *qvel,
-                 double const *gravity, BodyMotion<N> *motion) {
-  BodyMotion<N> base{};
-  base.moving_change = {N(-gravity[0]), N(-gravity[1]), N(-gravity[2])};
+                 BodyMotion<N> const &base, BodyMotion<N> *motion) {
   for (std::int64_t j = 0; j < dof; ++j) {
     BodyMotion<N> const &above = tree[2 * j] < 0 ? base : motion[tree[2 * j]];
     Vector<N> const w = qvel[j] * turning(body[j], tree[2 * j + 1]), v = qvel[j] * body[j].moving;
@@ -199,6 +205,15 @@ void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const 
     at.turning_change = at.turning_change + cross(at.turning, w);
     at.moving_change = at.moving_change + cross(at.turning, v) + cross(at.moving, w);
   }
+}
+
+// The same on a base at rest; gravity (3,) is an acceleration of the base.
+template <class N>
+void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, N const *qvel,
+                 double const *gravity, BodyMotion<N> *motion) {
+  BodyMotion<N> base{};
+  base.moving_change = {N(-gravity[0]), N(-gravity[1]), N(-gravity[2])};
+  move_bodies(dof, tree, body, qvel, base, motion);
 }
 
 }  // namespace batchpid

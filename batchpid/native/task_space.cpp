@@ -1,12 +1,14 @@
 // Kinematics, dynamics, inverse kinematics and operational-space control of many robots of one kind, for Python.
 
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "batchpid/native/buffer.h"
 #include "batchpid/native/call.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
+#include "batchpid/native/osc_friction.h"
 #include "batchpid/native/osc_law.h"
 #include "batchpid/native/pose_search.h"
 #include "batchpid/native/rigid_body.h"
@@ -142,13 +144,44 @@ bool open_law(Tables &table, PyObject *const *arrays, std::int64_t rows, std::in
   return true;
 }
 
+// Arrays of `friction` that are constants of the robot, and then in `bind`.
+constexpr int JOINTS[] = {VISCOUS, COULOMB, BAND};
+
+// Friction of some robots from its arrays; the others of Friction are those of a law.
+class JointFriction {
+ public:
+  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)) {
+    for (int i = 0; i < 3; ++i) {
+      if (!table[i]) continue;
+      columns_[i].resize(static_cast<std::size_t>(dof));
+      table[i].load(0, columns_[i].data());
+      of[JOINTS[i]] = columns_[i].data();
+    }
+  }
+  // Write the friction at the state of a law with this dynamics.
+  void write(OSCLaw const &law, std::int64_t dof) {
+    constexpr std::pair<Friction, Law> SAME[] = {{AT_POSE, TASK_POSE},   {AT_JACOBIAN, TASK_JACOBIAN},
+                                                 {ON_CHAIN, CHAIN},      {GOAL_POSE, SETPOINT},
+                                                 {GOAL_TWIST, TWIST},    {OTHERS_GOAL, POSTURE},
+                                                 {AT_QPOS, LAW_QPOS},    {AT_QVEL, LAW_QVEL}};
+    for (auto const &[mine, its] : SAME) of[mine] = law.given()[its];
+    write_friction(dof, of, out.data());
+  }
+
+  std::vector<Lanes> out;
+
+ private:
+  Lanes const *of[FRICTION] = {};
+  std::vector<Lanes> columns_[3];
+};
+
 // Law of some robots on given arrays, with dynamics of a tree where it has a tool.
 struct Step : Call {
   Tree tree{};
   std::int64_t body = -1, rows, dof;
   Decoupling decoupling;
   bool in_tool_axes;
-  Tables law, tool;
+  Tables law, tool, friction;
 
   // Arguments: decoupling, in_tool_axes, *arrays of law.
   bool open(PyObject *const *arguments) {
@@ -166,6 +199,14 @@ struct Step : Call {
     rows = PyLong_AsLong(arguments[2]);
     return !PyErr_Occurred() && tool.open(arguments[3], FRAME, rows, false) && open(arguments + 4);
   }
+  // Arguments: those of `open_with_tree`, and damping, Coulomb friction and band of the joints, one row each.
+  bool open_with_friction(PyObject *const *arguments) {
+    if (!open_with_tree(arguments)) return false;
+    for (int i = 0; i < 3; ++i) {
+      if (!friction.open(arguments[6 + LAW + i], dof, 1, false)) return false;
+    }
+    return true;
+  }
 };
 
 FOR_EACH_PROCESSOR void write_step(Call const &call) {
@@ -174,6 +215,9 @@ FOR_EACH_PROCESSOR void write_step(Call const &call) {
   ToolDynamics dynamics(step.tree, step.body);
   OSCLaw law(step.dof, step.decoupling, step.in_tool_axes, step.law, computes ? &dynamics : nullptr);
   Lanes tool[FRAME];
+  JointFriction friction(step.friction, step.dof);
+  bool const rubs{step.friction[1]};
+  if (rubs) law.given().set(FEEDFORWARD, friction.out.data());
   for (std::int64_t first = 0; first < step.rows; first += WIDTH) {
     law.load(first);
     if (computes) {
@@ -184,6 +228,7 @@ FOR_EACH_PROCESSOR void write_step(Call const &call) {
       if (!step.law[TASK_BIAS]) dynamics.set_bias();
       dynamics.set_mass();
     }
+    if (rubs) friction.write(law, step.dof);
     law.advance(first);
   }
 }
@@ -206,13 +251,39 @@ PyObject *step(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
+// friction(rows, dof, *arrays of Friction)
+PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
+  if (PyErr_Occurred()) return nullptr;
+  Tables table;
+  std::vector<Lanes> columns[FRICTION];
+  Lanes const *of[FRICTION] = {};
+  for (int i = 0; i < FRICTION; ++i) {
+    std::int64_t size = dof;
+    if (i == AT_POSE || i == GOAL_POSE) size = POSE;
+    if (i == AT_JACOBIAN) size = AXES * dof;
+    if (i == GOAL_TWIST) size = AXES;
+    if (!table.open(arguments[2 + i], size, i == ON_CHAIN ? 1 : rows, i == RUBBING)) return nullptr;
+    columns[i].resize(static_cast<std::size_t>(size));
+    if (table[i]) of[i] = columns[i].data();
+  }
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    for (int i = 0; i < RUBBING; ++i) {
+      if (table[i]) table[i].load(first, columns[i].data());
+    }
+    write_friction(dof, of, columns[RUBBING].data());
+    table[RUBBING].store(first, columns[RUBBING].data());
+  }
+  Py_RETURN_NONE;
+}
+
 char const *const BOUND = "batchpid.BoundStep";
 
-// bind(*arguments of Step::open_with_tree) -> (object, address of Call)
+// bind(*arguments of Step::open_with_friction) -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<Step>();
   bound->run = write_step;
-  if (!bound->open_with_tree(arguments)) return nullptr;
+  if (!bound->open_with_friction(arguments)) return nullptr;
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
   PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
     delete static_cast<Step *>(PyCapsule_GetPointer(object, BOUND));
@@ -246,6 +317,7 @@ PyMethodDef METHODS[] = {
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
     {"step", method(step), METH_FASTCALL, nullptr},
+    {"friction", method(friction), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},

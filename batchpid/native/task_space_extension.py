@@ -26,6 +26,11 @@ LAW = (
     *("task_share", "posture_share", "near_singular"),
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
+FRICTION = (
+    *("pose", "jacobian", "chain", "setpoint", "twist", "posture", "qpos", "qvel"),
+    *("damping", "coulomb", "band", "feedforward"),
+)
+"""Arrays of ``friction``; the last is the result."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
 DECOUPLING = ("full", "partial", "none")
@@ -36,12 +41,12 @@ BUFFER, CALL, LANES, RIGID_BODY = (
 )
 _HEADERS = tuple(
     f"batchpid/native/{name}.h"
-    for name in ("extension", "mobility", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
+    for name in ("extension", "mobility", "osc_friction", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
 )
 
 
 def _tables() -> tuple[Any, ...]:
-    return list(BODY.items()), KINEMATICS, LAW, SEARCH, DECOUPLING
+    return list(BODY.items()), KINEMATICS, LAW, FRICTION, SEARCH, DECOUPLING
 
 
 TASK_SPACE = Extension(

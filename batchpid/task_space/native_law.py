@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.task_space_extension import DECOUPLING, LAW
+from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients
@@ -48,19 +48,36 @@ def step(
     return list(found.values())
 
 
+def friction(arrays: Mapping[str, Any]) -> Float64 | None:
+    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in FRICTION.
+
+    The result is None where native code is not used. With ``damping`` the efforts of damping are included.
+    """
+    qpos = arrays["qpos"]
+    if (native := native_rows.for_rows(qpos, *arrays.values())) is None:
+        return None
+    found = np.empty(qpos.shape)
+    native_rows.call(native.friction, *qpos.shape, *({**arrays, "feedforward": found}.get(name) for name in FRICTION))
+    return found
+
+
 def bind(
     tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
     """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`step` on them.
 
     ``arrays`` are contiguous float64 arrays by their names in LAW; without ``bias`` it is the tree's. The tool is at a
-    ``point`` (3,) of ``link``, by default at its origin. The result is None where native code is not used.
+    ``point`` (3,) of ``link``, by default at its origin. With ``coulomb`` and ``band`` (dof,) the feedforward is
+    friction. The result is None where native code is not used.
     """
     if (native := native_rows.in_use()) is None:
         return None
     fixed, chain = _of_tree(native, tree, link, point, len(arrays["qpos"]), k)
     known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, "chain": chain}
-    return native.bind(*fixed, *map(known.get, LAW))
+    rubbing = [None, None, None]
+    if "coulomb" in arrays:  # damping is part of this friction, and not an input of the law
+        rubbing = [known.pop(name, None) for name in ("damping", "coulomb", "band")]
+    return native.bind(*fixed, *map(known.get, LAW), *rubbing)
 
 
 def _of_tree(

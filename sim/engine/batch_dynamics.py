@@ -27,15 +27,14 @@ limits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import load_engine, scene_dynamics
+from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.native.interface import DYNAMICS, STEP
 from batchpid.sim.engine.protocol import RobotModel
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -232,82 +231,3 @@ class PinocchioBatchDynamics:
         q = q + dt * v
         low, high = self._joints.low, self._joints.high
         return np.clip(q, low, high), np.where((q < low) | (q > high), 0.0, v), f
-
-
-class NativeMassMatrix:
-    """Mass matrices of the robot of ``spec``, by the native code that also runs within a tick."""
-
-    def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self._native = spec, native.extension("_gateway")
-
-    @cached_property
-    def _bodies(self) -> tuple[NDArray[Any], ...]:
-        bodies = scene_dynamics(self._spec).bodies
-        return np.ascontiguousarray(bodies.tree, np.int32), np.ascontiguousarray(bodies.table())
-
-    def __call__(self, qpos: NDArray[Any]) -> Float64:
-        """Return the mass matrices (M, dof, dof) [kg m^2 or kg] at ``qpos`` (M, dof)."""
-        rows = np.ascontiguousarray(qpos, np.float64)
-        out = np.empty((*rows.shape, rows.shape[1]))
-        self._native.mass_matrices(*self._bodies, rows, out, *rows.shape)
-        return out
-
-
-def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
-    """Return the function of positions that computes the mass matrices of a robot's description, on a fixed base.
-
-    ``natively`` says whether the extension is used; then every executor takes them from it, since Pinocchio's differ in
-    the last bits.
-    """
-    if natively:
-        return NativeMassMatrix(spec)
-    model = _model_of(spec)
-    return lambda qpos: model().mass_matrix(qpos)
-
-
-class NativePassiveForce:
-    """Passive forces of the robot of ``spec``, on a fixed base, at given states, by the extension."""
-
-    def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self._native = spec, native.extension("_batch_dynamics")
-
-    @cached_property
-    def _tree(self) -> Any:
-        bodies = scene_dynamics(self._spec).bodies
-        dof = len(bodies.tree)
-        everyone = np.arange(dof, dtype=np.int32), np.ones(dof), np.zeros(dof)
-        return self._native.tree(
-            bodies.tree, bodies.table(), *everyone, dof, dof, 0, (0.0, 0.0, 0.0), self._spec.gravity
-        )
-
-    def __call__(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
-        """Return the efforts (M, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal forces."""
-        force, state = np.empty(qpos.shape), (np.ascontiguousarray(each, np.float64) for each in (qpos, qvel))
-        self._native.run(self.bind(gravity, coriolis, *state, force)[0])
-        return force
-
-    def bind(self, gravity: bool, coriolis: bool, *arrays: Float64) -> tuple[Any, int]:
-        """Return an object that computes on fixed ``arrays``, and the address of its Call (call.h).
-
-        The arrays are positions, velocities and force (M, dof). The caller keeps them, and this object.
-        """
-        bound: tuple[Any, int] = self._native.bind_force(self._tree, gravity, coriolis, *arrays)
-        return bound
-
-
-def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Float64, bool, bool], Float64]:
-    """Return the function of positions, velocities, gravity and coriolis that computes a robot's passive forces.
-
-    ``natively`` says whether the extension is used; then every executor takes them from it, since the engines' differ
-    in the last bits.
-    """
-    if natively and spec.fixed_base:
-        return NativePassiveForce(spec)
-
-    model = _model_of(spec)
-    return lambda qpos, qvel, gravity, coriolis: model().passive_force(qpos, qvel, gravity, coriolis)
-
-
-def _model_of(spec: SceneSpec) -> Callable[[], RobotModel]:
-    """Return a function that returns the model of ``spec``, looked up once: the hash of a spec takes many calls."""
-    return cache(lambda: scene_dynamics(spec))

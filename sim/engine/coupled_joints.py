@@ -18,6 +18,7 @@ arm, or make it diverge. See docs/joints.md.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,9 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, multiply
 from batchpid.motors.coupling import Coupling
+from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import Constraint
+from batchpid.sim.engine.native_model import NativeModel
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 """Gains of c' dt and c in units of 1 / dt^2."""
@@ -35,8 +38,14 @@ RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 class ConstraintEfforts:
     """Constraint efforts of robots with the coupling ``coupling``; ``continuous`` (dof,) positions wrap.
 
-    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies the efforts by
-    the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if given.
+    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies and updates the
+    efforts by the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if
+    given.
+
+    Attributes
+    ----------
+    implicit
+        Inertia on the diagonal of the mass matrix besides the model's: armature of the motors, and damping times dt.
     """
 
     def __init__(
@@ -52,10 +61,13 @@ class ConstraintEfforts:
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
         self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
+        self.implicit = np.zeros((robots, joints))
+        self._model: NativeModel | None = None
         arrays: dict[str, NDArray[Any]] = {
             "response": self._response,
             "push": self._push,
             "passive": self._passive,
+            "implicit": self.implicit,
             "followers": followers.astype(np.int64),
             "leaders": coupling.leader[followers].astype(np.int64),
             "multiplier": coupling.multiplier[followers],
@@ -77,14 +89,34 @@ class ConstraintEfforts:
         """Address of the constraint, for a group of the extension."""
         return ctypes.addressof(self._native)
 
-    def update(self, mass_matrix: Float64, passive: Float64, rows: Any = slice(None)) -> None:
-        """Set mass matrix (len(rows), dof, dof) and passive force of robots ``rows``; they may be some steps old."""
-        numbers = np.concatenate([mass_matrix, passive[:, :, None]], axis=2)
+    def use(self, model: NativeModel, force: NativeModel | None) -> None:
+        """Update in native code, within a tick too, with mass matrices of ``model`` and passive forces of ``force``.
+
+        None: the passive forces are the engine's own.
+        """
+        self._model, self._force = model, force
+        self._native.model, self._native.force = model.address, None if force is None else force.address
+
+    def update(
+        self, mass_matrix: Callable[[Float64], Float64], qpos: Float64, passive: Float64, rows: Sequence[int]
+    ) -> None:
+        """Set mass matrix and passive force of robots ``rows``, at positions and passive forces of all robots.
+
+        ``mass_matrix`` is a function of positions; native code does not need it.
+        """
+        if self._model is not None:
+            wanted = np.zeros(len(qpos), bool)
+            wanted[rows] = True
+            arrays = (np.ascontiguousarray(each, np.float64) for each in (qpos, passive))
+            native.extension("_gateway").update_constraint(self.address, *arrays, wanted, len(qpos))
+            return
+        matrices = (mass_matrix(qpos) + self.implicit[:, None] * np.eye(qpos.shape[1]))[rows]
+        numbers = np.concatenate([matrices, passive[rows][:, :, None]], axis=2)
         sound = np.isfinite(numbers).all((1, 2), keepdims=True)  # a robot may have failed
-        matrix = np.where(sound, mass_matrix, np.eye(mass_matrix.shape[1]))
+        matrix = np.where(sound, matrices, np.eye(qpos.shape[1]))
         jacobian = self._coupling.jacobian
         response = np.linalg.solve(matrix, jacobian.T).swapaxes(1, 2)
-        self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive, 0.0)
+        self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive[rows], 0.0)
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:

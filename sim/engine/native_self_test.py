@@ -53,6 +53,7 @@ def main() -> None:
     _compare_calls()
     _compare_steps()
     _compare_ticks()
+    _compare_drives()
     _compare_dynamics()
 
 
@@ -161,6 +162,42 @@ def _compare_ticks() -> None:
             raise AssertionError("native ticks and their parts give different results")
     if not np.abs(results[0][0]).max() > 0.1:
         raise AssertionError("no robot moved in a native tick")
+
+
+def _compare_drives() -> None:
+    """Compare drives whose targets move within a native tick with targets that Python writes."""
+    shape, results = (4, 2), []
+    wanted = np.linspace((0.2, 0.1), (0.8, 0.3), 4)
+
+    def law(goal: Any, qpos: Any) -> list[Any]:
+        return [0.5 * (goal - qpos), qpos + 0.5 * (goal - qpos), 0.1 * (goal - qpos)]
+
+    for in_ticks in (True, False):
+        pack = Pack(_spec(), 4, system_size=2)
+        pack.write_drive(np.array([400.0, 300.0]), np.array([40.0, 30.0]), np.array([np.inf, np.inf]))
+        qpos, qvel, passive, before, qf, target, rate = np.zeros((7, *shape))
+        program = ArrayProgram(trace(law, 1, 1), [wanted], 1, shape)
+        outputs = qf, target, rate
+        arrays: dict[str, Any] = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
+        moving: dict[str, Any] = {"target": target, "target_rate": rate}
+        tick = NativeTick(program, (qpos,), outputs, timestep=1e-2, **arrays, **moving)
+        step, done = pack.compiled_step(True, True, True, None, True), 0
+        while done < STEPS:
+            if in_ticks:
+                done, status = tick.run(step.prepare(), done, STEPS, STEPS)
+            else:
+                program(qpos, out=outputs)
+                pack.write_drive_target(target, rate)
+                status, done = step(qf, qpos, qvel, passive), done + 1
+            if status:
+                pack.look(step.left())
+                step = pack.compiled_step(True, True, True, None, True)
+        results.append([qpos, qvel, target])
+    for ours, theirs in zip(*results, strict=True):
+        if ours.tobytes() != theirs.tobytes():
+            raise AssertionError("drives move otherwise in native ticks")
+    if not np.abs(results[0][0]).max() > 0.1:
+        raise AssertionError("no robot was driven")
 
 
 def _compare_calls() -> None:

@@ -161,6 +161,14 @@ class CompiledStep(Protocol):
         """Message of the engine's exception, after the status FAILED."""
 
 
+class CompiledModel(Protocol):
+    """Rigid-body model of robots in native code."""
+
+    @property
+    def address(self) -> int:
+        """Address of the model, for structures of the extension."""
+
+
 @runtime_checkable
 class CompiledPack(EnginePack, Protocol):
     """Pack whose sim steps can run in native code and in programs of XLA.
@@ -180,16 +188,24 @@ class CompiledPack(EnginePack, Protocol):
     def calls(self) -> object:
         """Object that is replaced when earlier results of :meth:`compiled_step` become invalid."""
 
-    def compiled_step(self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: Any) -> CompiledStep:
+    def compiled_step(
+        self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: Any, drives: bool = False
+    ) -> CompiledStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without both it is zero.
         Without ``velocities`` it reads zero velocities. The status reports speeds above ``speed_limit`` (dof,), if
-        given.
+        given. With ``drives`` the targets of the drives may move within a tick.
         """
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix, if joints are coupled."""
+
+    def joint_model(self) -> CompiledModel:
+        """Return the model of :meth:`joint_mass_matrix`, the same object for the life of the pack."""
+
+    def force_model(self) -> CompiledModel:
+        """Return the model of :meth:`passive_force`, where compiled steps do not read it."""
 
     def look(self, left: list[int]) -> None:
         """Handle a non-zero status of a compiled step, with the envs ``left`` from :meth:`CompiledStep.left`."""

@@ -11,6 +11,7 @@ the inertia tensor I, so that the momenta under s_j, and the mass matrix, are::
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.native.task_space_extension import BODY
 from batchpid.sim.engine.native import xla
+from batchpid.sim.robot.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
 
 
 class RigidBodies(NamedTuple):
@@ -39,10 +41,31 @@ class RigidBodies(NamedTuple):
     """Center of mass in the body's frame (dof, 3) [m]."""
     tensor: Float64
     """Inertia tensor about it, in the body's axes (dof, 3, 3) [kg m^2]."""
+    base: SpatialInertia
+    """Inertia of the base, with all that is fixed to it, in its frame."""
+    links: Mapping[str, tuple[int, Float64]]
+    """Body of each simulated link, by name, -1 for the base; and the link's pose in the frame of the body (4, 4)."""
 
     def table(self) -> Float64:
         """Return all but the tree, a row for each body (dof, 25)."""
         return np.hstack([getattr(self, name).reshape(-1, numbers) for name, numbers in BODY.items()])
+
+    def inertias(self) -> Float64:
+        """Return mass, center and tensor, a row for each body and one for the base (dof + 1, 13)."""
+        base = np.hstack([self.base.mass, self.base.center, self.base.tensor.ravel()])
+        return np.vstack([self.table()[:, -len(base) :], base])
+
+    def varied(self, added: Mapping[str, Float64]) -> Float64:
+        """Return :meth:`inertias` of n robots (n, dof + 1, 13), with spatial inertias (n, 6, 6) added to links."""
+        nominal, of_bodies = self.inertias(), dict[int, Float64]()
+        rows = np.tile(nominal, (len(next(iter(added.values()))), 1, 1))
+        for name, spatial in added.items():
+            body, place = self.links[name]
+            own = SpatialInertia(nominal[body, 0], nominal[body, 1:4], nominal[body, 4:].reshape(3, 3))
+            of_bodies[body] = of_bodies.get(body, spatial_matrix(own)) + moved_matrix(spatial, place)
+        for body, matrices in of_bodies.items():
+            rows[:, body] = inertia_rows(matrices)
+        return rows
 
 
 def mass_matrix(bodies: RigidBodies, qpos: Any) -> Any:

@@ -7,9 +7,7 @@ from batchpid.native.operations import MOST_SUMMED
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import Engine
-from batchpid.sim.loop.acting_draws import acting_actuators
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.randomization.fields import MASSES
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
@@ -23,18 +21,16 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
         return "the guard of setpoints is in NumPy"
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"
-    if reason := _engine_obstacle(options):
+    engine = options.load_engine()
+    if reason := _engine_obstacle(engine) or _force_obstacle(engine, options):
         return reason
     status = xla.status()
     return "" if status.active else status.reason
 
 
-def _engine_obstacle(options: RunnerOptions) -> str:
-    """Return why the engine has no native steps, or why these do not read the passive force; or nothing."""
-    engine = options.load_engine()
-    if "compiled_steps" not in engine.capabilities:
-        return f"the sim steps of {engine.name!r} are calls of Python"
-    return _force_obstacle(engine, options)
+def _engine_obstacle(engine: Engine) -> str:
+    """Return why the engine has no native steps, or nothing."""
+    return "" if "compiled_steps" in engine.capabilities else f"the sim steps of {engine.name!r} are calls of Python"
 
 
 def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
@@ -47,40 +43,31 @@ def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
     return ""
 
 
-def native_obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
-    """Return why the sim steps of a tick cannot be one native call, under backend "numpy"; or nothing."""
-    control, randomization = options.control, options.randomization
+def native_obstacle(options: RunnerOptions) -> str:
+    """Return why the sim steps of a tick cannot be one native call, without XLA; or nothing."""
+    control = options.control
     if isinstance(control, OperationalSpace):
         if not control.is_native:
-            return "task space takes the compensation of friction, or a subclass' law, from NumPy"
+            return "the law of a subclass of OperationalSpace is one of Python"
     elif not isinstance(control, str):
         return "the controller is one of Python"
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
-    engine = options.load_engine()
-    if "compiled_steps" not in engine.capabilities:
-        return f"the sim steps of {engine.name!r} are calls of Python"
-    if options.robot.fixed_base or "gravity" not in options.compensate:
-        return ""
-    acting = acting_actuators(options, actuators, None)
-    if acting is not None and acting.measures:
-        return "on a floating base the passive force at a sensor's reading is NumPy's"
-    if randomization is not None and MASSES & randomization.given.keys():
-        return "on a floating base the passive force of varied masses is NumPy's"
-    return _force_obstacle(engine, options)
+    return _engine_obstacle(options.load_engine())
 
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return the library of the law, and the kind of the calls into the engine, with reasons."""
     engine = options.load_engine().title
     calls = native.status().describe(engine)
-    if options.control == "drive":
-        return f"law in {engine} (control 'drive'), {calls}"
-    if options.backend == "numpy":
+    drives = options.control == "drive"
+    if drives or options.backend == "numpy":
         active = native.status().active
         compiled = active and (options.control == "pid" or isinstance(options.control, OperationalSpace))
-        reason = native_obstacle(options, actuators) if active else ""
+        reason = native_obstacle(options) if active else ""
         each = f", a call each sim step ({reason})" if reason else ""
+        if drives:
+            return f"law in {engine} (control 'drive'){each}, {calls}"
         return f"law {'as a native program' if compiled else 'in NumPy'}{each}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"

@@ -152,6 +152,8 @@ class Model(NamedTuple):
     """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
     joint_mass_matrix: Any = None
     """qpos -> effective mass matrix of the joints, armature of the motors included."""
+    refresh: Any = None
+    """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""
     passive_force: Any = None
     """qpos, qvel -> passive force of the description, for a measured state that differs from the joints' state."""
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
@@ -196,7 +198,7 @@ def control_step(
         limits = stages.limits(constants.motors, seen, seen_rate)
         if layout.measures and layout.model.passive_force is not None:
             passive = layout.model.passive_force(seen, seen_rate)
-    forward = _feedforward(constants, command, seen, passive)
+    forward = feedforward(constants, command, seen, passive)
     given = Inputs(command, Measured(seen, seen_rate, forward), limits, step)
     state, outputs = _CONTROLS[layout.control](layout, constants, state, given)
     motor = outputs.motor
@@ -217,10 +219,14 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
     return matrix if constants.coupling is None else constants.coupling.mass_matrix(matrix)
 
 
-def joint_mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
-    """Return the friction model's mass matrix (M, dof, dof), for the leaders only."""
+def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpos: Any) -> FrictionState:
+    """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
+    if layout.model.refresh is not None:
+        return layout.model.refresh(friction, qpos)
     matrix = layout.model.joint_mass_matrix(qpos)
-    return matrix if constants.coupling is None else constants.coupling.mass_matrix(matrix)
+    if constants.coupling is not None:
+        matrix = constants.coupling.mass_matrix(matrix)
+    return friction_model.refresh(constants.friction, friction, matrix, constants.timestep, *constants.drive)
 
 
 def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
@@ -239,7 +245,7 @@ def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple
     return state, command._replace(setpoint=setpoint, setpoint_rate=rate), changed
 
 
-def _feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
+def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
     if forward is not None and constants.coupling is not None:
@@ -324,9 +330,7 @@ def apply_friction(
         xp, due = namespace(age), age == REFRESH_STEPS
 
         def fresh() -> FrictionState:
-            matrix = joint_mass_matrix(layout, constants, measured.qpos)
-            new = friction_model.refresh(model, friction, matrix, constants.timestep, *constants.drive)
-            return replace_envs(friction, new, due)
+            return replace_envs(friction, refreshed(layout, constants, friction, measured.qpos), due)
 
         friction = layout.model.when(due, fresh, friction)
         age = xp.where(due, 0, age) + 1

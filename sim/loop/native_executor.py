@@ -1,13 +1,12 @@
 """Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Sensors have another program, and Python draws their noise in advance.
-Where the engine's steps do not read the passive force of the model, as at a measured state or with varied masses, a
-native call computes it; on a floating base Python does, and each sim step is a call. With coupled joints every four sim
-steps are a call, since Python updates the mass matrix of the constraint efforts. Operational-space control is a native
-call before the program, which takes its effort as an input. Where the control step cannot be traced (a caller's
-controller, drives whose targets move within a tick), it runs in NumPy, and one native call applies the efforts, steps
-the engine and reads it. A sim step in which the friction model updates its mass matrix runs in the same way.
+arrays that hold the state from step to step. Before and after it, native code updates the inertia of the friction model
+and the constraint of coupled joints, writes the targets of drives, and computes the passive force where the engine's
+steps do not read that of the model. Sensors have another program; Python draws their noise in advance, for 64 sim steps
+at once. Operational-space control is a native call before the program, which takes its effort as an input. With a
+controller of Python, or more joints than a program sums, the control step runs in NumPy, and one native call applies
+the efforts, steps the engine and reads it.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
-from batchpid.sim.engine.batch_dynamics import NativePassiveForce, passive_force_of
 from batchpid.sim.engine.native.interface import STATUS
-from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep, DrivenPack
+from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.control_step import REFRESH_STEPS, Constants, Layout, Measured, Step, StepState, control_step
+from batchpid.sim.loop.control_step import Constants, Layout, Measured, StepState
 from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran, Stopped
 from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
-from batchpid.sim.loop.tick_program import TickProgram
+from batchpid.sim.loop.tick_program import TickProgram, moves_drives
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
@@ -46,43 +45,28 @@ class NativeExecutor(NumPyExecutor):
         self._bound: object = None
         self._ticks: dict[tuple[bool, bool], TickProgram] = {}
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
-        self._calls_force = self._reads_force and not self._steps_read_force
-        calls_force = self._calls_force or (layout.measures and self._gravity)
-        force = passive_force_of(pack.spec, True) if calls_force else None
-        self._force = force if isinstance(force, NativePassiveForce) else None
-        self._by_step = calls_force and self._force is None
+        self._force: CompiledModel | None = None
+        if layout.measures and self._gravity:
+            self._force = NativeModel(pack.spec)
+        elif self._reads_force and not self._steps_read_force:
+            self._force = pack.force_model()
         has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
         if layout.control == "custom":
-            has_own_law = options.backend == "numpy" and _is_native(self._controller, layout, constants)
-        self._compiles = has_own_law and is_compiled(layout, constants, pack.dof)
+            has_own_law = options.backend == "numpy" and _is_native(self._controller)
+        self._compiles = has_own_law and is_compiled(constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
-        if not self._compiles or (self._controller is not None and command.feedforward is not None):
+        if not self._compiles:
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
         program.load(state, measured, command)
-        if self._layout.control == "drive" and isinstance(self._pack, DrivenPack):
+        if self._layout.control == "drive" and isinstance(self._pack, DrivenPack) and program.outputs.target is None:
             rate = command.setpoint_rate
             self._pack.write_drive_target(command.setpoint, np.zeros_like(command.setpoint) if rate is None else rate)
         done, status = begin, 0
         while done < end and not status:
-            self._update_constraint(done)
-            due = end if state.age is None else done + REFRESH_STEPS - int(program.state.age.max())
-            if is_program := due > done:
-                if self._by_step and self._layout.measures:
-                    program.reading.passive[...] = self._layout.model.passive_force(*program.measure())
-                until = done + 1 if self._by_step else min(due, end)
-                if self._constants.coupling is not None:
-                    until = min(until, done - done % COUPLING_STEPS + COUPLING_STEPS)
-                done, status = program.run(self._prepared(), done, until, end)
-            else:
-                step, now = Step(done, end, done + 1 == end), (program.state, command, program.measured)
-                program.take(*control_step(self._layout, self._constants, *now, step))
-                status = self._native_step(program.outputs.qf, *program.reading)
-                done += 1
-            if self._calls_force and not (is_program and self._force):
-                program.reading.passive[...] = self._pack.passive_force(self._gravity, self._coriolis)
+            done, status = program.run(self._prepared(), done, end)
         return self._ran(program, done, status)
 
     def _ran(self, program: TickProgram, done: int, status: int) -> Ran:
@@ -92,9 +76,9 @@ class NativeExecutor(NumPyExecutor):
 
     def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
         """Return the ticks under commands like ``command`` as :meth:`NumPyExecutor.quiet_ticks` does."""
-        layout, needs_force = self._layout, self._calls_force and self._force is None
-        needs_python = self._constants.coupling is not None or state.age is not None or layout.measures or needs_force
-        if needs_python or not (self._compiles and self._reads_qvel) or layout.control not in ("pid", "effort"):
+        layout = self._layout
+        is_whole = self._compiles and self._reads_qvel and not layout.measures
+        if not (is_whole and layout.control in ("pid", "effort")):
             return None
         return QuietTicks(self._program(state, command), arrays, shown)
 
@@ -107,11 +91,6 @@ class NativeExecutor(NumPyExecutor):
         tick, done, status = ticks.run(self._prepared(), first, until, steps)
         return Stopped(tick, partial(self._ran, program, done, status) if done else None)
 
-    def _update_constraint(self, index: int) -> None:
-        """Update the constraint efforts of coupled joints, if it is time for it before sim step ``index``."""
-        if self._constants.coupling is not None and index % COUPLING_STEPS == 0:
-            self._pack.update_constraint()
-
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
         own = {name: np.array(leaf) for name, leaf in state.law.items()} if isinstance(state.law, dict) else state.law
@@ -119,7 +98,8 @@ class NativeExecutor(NumPyExecutor):
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
-        self._update_constraint(index)
+        if self._constants.coupling is not None and index % COUPLING_STEPS == 0:
+            self._pack.update_constraint()
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._native_step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
         if not self._reads_force:
@@ -147,7 +127,8 @@ class NativeExecutor(NumPyExecutor):
             limit = None if self._speed_limit is None else np.asarray(self._speed_limit)
             reads_force = self._reads_force and self._steps_read_force
             force = (self._gravity, self._coriolis) if reads_force else (False, False)
-            self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit)
+            moves = moves_drives(self._layout, self._constants)
+            self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit, moves)
         return self._step
 
     def _program(self, state: StepState, command: Command) -> TickProgram:
@@ -163,19 +144,18 @@ class NativeExecutor(NumPyExecutor):
                 (self._gravity, self._coriolis),
                 self._controller,
                 self._force,
+                COUPLING_STEPS,
             )
         return self._ticks[key]
 
 
-def _is_native(controller: Any, layout: Layout, constants: Constants) -> bool:
-    """Return whether a controller is native: operational-space control without friction compensation."""
+def _is_native(controller: Any) -> bool:
+    """Return whether a controller is native: operational-space control."""
     if not isinstance(controller, OperationalSpace):
         return False
-    return constants.known is None and controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
+    return controller.bound(*np.zeros((3, 1, controller.tree.dof))) is not None
 
 
-def is_compiled(layout: Layout, constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: float64, drive targets constant in a tick."""
-    rests = constants.driven is None and constants.guard is None
-    fits = layout.control in ("pid", "effort", "custom") or (layout.control == "drive" and rests)
-    return fits and dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))
+def is_compiled(constants: Constants, dof: int) -> bool:
+    """Return whether the control step can be a program: in float64, of few joints."""
+    return dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))

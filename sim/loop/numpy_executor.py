@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
-from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
+from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.control_step import (
+    REFRESH_STEPS,
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    control_step,
+)
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
@@ -130,6 +140,11 @@ def with_model(
         model = model._replace(controller=call)
     if motors is not None:
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
+    if constants.friction.coulomb is not None and _is_native(pack):
+        given = constants.friction, constants.drive, constants.coupling, constants.timestep
+        model = model._replace(
+            refresh=NativeRefresh(pack.joint_model(), pack.size, pack.armature, *given, REFRESH_STEPS)
+        )
     if gravity:
         force = passive_force_of(pack.spec, _is_native(pack))
         model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, gravity, coriolis))
@@ -140,7 +155,7 @@ def _zeros_for_none(outputs: Outputs) -> Float64:
     return np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
 
 
-def _is_native(pack: EnginePack) -> bool:
+def _is_native(pack: EnginePack) -> TypeGuard[CompiledPack]:
     return isinstance(pack, CompiledPack) and pack.steps_natively
 
 

@@ -21,8 +21,8 @@ from batchpid.sim.loop.control_step import (
     Constants,
     Layout,
     StepState,
-    joint_mass_matrix,
     mass_matrix,
+    refreshed,
 )
 from batchpid.sim.loop.pid_law import PIDLaw
 
@@ -35,8 +35,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     velocity, load = pack.read_qvel(), pack.passive_force(True, True)
     if constants.coupling is not None:
         load = constants.coupling.efforts(load)
-    matrix = joint_mass_matrix(layout, constants, pack.read_qpos())
-    fresh = friction_model.init(model, velocity, load, matrix, constants.timestep, *constants.drive)
+    fresh = refreshed(layout, constants, friction_model.started(velocity, load), pack.read_qpos())
     age = np.zeros(pack.size, np.int64)
     if state.age is not None:
         fresh, age = replace_envs(state.friction, fresh, mask), np.where(mask, 0, state.age)

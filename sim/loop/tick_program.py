@@ -13,20 +13,30 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Stack, Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.native.trees import filled, leaves, mapped, structure
-from batchpid.sim.engine.batch_dynamics import NativePassiveForce
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
+from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.control_step import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    control_step,
+    feedforward,
+)
 
 
 class TickProgram:
     """Control step of a group of envs as a program, and its arrays.
 
     ``compensated`` says whether gravity is compensated, and whether Coriolis and centrifugal forces are. A
-    ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force`` computes
-    the passive force where the engine's steps do not read it.
+    ``controller`` (:class:`batchpid.sim.OperationalSpace`) runs as a native call before the program. ``force`` is the
+    model of the passive force where the engine's steps do not read it. Constraint efforts keep their mass matrix for
+    ``coupling_steps``.
 
     Attributes
     ----------
@@ -46,8 +56,9 @@ class TickProgram:
         state: StepState,
         command: Command,
         compensated: tuple[bool, bool],
-        controller: Any = None,
-        force: NativePassiveForce | None = None,
+        controller: Any,
+        force: CompiledModel | None,
+        coupling_steps: int,
     ) -> None:
         shape, law, matrix = (pack.size, pack.dof), layout.law, None
         if law is not None and law.needs_matrix:
@@ -59,21 +70,26 @@ class TickProgram:
         self._constants = mapped(_stacked, constants)
         self.before = np.zeros(shape)
         at = self.reading[:2] if self._seen is None else self._seen
-        self._control = None if controller is None else controller.bound(*at, self.reading.passive)
-        self._force: tuple[Any, ...] = ()
-        if force is not None:
-            bound, address = force.bind(*compensated, *at, self.reading.passive)
-            self._force = force, bound, {"measured_force" if layout.measures else "read_force": address}
+        self.command = command.map(lambda rows: np.zeros(shape))
+        if controller is not None:  # it has its own copy of setpoints, of any size
+            self.command = self.command._replace(setpoint=None)
+        forward = None if controller is None else self._make_forward()
+        bias = self.reading.passive if forward is None else forward[-1][0]
+        self._control = None if controller is None else controller.bound(*at, bias)
+        self._kept = force, layout.model.refresh
         self._noise = layout.model.noise
         self._sensors = self._make_sensors() if layout.measures else None
-        self._senses = layout.measures and not (compensated[0] and force is None)
         if self._control is not None:
             self.state = self.state._replace(law=self._control.state)
-            command = command._replace(setpoint=None)  # the controller has its own copy, of any size
-        self.command = command.map(lambda rows: np.zeros(shape))
         guarded = None if constants.guard is None else np.zeros(shape, bool)
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
+        arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
+        if moves_drives(layout, constants):
+            target, rate = np.zeros((2, *shape))
+            arrays |= {"target": target, "target_rate": rate}
+            known = None if command.setpoint_rate is None else rate
+            self.outputs = self.outputs._replace(target=target, target_rate=known)
         if self._control is not None:
             self.outputs = self.outputs._replace(returned=self._control.effort)
         fixed = self.state._replace(age=None, motors=_motor_side(self.state.motors))
@@ -85,12 +101,14 @@ class TickProgram:
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
         results = [*leaves(_returned(fixed)), *leaves(self.outputs._replace(returned=None))]
-        arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
+        if self._seen is not None:
+            arrays |= zip(("pose", "rate"), self._seen, strict=True)
+        if (age := self.state.age) is not None:
+            arrays |= {"age": age, "gain": self.state.friction.gain, "memory": self.state.friction.memory}
         if matrix is not None:
             bodies = scene_dynamics(pack.spec).bodies
             tree = np.ascontiguousarray(bodies.tree, np.int32)
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
-            arrays |= {} if self._seen is None else dict(zip(("pose", "rate"), self._seen, strict=True))
             arrays |= {"armature": constants.armature, "damping": constants.damping}
             if (coupling := constants.coupling) is not None:
                 arrays |= {"leader": coupling.leader.astype(np.int32), "multiplier": coupling.multiplier}
@@ -103,8 +121,13 @@ class TickProgram:
             matrix_steps=steps,
             whole=whole,
             control=None if self._control is None else self._control.address,
-            sensors=self._sensors if self._senses else None,
-            **(self._force[-1] if self._force else {}),
+            compensated=compensated,
+            refresh=None if age is None else layout.model.refresh.address,
+            coupling_steps=coupling_steps,
+            sensors=self._sensors,
+            forward=forward,
+            measured_force=force.address if force is not None and layout.measures else None,
+            read_force=None if force is None or layout.measures else force.address,
             **arrays,
         )
 
@@ -124,13 +147,13 @@ class TickProgram:
             if array is not None:
                 array[...] = value
 
-    def run(self, step: CompiledStep, begin: int, until: int, end: int) -> tuple[int, int]:
-        """Run sim steps from ``begin`` to ``until`` of a tick of ``end`` steps; return steps done and status.
+    def run(self, step: CompiledStep, begin: int, end: int) -> tuple[int, int]:
+        """Run sim steps from ``begin`` on of a tick of ``end`` steps; return steps done and status.
 
         Fewer steps are done after an event, and where the noise of the sensors has to be drawn.
         """
-        noise = leaves(self._draw()) if self._senses else []
-        until = min([until, *(begin + len(block) for block in noise)])
+        noise = [] if self._sensors is None else leaves(self._draw())
+        until = min([end, *(begin + len(block) for block in noise)])
         done, status = self._tick.run(step.prepare(), begin, until, end, *noise)
         self._count(done - begin)
         return done, status
@@ -142,46 +165,34 @@ class TickProgram:
         return tick, done, status
 
     def _count(self, steps: int) -> None:
-        """Count sim steps in the state."""
-        if self.state.age is not None:
-            self.state.age[...] += steps
+        """Count sim steps in the state of the motors."""
         if self.state.motors is not None and self.state.motors.step is not None:
             self.state.motors.step[...] += steps
-
-    def measure(self) -> Any:
-        """Advance the sensors; return positions and velocities as measured. Only :meth:`run` counts the step.
-
-        It comes before each :meth:`run` of one step where the passive force at a measured state is Python's.
-        """
-        assert self._sensors is not None
-        program, inputs, outputs = self._sensors
-        for place, block in zip(self._drawn, leaves(self._draw()), strict=True):
-            place[...] = block[0]
-        program(*inputs, out=outputs)
-        return self._seen
 
     def _draw(self) -> tuple[Any, Any]:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
         return self._noise.from_step(self._constants.motors, self.state.motors, self.before) or (None, None)
+
+    def _make_forward(self) -> tuple[ArrayProgram, list[Float64], list[Float64]] | None:
+        """Return the program of a controller's feedforward, its inputs and its output; None for the passive force."""
+        command, passive = self.command, self.measured.passive
+        if command.feedforward is None and (passive is None or self._constants.coupling is None):
+            return None
+        inputs, k = leaves((command, passive)), self._constants
+        traced = _trace_forward(*map(structure, (k, command, passive)))
+        program = ArrayProgram(traced, leaves(k), len(inputs), self.reading.qpos.shape)
+        return program, inputs, [np.zeros_like(self.reading.qpos)]
 
     def _make_sensors(self) -> tuple[ArrayProgram, list[Float64], list[Float64]]:
         """Return the program of the sensors, its inputs and its outputs."""
         assert self.state.motors is not None
         side, k = _sensor_side(self.state.motors), self._constants.motors
         noise = mapped(lambda block: block[0].copy(), self._draw())
-        self._drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
+        drawn, fixed = leaves(noise), leaves((side, *self.reading[:2]))
         traced = _trace_sensors(*map(structure, (k, side, *self.reading[:2], noise)))
-        inputs = [*fixed, *self._drawn]
+        inputs = [*fixed, *drawn]
         program = ArrayProgram(traced, leaves(k), len(inputs), self.reading.qpos.shape)
         return program, inputs, [*leaves(side.encoder), *leaves(self._seen)]
-
-    def take(self, state: StepState, outputs: Outputs) -> None:
-        """Copy the results of a control step in NumPy."""
-        self._copy(state)
-        self.before[...] = self.measured.qpos
-        for name in ("qf", "motor", "saturated", "guarded"):
-            if (array := getattr(outputs, name)) is not None:
-                getattr(self.outputs, name)[...] = array
 
     def _copy(self, state: StepState) -> None:
         if self._control is not None:
@@ -193,9 +204,14 @@ class TickProgram:
             self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
 
 
+def moves_drives(layout: Layout, constants: Constants) -> bool:
+    """Return whether the targets of the engine's drives move within a tick."""
+    return layout.control == "drive" and (constants.driven is not None or constants.guard is not None)
+
+
 @lru_cache(maxsize=64)
 def _trace(layout: Layout, *structures: Any) -> Trace:
-    """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints.
+    """Return the trace of the control step: new state, qf, effort of the motors, saturated and guarded joints, targets.
 
     ``structures`` describe constants, state, command, reading, measured positions and velocities, and of a controller
     the effort and the joints where it is limited. No update of mass matrix or friction is due.
@@ -214,7 +230,11 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
         new, outputs = control_step(layout._replace(model=model), k, start, command, measured, Step(0, 1))
         results = leaves(_returned(new._replace(age=None)))
         assert len(results) == len(leaves(_returned(before)))
-        return [*results, *leaves(outputs._replace(returned=None, target=None, target_rate=None))]
+        outputs = outputs._replace(returned=None)
+        return [
+            *results,
+            *leaves(outputs if moves_drives(layout, k) else outputs._replace(target=None, target_rate=None)),
+        ]
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
@@ -231,6 +251,19 @@ def _trace_sensors(*structures: Any) -> Trace:
         given = iter(symbols)
         new, *seen = advance_measurement(*(filled(each, given) for each in structures))
         return [*leaves(new.encoder), *seen]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+@lru_cache(maxsize=64)
+def _trace_forward(*structures: Any) -> Trace:
+    """Return the trace of the feedforward; ``structures`` describe constants, command and passive force."""
+
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        k, command, passive = (filled(each, given) for each in structures)
+        return [feedforward(k, command, None, passive)]
 
     first = len(leaves(structures[0]))
     return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))

@@ -40,13 +40,36 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
 
     S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
     """
-    (x, y, z), mass = inertia.center, inertia.mass
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    mass, cross = inertia.mass, _cross_matrix(inertia.center)
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = mass * np.eye(3)
     matrix[:3, 3:], matrix[3:, :3] = -mass * cross, mass * cross
     matrix[3:, 3:] = inertia.tensor - mass * cross @ cross
     return matrix
+
+
+def moved_matrix(matrix: Float64, place: Float64) -> Float64:
+    """Return spatial matrices (..., 6, 6) in the frame in which their own has the homogeneous pose ``place`` (4, 4)."""
+    turn = np.zeros((6, 6))  # velocity (v, w) in the matrices' frame, from the velocity in the other one
+    turn[:3, :3] = turn[3:, 3:] = place[:3, :3].T
+    turn[:3, 3:] = -place[:3, :3].T @ _cross_matrix(place[:3, 3])
+    return turn.T @ matrix @ turn
+
+
+def inertia_rows(matrices: Float64) -> Float64:
+    """Return mass, center and inertia tensor, a row for each spatial matrix (n, 6, 6): (n, 13)."""
+    mass = matrices[:, 0, 0, None]
+    center = matrices[:, [5, 3, 4], [1, 2, 0]] / mass
+    cross = _cross_matrix(center)
+    tensor = matrices[:, 3:, 3:] + mass[:, :, None] * cross @ cross
+    return np.hstack([mass, center, tensor.reshape(-1, 9)])
+
+
+def _cross_matrix(vector: Float64) -> Float64:
+    """Return C (..., 3, 3) with C a = c x a for vectors c (..., 3)."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    return np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), (0, 1), (-2, -1))
 
 
 def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:

@@ -35,6 +35,7 @@ class BoundOSC:
         parts: Mapping[str, slice],
         columns: NDArray[np.intp],
         damping: Float64 | None,
+        friction: tuple[Float64, Float64] | None,
         timestep: float,
         reading: tuple[Float64, Float64, Float64],
     ) -> None:
@@ -55,6 +56,8 @@ class BoundOSC:
         known["limited"] = self.limited
         if damping is not None:
             known |= {"damping": damping, "added_inertia": timestep * damping}
+        if friction is not None:
+            known |= dict(zip(("coulomb", "band"), friction, strict=True))
         tree, link, point = tool
         bound = native_law.bind(tree, link, point, k, {**self._given, **known})
         assert bound is not None

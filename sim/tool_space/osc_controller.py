@@ -24,7 +24,7 @@ from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tool_space.bound_osc import BoundOSC
-from batchpid.task_space import native_rows
+from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import pose_error
 from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
@@ -199,7 +199,7 @@ class OperationalSpace:
             added = self._timestep * (self._damping[:, None] * xp.eye(qpos.shape[1]))
             dynamics = dynamics._replace(mass_matrix=dynamics.mass_matrix + added.astype(qpos.dtype))
         if self._friction is not None:
-            friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture - qpos, dynamics)
+            friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture, qpos, dynamics)
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
         new, terms = ts.advance_terms(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
@@ -207,25 +207,30 @@ class OperationalSpace:
 
     @property
     def is_native(self) -> bool:
-        """Whether native code has this law: not that of a subclass, and not with compensation of friction."""
-        return type(self) is OperationalSpace and self._friction is None
+        """Whether native code has this law: not that of a subclass."""
+        return type(self) is OperationalSpace
 
     def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:
         """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
         if not self.is_native or native_rows.in_use() is None:
             return None
         tool = self.tree, self.link, self.point
-        given = self._parts, self._columns, self._damping, self._timestep
+        given = self._parts, self._columns, self._damping, self._friction, self._timestep
         return BoundOSC(self._k, tool, *given, (qpos, qvel, passive))
 
     def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""
         return self._k
 
-    def _friction_to(self, setpoint: Any, twist: Any, others: Any, dynamics: ts.TaskDynamics) -> Any:
-        """Return the friction (envs, dof) on the way to the setpoint; ``others`` is the way of the other joints."""
+    def _friction_to(self, setpoint: Any, twist: Any, posture: Any, qpos: Any, dynamics: ts.TaskDynamics) -> Any:
+        """Return the friction (envs, dof) on the way to the setpoint; joints outside the chain go to ``posture``."""
         assert self._friction is not None
-        error, j = pose_error(setpoint[:, :7], dynamics.pose), dynamics.jacobian
+        arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
+        arrays |= {"setpoint": setpoint[:, :7], "twist": twist, "posture": posture, "qpos": qpos}
+        found = native_law.friction({**arrays, **self._friction._asdict()})
+        if found is not None:
+            return found
+        error, j, others = pose_error(setpoint[:, :7], dynamics.pose), dynamics.jacobian, posture - qpos
         ahead = error if twist is None else error + LOOKAHEAD * twist
         rows, eye = namespace(j).swapaxes(j, -1, -2), 1e-4 * namespace(j).eye(6)
         moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]

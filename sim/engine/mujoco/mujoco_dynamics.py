@@ -114,7 +114,7 @@ def bodies_of(spec: SceneSpec) -> RigidBodies:
     model, dof = robot.model, len(robot.qvel)
     order = {int(model.dof_jntid[index]): number for number, index in enumerate(robot.qvel)}
     places: dict[int, tuple[int, Float64]] = {0: (-1, np.eye(4))}  # of each body: its joint, and its place in its frame
-    parts: list[list[SpatialInertia]] = [[] for _ in range(dof)]
+    parts: list[list[SpatialInertia]] = [[] for _ in range(dof + 1)]  # the last are the base's
     tree, at_zero = np.tile(np.array([-1, 0], np.int32), (dof, 1)), np.tile(np.eye(4), (dof, 1, 1))
     for body in range(1, model.nbody):
         above, place = places[int(model.body_parentid[body])]
@@ -128,13 +128,19 @@ def bodies_of(spec: SceneSpec) -> RigidBodies:
             tree[above] = number, model.jnt_type[joint] == 2
             at_zero[above], place = place @ turned, turned.T
         places[body] = above, place
-        if above >= 0 and model.body_mass[body] > 0:
+        if model.body_mass[body] > 0:
             at = place @ _matrix(model.body_ipos[body], model.body_iquat[body])
             tensor = at[:3, :3] @ np.diag(model.body_inertia[body]) @ at[:3, :3].T
             parts[above].append(SpatialInertia(float(model.body_mass[body]), at[:3, 3], tensor))
-    bodies = zip(*(total(of_joint) for of_joint in parts), strict=True)
-    table = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, bodies))
+    *bodies, base = [total(of_joint or [_NO_BASE]) for of_joint in parts]
+    mass, center, tensor = map(np.array, zip(*bodies, strict=True))
+    links = {name: places[body] for name, body in robot.bodies.items()}
+    table = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links)
     return RigidBodies._make(map(read_only, table))
+
+
+_NO_BASE = SpatialInertia(1e-12, np.zeros(3), np.zeros((3, 3)))
+"""Inertia of a fixed base, which MuJoCo does not simulate."""
 
 
 def _matrix(position: Float64, wxyz: Float64) -> Float64:

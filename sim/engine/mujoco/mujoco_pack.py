@@ -18,7 +18,6 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import mass_matrix_of, passive_force_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.batch_model import FLOATING, BatchModel, set_inertia
@@ -26,10 +25,12 @@ from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.model_builder import LARGEST_FORCE, RobotMj, robot_model
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, functions
 from batchpid.sim.engine.native.interface import FARTHEST
+from batchpid.sim.engine.native_model import NativeModel, passive_force_of
 from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
 
 Float64 = NDArray[np.float64]
 
@@ -65,6 +66,8 @@ class MujocoPack(SingleOwner):
         self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))
         varies_links = varied.link_mass is not None or varied.center_of_mass is not None
         self._bodies = varied_bodies(spec, carrier, links if varies_links else []) if self._masses_vary else {}
+        self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
+        self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the nominal
         self.qf = np.zeros((size, self.dof))
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
@@ -75,6 +78,11 @@ class MujocoPack(SingleOwner):
         self._continuous = np.array([joint.continuous for joint in spec.joints])
         if coupling is not None:
             self._constraint = ConstraintEfforts(size, coupling, self._continuous, spec.timestep)
+            self._constraint.implicit[...] = self._implicit
+            if self.steps_natively:
+                self._constraint.use(
+                    self._joint_model, None if self.steps_read_force(True, True) else self._force_model
+                )
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
         self._make_data(robot_model(spec))
         if variation is not None:
@@ -128,6 +136,10 @@ class MujocoPack(SingleOwner):
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
+        if self.steps_natively:
+            state = self.read_qpos(), self.read_qvel()
+            turning = None if self.spec.fixed_base else np.array([data.qvel[3:FLOATING] for data in self._data])
+            return self._force_model.passive_force(*state, gravity, coriolis, turning).astype(dtype)
         if self.spec.fixed_base:
             return self._passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis).astype(dtype)
         force = np.zeros((self.size, self.dof))
@@ -144,7 +156,26 @@ class MujocoPack(SingleOwner):
 
     @cached_property
     def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, self.steps_natively)
+        return passive_force_of(self.spec, False)
+
+    def force_model(self) -> NativeModel:
+        """Return the model of the passive force where compiled steps do not read it."""
+        return self._force_model
+
+    @cached_property
+    def _force_model(self) -> NativeModel:
+        return NativeModel(self.spec, not self.spec.fixed_base)
+
+    def joint_model(self) -> NativeModel:
+        """Return the model of :meth:`joint_mass_matrix` in native code."""
+        return self._joint_model
+
+    @cached_property
+    def _joint_model(self) -> NativeModel:
+        model = NativeModel(self.spec, not self.spec.fixed_base)
+        if self._masses_vary:
+            model.vary(range(self.size), self.size, self._added)
+        return model
 
     @cached_property
     def _model(self) -> BatchModel:
@@ -158,6 +189,8 @@ class MujocoPack(SingleOwner):
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
+        if self.steps_natively:
+            return self._joint_model.mass_matrix(qpos)
         self._varied_model.compute(qpos)
         return self._varied_model.joint_mass_matrix()
 
@@ -206,27 +239,29 @@ class MujocoPack(SingleOwner):
         return self._calls
 
     def compiled_step(
-        self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+        self,
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: NDArray[np.float64] | None,
+        drives: bool = False,
     ) -> MujocoStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
-        reads_force = gravity and coriolis
-        return self._make_step(reads_force, speed_limit)
+        return self._make_step(gravity and coriolis, speed_limit, drives)
 
-    def _make_step(self, reads_force: bool, speed_limit: NDArray[np.float64] | None) -> MujocoStep:
+    def _make_step(
+        self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
+    ) -> MujocoStep:
         constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
-        return MujocoStep(self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint)
+        moving = (self._stiffness, self._rate_gain, self._continuous) if drives else None
+        return MujocoStep(
+            self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving
+        )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
-            matrix = self._constraint_matrix(self.read_qpos()) + self._implicit[:, None] * np.eye(self.dof)
-            self._constraint.update(matrix[rows], self.passive_force(True, True)[rows], rows)
-
-    @cached_property
-    def _constraint_matrix(self) -> Callable[[Float64], Float64]:
-        """Function of positions that returns the mass matrices for the constraint efforts."""
-        native_model = self.steps_natively and self.steps_read_force(True, True)
-        return mass_matrix_of(self.spec, True) if native_model else self.joint_mass_matrix
+            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), self.passive_force(True, True), rows)
 
     def look(self, left: list[int]) -> None:
         """Do nothing: MuJoCo needs no care before a contact."""
@@ -260,6 +295,8 @@ class MujocoPack(SingleOwner):
         self.armature = self._motors + (0.0 if added is None else added)
         viscous = self.friction.viscous
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
+        if self._constraint is not None:
+            self._constraint.implicit[...] = self._implicit
         values = np.broadcast_to(self._implicit, self.qf.shape)
         for row in range(self.size) if rows is None else rows:
             if not np.array_equal(self.models[row].dof_armature[self._robot.qvel], values[row]):
@@ -298,9 +335,13 @@ class MujocoPack(SingleOwner):
         for row in rows:
             model = self._own_model(row)
             for name, body in self._bodies.items():
-                set_inertia(model, self._robot.bodies[name], varied_inertia(body, self._variation, row))
+                inertia = varied_inertia(body, self._variation, row)
+                set_inertia(model, self._robot.bodies[name], inertia)
+                self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
             mujoco.mj_setConst(model, self._scratch)
         self.__dict__.pop("_varied_model", None)
+        if "_joint_model" in self.__dict__:
+            self._joint_model.vary(list(rows), self.size, self._added)
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof).

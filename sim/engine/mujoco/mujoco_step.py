@@ -30,7 +30,7 @@ FUNCTIONS = {
 """Functions of MuJoCo's library, by field of the structures in :mod:`batchpid.sim.engine.native.interface`."""
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
-FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias"}
+FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias", "ctrl": "ctrl"}
 """Arrays of ``mujoco.MjData``, by field."""
 
 
@@ -73,6 +73,9 @@ class MujocoStep:
         Joint speed beyond which the status says so (dof,), or None.
     constraint
         Address of the constraint of coupled joints, or None.
+    drives
+        Stiffness and rate gain of the drives (robots, dof), and the joints that are continuous (dof,), if the targets
+        move within a tick.
     """
 
     def __init__(
@@ -85,6 +88,7 @@ class MujocoStep:
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
+        drives: tuple[NDArray[Any], ...] | None = None,
     ) -> None:
         found, data = functions(), take_data()
         assert found is not None
@@ -99,6 +103,8 @@ class MujocoStep:
         }
         arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
+        if drives is not None:
+            arrays |= zip(("stiffness", "rate_gain", "continuous"), drives, strict=True)
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
         robots.clearance = None if clearance is None else clearance.address
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)

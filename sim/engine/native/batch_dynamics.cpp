@@ -6,7 +6,6 @@
 #include <vector>
 
 #include "batchpid/native/buffer.h"
-#include "batchpid/native/call.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/rigid_body.h"
@@ -138,83 +137,6 @@ FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, doub
   }
 }
 
-// Write the passive forces of rows of robots without payload, in the order of write_dynamics.
-FOR_EACH_PROCESSOR void write_forces(Tree const &tree, std::int64_t rows, double const *qpos, double const *qvel,
-                                     double *out) {
-  std::int64_t const joints = tree.joints, dof = tree.dof;
-  std::int32_t const *above = tree.tree.data();
-  Workspace work(dof);
-  std::vector<Lanes> force(joints);
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    BodyState<Lanes> *bodies = work.bodies.data();
-    BodyMotion<Lanes> *motions = work.motions.data();
-    set_bodies(tree, work, qpos, qvel, first, rows);
-    for (std::int64_t i = 0; i < dof; ++i) motions[i].accelerate(bodies[i].inertia);
-    efforts_of_wrenches(dof, above, bodies, motions, work.effort.data());
-    std::fill(force.begin(), force.end(), Lanes{});
-    for (std::int64_t i = 0; i < dof; ++i) {
-      if (tree.leader[i] >= 0) force[tree.leader[i]] += tree.multiplier[i] * work.effort[i];
-    }
-    for (std::int64_t k = 0; k < joints; ++k) scatter(force[k], out, joints, k, first, rows);
-  }
-}
-
-// Parts of the passive forces of some robots, on fixed arrays.
-struct BoundForce : Call {
-  Tree const *tree;
-  std::int64_t rows;
-  bool gravity, coriolis;
-  double const *qpos, *qvel;
-  double *out;
-
-  static void write(Call const &call) {
-    auto const &bound = static_cast<BoundForce const &>(call);
-    auto const size = static_cast<std::size_t>(bound.rows * bound.tree->joints);
-    thread_local std::vector<double> still, at_rest;
-    still.assign(size, 0.0);
-    write_forces(*bound.tree, bound.rows, bound.qpos, bound.coriolis ? bound.qvel : still.data(), bound.out);
-    if (bound.gravity) return;
-    at_rest.resize(size);
-    write_forces(*bound.tree, bound.rows, bound.qpos, still.data(), at_rest.data());
-    for (std::size_t i = 0; i < size; ++i) bound.out[i] -= at_rest[i];
-  }
-};
-
-char const *const BOUND = "batchpid.BoundForce";
-
-// bind_force(tree, gravity, coriolis, qpos, qvel, out) -> (object, address of Call); the caller keeps the arguments
-PyObject *bind_force(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Tree const *tree = tree_of(arguments[0]);
-  if (tree == nullptr) return nullptr;
-  auto bound = std::make_unique<BoundForce>();
-  bound->run = BoundForce::write;
-  bound->tree = tree;
-  bound->gravity = PyObject_IsTrue(arguments[1]) != 0;
-  bound->coriolis = PyObject_IsTrue(arguments[2]) != 0;
-  bound->rows = PyObject_Size(arguments[3]);
-  Buffer arrays[3];
-  for (int i = 0; i < 3; ++i) {
-    int const flags = PyBUF_C_CONTIGUOUS | (i < 2 ? 0 : PyBUF_WRITABLE);
-    if (!arrays[i].open(arguments[i + 3], bound->rows * tree->joints, sizeof(double), flags)) return nullptr;
-  }
-  bound->qpos = arrays[0].as<double>();
-  bound->qvel = arrays[1].as<double>();
-  bound->out = arrays[2].as<double>();
-  PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
-  PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
-    delete static_cast<BoundForce *>(PyCapsule_GetPointer(object, BOUND));
-  });
-  return Py_BuildValue("NN", capsule, address);
-}
-
-// run(object of bind_force)
-PyObject *run_bound(PyObject *, PyObject *object) {
-  auto const *bound = static_cast<BoundForce const *>(PyCapsule_GetPointer(object, BOUND));
-  if (bound == nullptr) return nullptr;
-  bound->run(*bound);
-  Py_RETURN_NONE;
-}
-
 // dynamics(tree, qpos, qvel, payload, matrix, force, payload_force): DYNAMICS in interface.py
 PyObject *dynamics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = tree_of(arguments[0]);
@@ -305,8 +227,6 @@ PyCFunction method(Function function) {
 PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"dynamics", method(dynamics), METH_FASTCALL, nullptr},
-    {"bind_force", method(bind_force), METH_FASTCALL, nullptr},
-    {"run", run_bound, METH_O, nullptr},
     {"step", method(step), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "batchpid/native/program.h"
+#include "model.h"
 
 #include <cmath>
 #include <cstdint>
@@ -13,17 +14,75 @@ namespace batchpid {
 
 // Python fills in the fields (Constraint in interface.py) and owns what they point to.
 struct Constraint {
-  double const *response;                  // (robots, followers, dof): J M^-1
-  double const *push;                      // (robots, dof, followers): J^T (J M^-1 J^T)^-1
-  double const *passive;                   // (robots, dof)
+  double *response;                        // (robots, followers, dof): J M^-1
+  double *push;                            // (robots, dof, followers): J^T (J M^-1 J^T)^-1
+  double *passive;                         // (robots, dof)
   std::int64_t const *followers, *leaders;  // (followers,)
   double const *multiplier, *offset;       // (followers,)
   char const *wraps;                       // (followers,): differences of positions lose their whole turns
   float *asked;                            // (robots, dof): efforts without the constraint's, or null
   double *wrong, *free;                    // (followers,), (dof,): work space
+  Model const *model;                      // of the joints' mass matrices
+  double const *implicit;                  // (robots, dof): inertia on their diagonals besides the model's
+  Model const *force;                      // of the passive force; null: the engine's own
   double rate_gain, position_gain;
   std::int64_t size;                       // number of followers
 };
+
+// Set mass matrix and passive force (robots, dof) of the robots of a mask (robots,), or of all for null.
+FOR_EACH_PROCESSOR static void update_constraint(Constraint const &of, std::int64_t robots, double const *qpos,
+                                                 double const *passive, char const *wanted) {
+  std::int64_t const dof = of.model->dof, size = of.size;
+  Posed posed(dof);
+  std::vector<Lanes> matrix(static_cast<std::size_t>(dof * dof)), work(matrix.size());
+  std::vector<Lanes> response(static_cast<std::size_t>(size * dof)), small(static_cast<std::size_t>(size * size));
+  std::vector<Lanes> column(static_cast<std::size_t>(dof));
+  for (std::int64_t first = 0; first < robots; first += WIDTH) {
+    auto const write = [&](Lanes value, double *table, std::int64_t columns, std::int64_t column) {
+      for (int k = 0; k < WIDTH && first + k < robots; ++k) {
+        if (wanted == nullptr || wanted[first + k]) table[(first + k) * columns + column] = value.of[k];
+      }
+    };
+    joint_matrix(*of.model, first, robots, qpos, posed, matrix.data());
+    Lanes nothing{};  // 0, or nan for a robot that has failed
+    for (std::int64_t j = 0; j < dof; ++j) matrix[j * dof + j] += gather(of.implicit, dof, j, first, robots);
+    for (Lanes const &each : matrix) nothing += each - each;
+    for (std::int64_t j = 0; j < dof; ++j) {
+      Lanes const force = gather(passive, dof, j, first, robots);
+      nothing += force - force;
+    }
+    Lanes const failed = differs_mask(nothing, Lanes{});
+    for (std::int64_t k = 0; k < dof * dof; ++k) {
+      matrix[k] = where_positive(failed, k % (dof + 1) == 0 ? 1.0 : 0.0, matrix[k]);
+    }
+    for (std::int64_t j = 0; j < dof; ++j) {
+      write(where_positive(failed, 0.0, gather(passive, dof, j, first, robots)), of.passive, dof, j);
+    }
+    invert(dof, matrix.data(), work.data());
+    for (std::int64_t i = 0; i < size; ++i) {
+      Lanes const *own = &matrix[of.followers[i] * dof], *above = &matrix[of.leaders[i] * dof];
+      for (std::int64_t j = 0; j < dof; ++j) {
+        response[i * dof + j] = own[j] - of.multiplier[i] * above[j];
+        write(response[i * dof + j], of.response, size * dof, i * dof + j);
+      }
+    }
+    for (std::int64_t i = 0; i < size; ++i) {
+      for (std::int64_t k = 0; k < size; ++k) {
+        Lanes const *row = &response[i * dof];
+        small[i * size + k] = row[of.followers[k]] - of.multiplier[k] * row[of.leaders[k]];
+      }
+    }
+    invert(size, small.data(), work.data());
+    for (std::int64_t k = 0; k < size; ++k) {
+      for (Lanes &each : column) each = Lanes{};
+      for (std::int64_t i = 0; i < size; ++i) {
+        column[of.followers[i]] += small[i * size + k];
+        column[of.leaders[i]] -= of.multiplier[i] * small[i * size + k];
+      }
+      for (std::int64_t j = 0; j < dof; ++j) write(column[j], of.push, dof * size, j * size + k);
+    }
+  }
+}
 
 // Add the constraint efforts of a robot to `effort` (dof); q(j) and v(j) are position and velocity of joint j.
 template <class Position, class Velocity>

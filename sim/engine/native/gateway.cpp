@@ -14,13 +14,14 @@ using namespace batchpid;
 
 namespace {
 
-// type_info("robot" | "system" | "body"): capsule with the C++ type, as pybind11's conduit expects it.
+// type_info("robot" | "system" | "body" | "joint"): capsule with the C++ type, as pybind11's conduit expects it.
 PyObject *type_info(PyObject *, PyObject *argument) {
   Py_ssize_t size = 0;
   char const *kind = PyUnicode_AsUTF8AndSize(argument, &size);
   if (kind == nullptr) return nullptr;
   auto const *info = std::strcmp(kind, "robot") == 0    ? &typeid(Articulation)
                      : std::strcmp(kind, "system") == 0 ? &typeid(System)
+                     : std::strcmp(kind, "joint") == 0  ? &typeid(Joint)
                                                         : &typeid(Body);
   return PyCapsule_New(const_cast<std::type_info *>(info), typeid(std::type_info).name(), nullptr);
 }
@@ -37,10 +38,10 @@ PyObject *make_gateway(PyObject *, PyObject *arguments) {
     delete gateway;
     return nullptr;
   }
-  static_assert(sizeof(Functions) == 5 * sizeof(void *));
-  if (addresses.size() != 5) {
+  static_assert(sizeof(Functions) == 7 * sizeof(void *));
+  if (addresses.size() != 7) {
     delete gateway;
-    PyErr_SetString(PyExc_ValueError, "needs five functions");
+    PyErr_SetString(PyExc_ValueError, "needs seven functions");
     return nullptr;
   }
   std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
@@ -191,49 +192,51 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   });
 }
 
-// tick(bound program, address of a Tick, address of a Group, begin, until, end, program of the sensors or None)
-//   -> (steps done, Status)
+// Return the programs of a tick, of which the last two may be None; set an exception if they do not fit the group.
+Programs programs_of(Tick const *arrays, Group const *group, PyObject *step, PyObject *sensors, PyObject *forward) {
+  bool fits = arrays != nullptr && group != nullptr && arrays->dof == group->dof && step != Py_None;
+  auto const program = [&](PyObject *object) -> BoundProgram * {
+    if (object == Py_None || !fits) return nullptr;
+    auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(object, BOUND));
+    fits = bound != nullptr && bound->program->rows == static_cast<Index>(group->robots) &&
+           bound->program->columns == static_cast<Index>(group->dof);
+    return bound;
+  };
+  Programs const programs{program(step), program(sensors), program(forward)};
+  if (!fits && !PyErr_Occurred()) misfit();
+  return programs;
+}
+
+// tick(bound program, address of a Tick, address of a Group, begin, until, end, programs of sensors and feedforward)
+//   -> (steps done, Status); a program may be None
 PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[0], BOUND));
-  bool const measures = arguments[6] != Py_None;
-  auto *sensors = measures ? static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[6], BOUND)) : nullptr;
-  if (measures && sensors == nullptr) return nullptr;
   auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
-  if (bound == nullptr || arrays == nullptr || group == nullptr) return nullptr;
-  if (bound->program->rows != static_cast<Index>(group->robots) ||
-      bound->program->columns != static_cast<Index>(group->dof) || arrays->dof != group->dof ||
-      (measures && (sensors->program->rows != bound->program->rows ||
-                    sensors->program->columns != bound->program->columns))) {
-    return misfit();
-  }
+  Programs const programs = programs_of(arrays, group, arguments[0], arguments[6], arguments[7]);
   std::int64_t step = PyLong_AsLongLong(arguments[3]);
   std::int64_t const until = PyLong_AsLongLong(arguments[4]), end = PyLong_AsLongLong(arguments[5]);
+  if (PyErr_Occurred()) return nullptr;
   std::int32_t status = 0;
-  PyObject *done = without_gil([&] { status = run_tick(*bound, sensors, *arrays, *group, step, until, end); });
+  PyObject *done = without_gil([&] { status = run_tick(programs, *arrays, *group, step, until, end); });
   if (done == nullptr) return nullptr;
   Py_DECREF(done);
   return Py_BuildValue("Li", static_cast<long long>(step), static_cast<int>(status));
 }
 
 // ticks(bound program, address of a Tick, address of a Group, address and number of Transfers, first tick, until, steps)
-// -> ticks completed, sim steps of the next one, status.
+//   -> (ticks completed, sim steps of the next one, Status)
 PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(arguments[0], BOUND));
   auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
   auto *transfers = static_cast<Transfer const *>(PyLong_AsVoidPtr(arguments[3]));
-  if (bound == nullptr || arrays == nullptr || group == nullptr || transfers == nullptr) return nullptr;
-  if (bound->program->rows != static_cast<Index>(group->robots) ||
-      bound->program->columns != static_cast<Index>(group->dof) || arrays->dof != group->dof) {
-    return misfit();
-  }
+  Programs const programs = programs_of(arrays, group, arguments[0], Py_None, Py_None);
   std::int64_t const count = PyLong_AsLongLong(arguments[4]), until = PyLong_AsLongLong(arguments[6]);
   std::int64_t const steps = PyLong_AsLongLong(arguments[7]);
   std::int64_t tick = PyLong_AsLongLong(arguments[5]), step = 0;
+  if (PyErr_Occurred()) return nullptr;
   std::int32_t status = 0;
   PyObject *done = without_gil([&] {
-    status = run_ticks(*bound, *arrays, *group, transfers, count, tick, until, steps, step);
+    status = run_ticks(programs, *arrays, *group, transfers, count, tick, until, steps, step);
   });
   if (done == nullptr) return nullptr;
   Py_DECREF(done);
@@ -253,6 +256,76 @@ PyObject *mass_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return without_gil([&] {
     write_mass_matrices({dof, tree.as<std::int32_t>(), bodies.as<double>()}, rows, qpos.as<double>(), nullptr, 0.0,
                         out.as<double>());
+  });
+}
+
+// Return the structure of Python at an address, or null with an exception.
+template <class T>
+T const *structure(PyObject *address) {
+  return static_cast<T const *>(PyLong_AsVoidPtr(address));
+}
+
+// joint_matrices(address of a Model, qpos, out, rows): the mass matrices that the joints show.
+PyObject *joint_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto const *model = structure<Model>(arguments[0]);
+  if (model == nullptr) return nullptr;
+  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[3]), dof = model->dof;
+  Buffer qpos, out;
+  if (!qpos.open(arguments[1], rows * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !out.open(arguments[2], rows * dof * dof, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
+    return nullptr;
+  }
+  return without_gil([&] { write_joint_matrices(*model, rows, qpos.as<double>(), out.as<double>()); });
+}
+
+// forces(address of a Model, gravity, coriolis, qpos, qvel, turning or None, out, rows)
+PyObject *forces(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto const *model = structure<Model>(arguments[0]);
+  if (model == nullptr) return nullptr;
+  Parts const parts{PyObject_IsTrue(arguments[1]) == 1, PyObject_IsTrue(arguments[2]) == 1};
+  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[7]), count = rows * model->dof;
+  bool const floats = arguments[5] != Py_None;
+  Buffer qpos, qvel, turning, out;
+  if (!qpos.open(arguments[3], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !qvel.open(arguments[4], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      (floats && !turning.open(arguments[5], 3 * rows, sizeof(double), PyBUF_C_CONTIGUOUS)) ||
+      !out.open(arguments[6], count, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
+    return nullptr;
+  }
+  return without_gil([&] {
+    write_forces(*model, parts, rows, qpos.as<double>(), qvel.as<double>(), floats ? turning.as<double>() : nullptr,
+                 out.as<double>());
+  });
+}
+
+// refresh(address of a Refresh, qpos, gain, memory, rows)
+PyObject *refresh_friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto const *of = structure<Refresh>(arguments[0]);
+  if (of == nullptr) return nullptr;
+  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
+  Buffer arrays[3];
+  for (int i = 0; i < 3; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i == 0 ? 0 : PyBUF_WRITABLE);
+    if (!arrays[i].open(arguments[i + 1], count, sizeof(double), flags)) return nullptr;
+  }
+  return without_gil([&] {
+    refresh(*of, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(), nullptr);
+  });
+}
+
+// update_constraint(address of a Constraint, qpos, passive, mask of robots, rows)
+PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto const *of = structure<Constraint>(arguments[0]);
+  if (of == nullptr) return nullptr;
+  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
+  Buffer qpos, passive, wanted;
+  if (!qpos.open(arguments[1], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !passive.open(arguments[2], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
+      !wanted.open(arguments[3], rows, 1, PyBUF_C_CONTIGUOUS)) {
+    return nullptr;
+  }
+  return without_gil([&] {
+    update_constraint(*of, rows, qpos.as<double>(), passive.as<double>(), wanted.as<char>());
   });
 }
 
@@ -289,6 +362,10 @@ PyMethodDef METHODS[] = {
     {"tick", method(tick), METH_FASTCALL, nullptr},
     {"ticks", method(ticks), METH_FASTCALL, nullptr},
     {"mass_matrices", method(mass_matrices), METH_FASTCALL, nullptr},
+    {"joint_matrices", method(joint_matrices), METH_FASTCALL, nullptr},
+    {"forces", method(forces), METH_FASTCALL, nullptr},
+    {"refresh", method(refresh_friction), METH_FASTCALL, nullptr},
+    {"update_constraint", method(update), METH_FASTCALL, nullptr},
     {"xla_functions", xla_functions, METH_NOARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

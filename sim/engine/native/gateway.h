@@ -16,6 +16,7 @@ namespace sapien::physx {
 class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
 class PhysxSystemCpu {};
 class PhysxRigidBaseComponent {};
+class PhysxArticulationJoint {};
 }  // namespace sapien::physx
 
 #pragma GCC visibility push(hidden)
@@ -25,6 +26,7 @@ namespace batchpid {
 using Articulation = sapien::physx::PhysxArticulation;
 using System = sapien::physx::PhysxSystemCpu;
 using Body = sapien::physx::PhysxRigidBaseComponent;
+using Joint = sapien::physx::PhysxArticulationJoint;
 
 // Layout of Eigen::VectorXf. Its destructor makes the compiler return it as it returns Eigen's.
 struct VectorXf {
@@ -40,6 +42,8 @@ struct Functions {
   VectorXf (*compute_passive_force)(Articulation *, bool gravity, bool coriolis);
   void (*set_qf)(Articulation *, VectorXf const &);
   void (*step)(System *);
+  void (*set_drive_position)(Joint *, float);
+  void (*set_drive_velocity)(Joint *, float);
 };
 
 struct Gateway {

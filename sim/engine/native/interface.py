@@ -19,6 +19,8 @@ SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation19computePassiveForceEbb",
     "_ZN6sapien5physx17PhysxArticulation5setQfERKN5Eigen6MatrixIfLin1ELi1ELi0ELin1ELi1EEE",
     "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
+    "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
+    "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 STATUS = ("left_region", "contacts", "not_finite", "too_fast", "failed")
@@ -38,8 +40,7 @@ class Group(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "system_of", "contacts", "watched")),
         *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
         *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
-        ("mujoco", ctypes.c_void_p),
-        ("constraint", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
         ("pairs", ctypes.c_int64),
@@ -75,6 +76,7 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
+        *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain", "continuous")),
         ("clearance", ctypes.c_void_p),
     ]
 
@@ -85,9 +87,34 @@ class Constraint(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("response", "push", "passive", "followers", "leaders")),
         *((name, ctypes.c_void_p) for name in ("multiplier", "offset", "wraps", "asked", "wrong", "free")),
+        *((name, ctypes.c_void_p) for name in ("model", "implicit", "force")),
         ("rate_gain", ctypes.c_double),
         ("position_gain", ctypes.c_double),
         ("size", ctypes.c_int64),
+    ]
+
+
+class Model(ctypes.Structure):
+    """Rigid-body model of robots, as Model in model.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("tree", "rows", "inertias")),
+        ("gravity", 3 * ctypes.c_double),
+        ("dof", ctypes.c_int64),
+        ("varies", ctypes.c_int32),
+        ("floats", ctypes.c_int32),
+    ]
+
+
+class Refresh(ctypes.Structure):
+    """Constants of the friction model, as Refresh in refresh.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("model", "armature", "coulomb", "viscous", "damping", "stiffness")),
+        *((name, ctypes.c_void_p) for name in ("leader", "multiplier")),
+        ("timestep", ctypes.c_double),
+        ("share", ctypes.c_double),
+        ("steps", ctypes.c_int64),
     ]
 
 
@@ -98,12 +125,13 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
-        *((name, ctypes.c_void_p) for name in ("measured_force", "read_force")),
+        *((name, ctypes.c_void_p) for name in ("measured_force", "read_force", "refresh")),
+        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate")),
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),
-        ("whole", ctypes.c_int32),
-        ("matrix_steps", ctypes.c_int32),
+        *((name, ctypes.c_int32) for name in ("whole", "matrix_steps", "coupling_steps")),
+        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "unused")),
     ]
 
 
@@ -141,6 +169,8 @@ def _gateway_tables() -> tuple[Any, ...]:
         _layout(Clearance),
         _layout(Mujoco),
         _layout(Constraint),
+        _layout(Model),
+        _layout(Refresh),
         _layout(Tick),
         TRANSFERS,
         _layout(Transfer),
@@ -160,10 +190,11 @@ EXTENSIONS = {
             *_files(
                 "gateway.cpp",
                 "gateway.h",
-                "mass_matrices.h",
+                "model.h",
                 "mujoco_step.h",
                 "clearance.h",
                 "constraint.h",
+                "refresh.h",
                 "sim_step.h",
                 "tick.h",
                 "ticks.h",
@@ -180,7 +211,7 @@ EXTENSIONS = {
     ),
     "_batch_dynamics": Extension(
         "batchpid.sim.engine.native._batch_dynamics",
-        (*_files("batch_dynamics.cpp"), BUFFER, CALL, LANES, RIGID_BODY),
+        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY),
         (*ROUNDED, "-Wno-psabi"),
         _batch_dynamics_tables,
     ),

@@ -37,6 +37,9 @@ struct Mujoco {
   double *const *applied, *const *bias;
   std::int64_t const *qpos_at, *qvel_at;    // (dof,): places of the joints in these arrays
   double *qf;                               // (robots, dof): efforts last applied
+  double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
+  double const *stiffness, *rate_gain;      // (robots, dof): of the drives, or null without targets that move
+  char const *continuous;                   // (dof,): joints whose targets may be whole turns away
   Clearance const *clearance;               // or null: MuJoCo looks for contacts in every sim step
 };
 

@@ -13,6 +13,9 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import Tick
 
+_TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
+"""Dtypes of arrays that are not float64."""
+
 
 class NativeTick:
     """Sim steps of a pack under a program, on fixed arrays.
@@ -31,17 +34,26 @@ class NativeTick:
         Whether ``matrix`` is the whole mass matrix or its diagonal.
     control
         Address of a native controller (``Call`` in call.h), whose effort is one of the program's inputs.
+    compensated
+        Parts of the passive force: whether it cancels gravity, and Coriolis and centrifugal forces.
     measured_force, read_force
-        Address of a call that writes ``passive`` at the measured state before each control step, or at the reading
-        after each sim step.
+        Address of a model (:class:`batchpid.sim.engine.native_model.NativeModel`) by which ``passive`` is computed at
+        the measured state before each control step, or at the reading after each sim step.
+    refresh
+        Address of the friction model (:class:`batchpid.sim.engine.native_model.NativeRefresh`).
+    coupling_steps
+        Sim steps for which the constraint efforts of coupled joints keep their mass matrix.
     sensors
         Program of the sensors, its inputs and its outputs. Its last inputs are the noise (:meth:`run`).
+    forward
+        Program that runs before the controller, its inputs and its outputs: of the feedforward that it takes.
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
         ``tree`` and ``bodies`` (:class:`batchpid.sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping``
         (dof,), ``leader`` and ``multiplier`` of coupled joints (dof,), and ``pose`` and ``rate`` if sensors measure
-        others than the reading.
+        others than the reading; ``gain``, ``memory`` and ``age`` (envs,) of the friction model; ``target`` and
+        ``target_rate`` of drives, if they move within a tick.
     """
 
     def __init__(
@@ -54,26 +66,31 @@ class NativeTick:
         matrix_steps: int = 1,
         whole: bool = False,
         control: int | None = None,
+        compensated: tuple[bool, bool] = (False, False),
         measured_force: int | None = None,
         read_force: int | None = None,
+        refresh: int | None = None,
+        coupling_steps: int = 1,
         sensors: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
+        forward: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
         **arrays: NDArray[Any] | None,
     ) -> None:
         arrays = {"pose": arrays["qpos"], "rate": arrays["qvel"], **arrays}
         given = {name: array for name, array in arrays.items() if array is not None}
-        types = {name: np.int32 if name in ("tree", "leader") else np.float64 for name in given}
         for name, array in given.items():
-            if array.dtype != types[name] or not array.flags.c_contiguous:
-                raise ValueError(f"{name} is not a contiguous array of {np.dtype(types[name])}")
+            wanted = np.dtype(_TYPES.get(name, np.float64))
+            if array.dtype != wanted or not array.flags.c_contiguous:
+                raise ValueError(f"{name} is not a contiguous array of {wanted}")
         self._native = native.extension("_gateway")
         self._program = self._bind(program, inputs, outputs)
-        self._sensors = None if sensors is None else self._bind(*sensors)
+        self._others = [None if each is None else self._bind(*each) for each in (sensors, forward)]
         addresses = {name: array.ctypes.data for name, array in given.items()}
-        dof = program.shape[1]
-        calls = {"control": control, "measured_force": measured_force, "read_force": read_force}
-        self._tick = Tick(timestep=timestep, dof=dof, whole=whole, matrix_steps=matrix_steps, **calls, **addresses)
+        calls = {"control": control, "refresh": refresh, "measured_force": measured_force, "read_force": read_force}
+        steps = {"matrix_steps": matrix_steps, "coupling_steps": coupling_steps, "dof": program.shape[1]}
+        parts = dict(zip(("gravity", "coriolis"), compensated, strict=True))
+        self._tick = Tick(timestep=timestep, whole=whole, **steps, **parts, **calls, **addresses)
         self._address = ctypes.addressof(self._tick)
-        self._kept = inputs, outputs, given, sensors
+        self._kept = inputs, outputs, given, sensors, forward
 
     def _bind(self, program: ArrayProgram, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]]) -> Any:
         """Return a program with its arrays."""
@@ -88,7 +105,7 @@ class NativeTick:
         """
         for place, block in enumerate(noise):
             self._tick.noise[place] = block.ctypes.data
-        return self._native.tick(self._program, self._address, group, begin, until, end, self._sensors)
+        return self._native.tick(self._program, self._address, group, begin, until, end, *self._others)
 
     def run_ticks(self, group: int, transfers: Any, first: int, until: int, steps: int) -> tuple[int, int, int]:
         """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until something needs attention.

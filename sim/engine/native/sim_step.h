@@ -44,6 +44,7 @@ struct Group {
   double const *speed_limit;         // (dof,), or null
   Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway, and nothing to watch
   Constraint const *constraint;      // of coupled joints, or null
+  Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
   std::int64_t robots, dof;
   std::int64_t pairs, bodies_size;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
@@ -215,6 +216,62 @@ std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *q
     std::strncpy(group.message, message, last);
   }
   return FAILED;
+}
+
+// Set the targets of the drives (robots, dof): write_drive_target of the packs.
+inline void write_targets(Group const &group, double const *target, double const *rate) {
+  std::int64_t const dof = group.dof;
+  for (std::int64_t at = 0; at < group.robots * dof; ++at) {
+    if (group.mujoco == nullptr) {
+      Functions const &call = group.gateway->functions;
+      call.set_drive_position(group.joints[at], static_cast<float>(target[at]));
+      call.set_drive_velocity(group.joints[at], static_cast<float>(rate[at]));
+      continue;
+    }
+    constexpr double TURN = 6.283185307179586;
+    Mujoco const &mujoco = *group.mujoco;
+    std::int64_t const row = at / dof, joint = at % dof;
+    double position = target[at];
+    if (mujoco.continuous[joint]) {
+      double const error = position - mujoco.qpos[row][mujoco.qpos_at[joint]];
+      position -= TURN * std::nearbyint(error / TURN);
+    }
+    mujoco.ctrl[row][joint] = mujoco.stiffness[at] * position + mujoco.rate_gain[at] * rate[at];
+  }
+}
+
+// Write the velocities (robots, 3) at which bases in MuJoCo turn, in their own axes.
+inline void write_turning(Group const &group, double *out) {
+  for (std::int64_t row = 0; row < group.robots; ++row) std::copy_n(group.mujoco->qvel[row] + 3, 3, out + 3 * row);
+}
+
+// Write a part of the passive force (robots, dof) of a model at a state of the robots.
+inline void write_force(Group const &group, Model const &model, Parts parts, double const *qpos, double const *qvel,
+                        double *out) {
+  thread_local std::vector<double> turning;
+  turning.resize(static_cast<std::size_t>(3 * group.robots));
+  if (model.floats) write_turning(group, turning.data());
+  write_forces(model, parts, group.robots, qpos, qvel, model.floats ? turning.data() : nullptr, out);
+}
+
+// Give the constraint efforts the present mass matrices and passive forces; qpos and qvel (robots, dof) are the present.
+inline void update_constraint(Group const &group, double const *qpos, double const *qvel) {
+  thread_local std::vector<double> passive;
+  std::int64_t const dof = group.dof;
+  passive.resize(static_cast<std::size_t>(group.robots * dof));
+  Model const *force = group.constraint->force;
+  if (force != nullptr) write_force(group, *force, {true, true}, qpos, qvel, passive.data());
+  for (std::int64_t row = 0; row < group.robots && force == nullptr; ++row) {
+    double *own = passive.data() + row * dof;
+    if (group.mujoco == nullptr) {
+      Gateway const &gateway = *group.gateway;
+      copy_row(gateway.functions.compute_passive_force(gateway.robots[static_cast<std::size_t>(row)], true, true), own,
+               dof);
+      continue;
+    }
+    for (std::int64_t j = 0; j < dof; ++j) own[j] = group.mujoco->bias[row][group.mujoco->qvel_at[j]];
+  }
+  update_constraint(*group.constraint, group.robots, qpos, passive.data(), nullptr);
 }
 
 }  // namespace batchpid

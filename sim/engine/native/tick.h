@@ -7,7 +7,7 @@
 
 #include "batchpid/native/call.h"
 #include "batchpid/native/make_program.h"
-#include "mass_matrices.h"
+#include "refresh.h"
 #include "sim_step.h"
 
 #pragma GCC visibility push(hidden)
@@ -24,17 +24,23 @@ struct Tick {
   double const *bodies;           // (dof, 25)
   double const *armature;         // (dof,), or null
   double const *damping;          // (dof,), or null
-  std::int32_t const *leader;     // (dof,): of coupled joints, as in batchpid/motors/coupling.py, or null
-  double const *multiplier;       // (dof,)
+  Coupling coupling;
   double *matrix;                 // (robots, dof, dof), or its diagonal, or null
   Call const *control;            // native controller, whose effort is an input of the program, or null
-  Call const *measured_force;     // writes the passive force at the measured state, or null
-  Call const *read_force;         // writes it at the reading after a sim step, or null
+  Model const *measured_force;    // of the passive force at the measured state, or null
+  Model const *read_force;        // of the passive force at the reading after a sim step, or null
+  Refresh const *refresh;         // of the friction model's inertia, or null
+  double *gain, *memory;          // of the friction model
+  std::int64_t *age;              // (robots,)
+  double const *target, *target_rate;  // outputs of the program: targets of drives, or null
   double const *noise[2];         // (steps, robots, dof): last inputs of the sensors in the next steps, or null
   double timestep;
   std::int64_t dof;
   std::int32_t whole;             // the law takes the whole matrix
   std::int32_t matrix_steps;
+  std::int32_t coupling_steps;    // sim steps for which constraint efforts keep their mass matrix
+  std::int32_t gravity, coriolis;  // parts of the passive force
+  std::int32_t unused;
 };
 
 // A program with its arrays.
@@ -43,24 +49,6 @@ struct BoundProgram {
   std::vector<Input> inputs;
   std::vector<Output> outputs;
 };
-
-// Write G^T M G of coupled joints in place of M (n, n): CouplingArrays.mass_matrix in batchpid/motors/coupling.py.
-inline void fold(Tick const &tick, std::size_t n, double *matrix) {
-  auto const leader = [&](std::size_t i) { return static_cast<std::size_t>(tick.leader[i]); };
-  for (std::size_t i = 0; i < n; ++i) {
-    if (leader(i) == i) continue;
-    for (std::size_t j = 0; j < n; ++j) matrix[leader(i) * n + j] += tick.multiplier[i] * matrix[i * n + j];
-  }
-  for (std::size_t i = 0; i < n; ++i) {
-    if (leader(i) == i) continue;
-    for (std::size_t j = 0; j < n; ++j) matrix[j * n + leader(i)] += tick.multiplier[i] * matrix[j * n + i];
-  }
-  for (std::size_t i = 0; i < n; ++i) {
-    if (leader(i) == i) continue;
-    for (std::size_t j = 0; j < n; ++j) matrix[i * n + j] = matrix[j * n + i] = 0.0;
-    matrix[i * n + i] = 1.0;
-  }
-}
 
 // Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
 inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
@@ -76,7 +64,7 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
       if (tick.armature != nullptr) entry += tick.armature[j];
       if (tick.damping != nullptr) entry += tick.timestep * tick.damping[j];
     }
-    if (tick.leader != nullptr) fold(tick, n, found);
+    tick.coupling.fold(n, found);
     if (tick.whole) continue;
     for (std::size_t j = 0; j < n; ++j) tick.matrix[static_cast<std::size_t>(row) * n + j] = found[j * n + j];
   }
@@ -91,24 +79,40 @@ inline void measure(BoundProgram &sensors, Tick const &tick, std::int64_t robots
   run(*sensors.program, sensors.inputs.data(), sensors.outputs.data(), 0, robots);
 }
 
-// Run the sim steps from `step` to `until` of a tick of `end` steps, with the program of sensors or null. Advance `step`;
-// return the status of the last.
-inline std::int32_t run_tick(BoundProgram const &bound, BoundProgram *sensors, Tick const &tick, Group &group,
-                             std::int64_t &step, std::int64_t until, std::int64_t end) {
+// Programs of a tick: the control step, and sensors and the feedforward of a native controller, or null.
+struct Programs {
+  BoundProgram *step, *sensors, *forward;
+};
+
+// Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
+inline std::int32_t run_tick(Programs const &programs, Tick const &tick, Group &group, std::int64_t &step,
+                             std::int64_t until, std::int64_t end) {
   auto const robots = group.robots, begin = step;
   auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
+  auto const run_bound = [&](BoundProgram const &bound) {
+    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+  };
+  Parts const parts{tick.gravity != 0, tick.coriolis != 0};
   std::int32_t status = 0;
   while (step < until && status == 0) {
-    if (sensors != nullptr) measure(*sensors, tick, robots, step - begin);
-    if (tick.measured_force != nullptr) tick.measured_force->run(*tick.measured_force);
+    if (programs.sensors != nullptr) measure(*programs.sensors, tick, robots, step - begin);
+    if (tick.measured_force != nullptr) {
+      write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
+    }
+    if (tick.refresh != nullptr) refresh(*tick.refresh, robots, tick.qpos, tick.gain, tick.memory, tick.age);
     if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
       write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
     }
+    if (programs.forward != nullptr) run_bound(*programs.forward);
     if (tick.control != nullptr) tick.control->run(*tick.control);
-    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+    run_bound(*programs.step);
+    if (tick.target != nullptr) write_targets(group, tick.target, tick.target_rate);
+    if (group.constraint != nullptr && step % tick.coupling_steps == 0) {
+      update_constraint(group, tick.qpos, tick.qvel);
+    }
     std::memcpy(tick.before, tick.qpos, bytes);
     status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
-    if (tick.read_force != nullptr) tick.read_force->run(*tick.read_force);
+    if (tick.read_force != nullptr) write_force(group, *tick.read_force, parts, tick.qpos, tick.qvel, tick.passive);
     ++step;
   }
   return status;

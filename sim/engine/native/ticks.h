@@ -55,12 +55,12 @@ inline void write_observation(Transfer const *transfers, std::int64_t count, std
 // Run ticks of `steps` sim steps from `tick` to `until`. Stop in a tick whose command is not finite, after an event in it,
 // or if velocities are not finite after it. Advance `tick` by the ticks completed; `step` is how many sim steps of the
 // next one are done. Return the status of the last sim step.
-inline std::int32_t run_ticks(BoundProgram const &bound, Tick const &arrays, Group &group, Transfer const *transfers,
+inline std::int32_t run_ticks(Programs const &programs, Tick const &arrays, Group &group, Transfer const *transfers,
                               std::int64_t count, std::int64_t &tick, std::int64_t until, std::int64_t steps,
                               std::int64_t &step) {
   for (step = 0; tick < until; ++tick, step = 0) {
     if (!read_commands(transfers, count, tick)) return 0;
-    std::int32_t const status = run_tick(bound, nullptr, arrays, group, step, steps, steps);
+    std::int32_t const status = run_tick(programs, arrays, group, step, steps, steps);
     if (status != 0 || !are_finite(arrays.qvel, group.robots * group.dof)) return status;
     write_observation(transfers, count, tick);
   }

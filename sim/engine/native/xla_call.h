@@ -6,7 +6,7 @@
 
 #pragma once
 
-#include "mass_matrices.h"
+#include "model.h"
 #include "sim_step.h"
 
 #pragma GCC visibility push(hidden)

@@ -17,7 +17,7 @@ def bodies_of(robot: Any) -> RigidBodies:
     """Return the bodies of one of SAPIEN's articulations."""
     dofs = {joint.name: dof for dof, joint in enumerate(robot.active_joints)}
     places: dict[Any, tuple[int, Float64]] = {}  # of each link: its body, and its pose in the body's frame
-    parts: list[list[SpatialInertia]] = [[] for _ in dofs]
+    parts: list[list[SpatialInertia]] = [[] for _ in range(len(dofs) + 1)]  # the last are the base's
     tree, at_zero = np.tile(np.array([-1, 0], np.int32), (len(dofs), 1)), np.tile(np.eye(4), (len(dofs), 1, 1))
     for link in robot.links:
         if link.parent is None:
@@ -30,11 +30,13 @@ def bodies_of(robot: Any) -> RigidBodies:
             body, place = dof, np.eye(4)
         place = place @ _matrix(joint.pose_in_child.inv())
         places[link] = body, place
-        if body >= 0:
-            at, principal = place @ _matrix(link.cmass_local_pose), np.diag([float(str(one)) for one in link.inertia])
-            parts[body].append(SpatialInertia(link.mass, at[:3, 3], at[:3, :3] @ principal @ at[:3, :3].T))
-    bodies = [total(of_body) for of_body in parts]
-    of_bodies = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], *map(np.array, zip(*bodies, strict=True)))
+    for link, (body, place) in places.items():
+        at, principal = place @ _matrix(link.cmass_local_pose), np.diag([float(str(one)) for one in link.inertia])
+        parts[body].append(SpatialInertia(link.mass, at[:3, 3], at[:3, :3] @ principal @ at[:3, :3].T))
+    *bodies, base = [total(of_body) for of_body in parts]
+    mass, center, tensor = map(np.array, zip(*bodies, strict=True))
+    links = {link.name: place for link, place in places.items()}
+    of_bodies = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links)
     return RigidBodies._make(map(read_only, of_bodies))
 
 

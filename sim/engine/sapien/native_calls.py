@@ -73,7 +73,7 @@ class NativeCalls:
 
 
 def pointer(wrapper: Any, kind: str) -> int:
-    """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "body".
+    """Return the address of the C++ object in ``wrapper``, a "robot", "system", "body" or "joint".
 
     It comes by pybind11's conduit, which checks type and ABI.
     """

@@ -11,7 +11,7 @@ lines because that is the whole interface between loop and engine.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -23,9 +23,9 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import mass_matrix_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
+from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.sapien.building import (
     build_scene,
     engine_settings,
@@ -106,6 +106,9 @@ class Pack(SingleOwner):
             self._joint_qf = np.zeros_like(self.qf)
             continuous = np.array([joint.continuous for joint in spec.joints])
             self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
+            self._constraint.implicit[...] = self._implicit
+            if self.steps_natively:
+                self._constraint.use(self._joint_model, None)
         self._bind()
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
@@ -157,12 +160,17 @@ class Pack(SingleOwner):
         return True
 
     def compiled_step(
-        self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: NDArray[np.float64] | None
+        self,
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: NDArray[np.float64] | None,
+        drives: bool = False,
     ) -> NativeStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
-        reads = gravity, coriolis, velocities
-        return NativeStep(self.calls, self.systems, self.watch, *reads, speed_limit, constraint)
+        reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
+        return NativeStep(self.calls, self.systems, self.watch, *reads, speed_limit, constraint, joints)
 
     def look(self, left: list[int]) -> None:
         """Look for contacts after a :meth:`compiled_step` that led ``left`` out of regions."""
@@ -173,15 +181,20 @@ class Pack(SingleOwner):
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
-            matrix = self._constraint_matrix(self._calls.qpos(np.float64)) + self._implicit[:, None] * np.eye(self.dof)
             passive = self._calls.passive_force(True, True, np.float64)
-            self._constraint.update(matrix[rows], passive[rows], rows)
+            self._constraint.update(self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows)
+
+    def joint_model(self) -> NativeModel:
+        """Return the model of :meth:`joint_mass_matrix` in native code."""
+        return self._joint_model
 
     @cached_property
-    def _constraint_matrix(self) -> Callable[[Float64], Float64]:
-        """Function of positions that returns the mass matrices for the constraint efforts."""
-        native_model = self.steps_natively and self.spec.fixed_base and self.steps_read_force(True, True)
-        return mass_matrix_of(self.spec, True) if native_model else self.joint_mass_matrix
+    def _joint_model(self) -> NativeModel:
+        return NativeModel(self.spec, not self.spec.fixed_base)
+
+    def force_model(self) -> NativeModel:
+        """Return the model of the passive force where compiled steps do not read it."""
+        return NativeModel(self.spec)
 
     def isolate(self, rows: Iterable[int]) -> None:
         """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
@@ -232,6 +245,9 @@ class Pack(SingleOwner):
         return self._calls.qvel(dtype)
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+        return self._joint_model.mass_matrix(qpos) if self.steps_natively else self._joint_mass_matrix(qpos)
+
+    def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         return scene_dynamics(self.spec).joint_mass_matrix(qpos)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
@@ -311,6 +327,8 @@ class Pack(SingleOwner):
         armature, viscous = None if actuators is None else actuators.armature, self.friction.viscous
         self.armature = self._motors + (0.0 if armature is None else armature)
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
+        if self._constraint is not None:
+            self._constraint.implicit[...] = self._implicit
         values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
         for row in range(self.size) if rows is None else rows:
             for joint, value in zip(self.robots[row].active_joints, values[row, :, None], strict=True):

@@ -40,6 +40,8 @@ class NativeStep:
         Joint speed beyond which the status says so (dof,), or None.
     constraint
         Address of the constraint of coupled joints, or None.
+    joints
+        Joints of all robots, if the targets of their drives move within a tick.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class NativeStep:
         velocities: bool,
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
+        joints: Sequence[Any] | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
         numbers = {system: number for number, system in enumerate(calls.systems)}
@@ -80,6 +83,8 @@ class NativeStep:
             "used": np.zeros(pairs),
             "outside": self._outside,
         } | ({} if limit is None else {"speed_limit": limit})
+        if joints is not None:
+            arrays["joints"] = np.array([pointer(joint, "joint") for joint in joints], np.uint64)
         self._group = Group(
             gateway=gateway_address(calls.gateway),
             robots=count,

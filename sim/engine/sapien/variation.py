@@ -18,8 +18,8 @@ from sapien import Pose
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine.batch_dynamics import passive_force_of
 from batchpid.sim.engine.joint_friction import own_friction
+from batchpid.sim.engine.native_model import NativeModel, passive_force_of
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
 from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
@@ -62,6 +62,15 @@ class VariedPack(Pack):
                 mine[rows] = new
         for row in rows:
             self._change_masses(self.robots[row], row)
+        if self._bodies and "_joint_model" in self.__dict__:
+            self._joint_model.vary(rows, self.size, self._added)
+
+    @cached_property
+    def _joint_model(self) -> NativeModel:
+        model = super()._joint_model
+        if self._bodies:
+            model.vary(range(len(self.qf)), len(self.qf), self._added)
+        return model
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene and the robot in it, with its masses."""
@@ -98,7 +107,7 @@ class VariedPack(Pack):
     def _passive_force(self) -> Callable[..., Float64]:
         return passive_force_of(self.spec, self.steps_natively)
 
-    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         return self._dynamics.joint_mass_matrix(qpos, self._added)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:

@@ -106,7 +106,7 @@ def test_dynamics_are_those_of_sapien_up_to_single_precision(name, fixed_base):
 
 
 def test_the_native_mass_matrix_is_that_of_the_model(tmp_path):
-    from batchpid.sim.engine.batch_dynamics import NativeMassMatrix
+    from batchpid.sim.engine.native_model import NativeMassMatrix
 
     tree = Robot.load(write(tmp_path, robot(*random_tree(np.random.default_rng(5), 12))))
     for arm in (load_bundled("panda"), load_bundled("jaco2"), tree):

@@ -10,16 +10,20 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
+from batchpid.motors import friction as friction_model
+from batchpid.motors.friction import Friction
 from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import NativeMassMatrix, NativePassiveForce
+from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.native.native_tick import NativeTick
+from batchpid.sim.engine.native_model import NativeMassMatrix, NativeModel, NativeRefresh
 from batchpid.sim.engine.sapien.physics import PHYSICS
-from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.loop import native_executor, tick_program
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.loop import tick_program
 from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
-from batchpid.sim.loop.tick_program import TickProgram
 from tests.sim.engine.test_coupled_joints import arm
 
 pytestmark = pytest.mark.skipif(not native.status().active, reason="native calls are not available")
@@ -86,12 +90,12 @@ def test_the_passive_force_is_that_of_the_model(name, parts):
     robot = load_bundled(name)
     poses, rates = robot.sample(21, seed=0), np.random.default_rng(0).normal(size=(21, robot.dof))
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
-    force = NativePassiveForce(spec)(poses, rates, *parts)
+    force = NativeModel(spec).passive_force(poses, rates, *parts)
     wanted = robot.dynamics().passive_force(poses, rates, *parts)
     assert np.abs(wanted).max() > 0.01
     np.testing.assert_allclose(force, wanted, rtol=1e-5, atol=1e-6)  # SAPIEN's model is float32
     for row in range(21):
-        alone = NativePassiveForce(spec)(poses[row : row + 1], rates[row : row + 1], *parts)
+        alone = NativeModel(spec).passive_force(poses[row : row + 1], rates[row : row + 1], *parts)
         np.testing.assert_array_equal(alone[0], force[row])
 
 
@@ -116,13 +120,13 @@ def test_the_program_is_a_trace_of_the_control_step(panda, monkeypatch):
         calls.append(layout.control)
         return control_step(layout, *arguments)
 
-    assert native_executor.control_step is tick_program.control_step is control_step
+    assert tick_program.control_step is control_step
     monkeypatch.setattr(tick_program, "control_step", recorded)
     tick_program._trace.cache_clear()
     with Runner(panda, 2, workers=0, substeps=30) as runner:
-        runner.step(panda.settings.target)
+        runner.step(panda.settings.target, substeps=100)  # friction is due in sim step 64
     tick_program._trace.cache_clear()
-    assert calls == ["pid"], "traced once; friction is not due within 64 sim steps"
+    assert calls == ["pid"], "traced once"
 
 
 EFFECTS = {
@@ -154,10 +158,10 @@ def random_options(robot, rng):
         effects["position_limit"] = np.array([-1.0, 0.0, 1.0]), np.array([40.0, 80.0, 60.0])
     options = {"control": control, "actuators": bp.make_actuators(robot.dof, **effects, seed=7)}
     options["compensate"] = str(rng.choice(["gravity+coriolis+friction", "gravity", "none"]))
+    options["guard"] = bool(control in ("pid", "drive") and rng.random() < 0.5)
     if control == "drive":
-        options["params"] = robot.params(gain_units="effort", kp=300.0, ki=0.0, kd=30.0)
+        options["params"] = robot.params(gain_units="effort", kp=300.0, ki=float(rng.choice([0.0, 50.0])), kd=30.0)
     else:
-        options["guard"] = bool(control == "pid" and rng.random() < 0.5)
         options["params"] = params_of(robot, rng.choice(list(CASES))) if control == "pid" else None
     if rng.random() < 0.5:
         options["randomization"] = Randomization(payload=Uniform(0.0, 2.0), friction=Uniform(0.0, 0.5))
@@ -241,26 +245,6 @@ def test_python_calls_of_a_sim_step(panda, actuators):
     assert calls <= 2 * 4 * 20 + 60, "60 for the runner itself"
 
 
-def test_coupled_joints_take_a_call_for_four_sim_steps(tmp_path, engine, monkeypatch):
-    spans, run, run_ticks = [], TickProgram.run, TickProgram.run_ticks
-
-    def counted(self, step, begin, until, end):
-        spans.append((begin, until))
-        return run(self, step, begin, until, end)
-
-    def counted_ticks(self, step, transfers, first, until, steps):
-        spans.extend([steps] * (until - first))
-        return run_ticks(self, step, transfers, first, until, steps)
-
-    monkeypatch.setattr(TickProgram, "run", counted)
-    monkeypatch.setattr(TickProgram, "run_ticks", counted_ticks)
-    with Runner(arm(tmp_path, joints=3), 2, workers=0, engine=engine) as runner:
-        start = runner.reset().qpos
-        runner.step(start, substeps=10)
-        assert spans == [(0, 4), (4, 8), (8, 10)]
-        assert "a call each sim step" not in runner.backend
-
-
 class Rest:
     """A controller that only compensates the passive force."""
 
@@ -272,7 +256,7 @@ class Rest:
 
 
 def test_control_steps_that_are_a_program(panda):
-    """Not those of an own controller, nor of drives whose targets move within a tick."""
+    """All but those of an own controller."""
     effects = {"command_delay": 0.002, "strength": 0.95, "position_noise": 1e-4}
     gains = {"gain_units": "effort", "kp": 300.0, "kd": 30.0}
     cases = {
@@ -281,6 +265,7 @@ def test_control_steps_that_are_a_program(panda):
         "payload": {"randomization": Randomization(payload=Uniform(0.0, 1.0))},
         "drive": {"control": "drive", "params": panda.params(**gains, ki=0.0)},
         "integral": {"control": "drive", "params": panda.params(**gains, ki=50.0)},
+        "guard": {"control": "drive", "params": panda.params(**gains, ki=0.0), "guard": True},
         "controller": {"control": Rest()},
     }
     executors, programs = [], set()
@@ -300,7 +285,7 @@ def test_control_steps_that_are_a_program(panda):
             with Runner(panda, 2, workers=0, **options) as runner:
                 runner.step(panda.settings.target)
             programs |= {case} if executors[-1] else set()
-    assert programs == cases.keys() - {"integral", "controller"}
+    assert programs == cases.keys() - {"controller"}
 
 
 @pytest.mark.usefixtures("engine")
@@ -315,6 +300,10 @@ def test_control_steps_that_are_a_program(panda):
         ({"randomization": Randomization(friction=Uniform(0.1, 0.2))}, ""),
         ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, ""),
         ({"control": Rest()}, "the controller is one of Python"),
+        ({"control": "drive"}, ""),
+        ({"control": "drive", "guard": True}, ""),
+        ({"actuators": bp.make_actuators(9, coulomb=0.5)}, ""),
+        ({"control": "osc", "tool": "panda_hand", "actuators": bp.make_actuators(9, coulomb=0.5)}, ""),
         ({"control": "osc", "tool": "panda_hand"}, ""),
         ({"control": "osc", "tool": "panda_hand", "actuators": bp.make_actuators(9, position_noise=1e-4)}, ""),
     ],
@@ -327,43 +316,137 @@ def test_control_steps_that_are_a_program(panda):
         "friction",
         "masses",
         "controller",
+        "drive",
+        "drive with guard",
+        "coulomb",
+        "tool with friction",
         "tool",
         "tool with sensors",
     ],
 )
 def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, panda, monkeypatch):
-    """Runs of the program, of the whole tick or of one sim step, are counted."""
-    spans, run, run_ticks = [], TickProgram.run, TickProgram.run_ticks
+    check_calls(panda, options, reason, monkeypatch)
 
-    def counted(self, step, begin, until, end):
-        spans.append(until - begin)
-        return run(self, step, begin, until, end)
 
-    def counted_ticks(self, step, transfers, first, until, steps):
-        spans.extend([steps] * (until - first))
-        return run_ticks(self, step, transfers, first, until, steps)
+def check_calls(robot, options, reason, monkeypatch):
+    """Check the number of native calls in a tick of 100 sim steps, and the reason for more of them."""
+    spans, run, run_ticks = [], NativeTick.run, NativeTick.run_ticks
 
-    monkeypatch.setattr(TickProgram, "run", counted)
-    monkeypatch.setattr(TickProgram, "run_ticks", counted_ticks)
-    with Runner(panda, 2, workers=0, **options) as runner:
+    def counted(self, *arguments):
+        done, status = run(self, *arguments)
+        spans.append(done - arguments[1])
+        return done, status
+
+    def counted_ticks(self, group, transfers, first, until, steps):
+        tick, done, status = run_ticks(self, group, transfers, first, until, steps)
+        spans.append((tick - first) * steps + done)
+        return tick, done, status
+
+    monkeypatch.setattr(NativeTick, "run", counted)
+    monkeypatch.setattr(NativeTick, "run_ticks", counted_ticks)
+    with Runner(robot, 2, workers=0, **options) as runner:
         begin = runner.reset()
-        runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=10)
-        assert (spans == [10]) == (not reason)
+        runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=100)
+        assert sum(spans) == (0 if reason else 100)
+        noisy = "actuators" in options and options["actuators"].position_noise is not None
+        assert len(spans) <= 1 + noisy, "the noise of sensors is drawn for 64 sim steps"
         assert ("a call each sim step (" in runner.backend) == bool(reason)
         assert reason in runner.backend
+
+
+def test_a_tick_of_coupled_joints_is_one_native_call(tmp_path, engine, monkeypatch):
+    check_calls(arm(tmp_path, joints=3), {"engine": engine}, "", monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"),
+    "options",
     [
-        ({}, ""),
-        ({"compensate": "none", "actuators": bp.make_actuators(9, position_noise=1e-4)}, ""),
-        ({"actuators": bp.make_actuators(9, position_noise=1e-4)}, "a sensor's reading"),
-        ({"randomization": Randomization(payload=Uniform(0.1, 0.2))}, "varied masses"),
+        {},
+        {"compensate": "none", "actuators": bp.make_actuators(9, position_noise=1e-4)},
+        {"actuators": bp.make_actuators(9, position_noise=1e-4)},
+        {"randomization": Randomization(payload=Uniform(0.1, 0.2))},
     ],
     ids=["pid", "no compensation", "sensors", "masses"],
 )
-def test_the_reasons_on_a_floating_base(options, reason):
-    with Runner(Robot.load("panda", fixed_base=False), 2, workers=0, **options) as runner:
-        assert ("a call each sim step (" in runner.backend) == bool(reason)
-        assert reason in runner.backend
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_a_tick_on_a_floating_base_is_one_native_call(options, engine, monkeypatch):
+    options = {"engine": engine, "ground": False, **options}
+    check_calls(Robot.load("panda", fixed_base=False), options, "", monkeypatch)
+
+
+def varied_pack(robot, engine):
+    """Return a pack of 5 robots, with payloads and masses of links that differ."""
+    chosen, rng = load_engine(engine), np.random.default_rng(0)
+    spec = SceneSpec(
+        robot.urdf,
+        robot.ignored_pairs,
+        robot.joints,
+        5e-4,
+        next(iter(chosen.physics.values())),
+        fixed_base=robot.fixed_base,
+        engine=engine,
+        ground=False,
+    )
+    variation = Variation(payload=rng.uniform(0.5, 3.0, 5), link_mass=rng.uniform(0.5, 2.0, (5, 2)))
+    return chosen.make_pack(spec, 5, 0, 8, variation, "panda_hand", ["panda_link2", "panda_link7"]), variation
+
+
+@pytest.mark.parametrize("fixed_base", [True, False])
+def test_the_joint_mass_matrix_of_varied_masses_is_that_of_the_engine_model(engine, fixed_base, monkeypatch):
+    robot = Robot.load("panda", fixed_base=fixed_base)
+    found = []
+    for switch in ("1", "0"):
+        monkeypatch.setenv(native.SWITCH, switch)
+        pack, variation = varied_pack(robot, engine)
+        assert pack.steps_natively == (switch == "1")
+        poses = robot.sample(5, seed=1)
+        matrices = [pack.joint_mass_matrix(poses)]
+        pack.vary([1, 3], Variation(payload=np.array([0.1, 0.2]), link_mass=variation.link_mass[:2].copy()))
+        matrices.append(pack.joint_mass_matrix(poses))
+        found.append(np.array(matrices))
+        pack.close()
+    assert not np.allclose(found[0][0, 1], found[0][1, 1], rtol=1e-3)
+    scale = np.abs(found[1]).max()
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=(2e-6 if engine == "sapien" else 1e-12) * scale)
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_refresh_of_friction_is_that_of_the_friction_model(panda, tmp_path, coupled):
+    robot = arm(tmp_path, -0.5, 0.01, joints=3) if coupled else panda
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
+    rng, shape = np.random.default_rng(0), (7, robot.dof)
+    model, qpos, coupling = NativeModel(spec), robot.sample(7, seed=0), robot.coupling
+    arrays = None if coupling is None else coupling.arrays
+    armature, drive = rng.uniform(0, 0.1, shape), tuple(rng.uniform(0, 100.0, (2, *shape)))
+    state = friction_model.started(np.zeros(shape), np.zeros(shape))
+    matrix = model.mass_matrix(qpos) + armature[:, None] * np.eye(robot.dof)
+    if arrays is not None:
+        matrix = arrays.mass_matrix(matrix)
+    coulomb = rng.uniform(0, 1, shape) * (rng.random(shape) < 0.7)
+    for friction in (Friction(coulomb), Friction(coulomb[:1], rng.uniform(0, 1, shape))):
+        for given in ((0.0, 0.0), drive):
+            ours = NativeRefresh(model, 7, armature, friction, given, arrays, 1e-3, 64)(state, qpos)
+            theirs = friction_model.refresh(friction, state, matrix, 1e-3, *given)
+            np.testing.assert_allclose(ours.gain, theirs.gain, rtol=1e-10, atol=1e-12)
+            np.testing.assert_allclose(ours.memory, theirs.memory, rtol=1e-10, atol=1e-12)
+            assert (theirs.gain > 0).any()
+            assert (theirs.gain == 0).any()
+
+
+def test_the_update_of_a_constraint_is_that_of_numpy(tmp_path):
+    """Also for a robot that has failed, and for some robots only."""
+    robot = arm(tmp_path, -0.5, 0.01, joints=3)
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
+    model, qpos, rng = NativeModel(spec), robot.sample(6, seed=0), np.random.default_rng(0)
+    qpos[4, 1] = np.nan
+    effort, passive, rate = rng.normal(size=(3, 6, robot.dof))
+    results = []
+    for natively in (True, False):
+        constraint = ConstraintEfforts(6, robot.coupling, robot.continuous, 1e-3)
+        constraint.implicit[...] = 0.01
+        if natively:
+            constraint.use(model, None)
+        constraint.update(model.mass_matrix, qpos, passive, [0, 1, 2, 4])
+        results.append(constraint.apply(effort, np.nan_to_num(qpos), rate))
+    np.testing.assert_allclose(*results, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(results[0][[3, 5]], effort[[3, 5]])

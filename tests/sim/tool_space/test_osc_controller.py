@@ -12,8 +12,10 @@ from tiny_urdf import joint, link, robot, write
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
+from batchpid.native.availability import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.sim.robot.loop_stability import StabilityWarning
+from tests.sim.engine.test_coupled_joints import arm as coupled_arm
 
 HAND = "panda_hand"
 START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
@@ -47,6 +49,11 @@ def six_joints(tmp_path_factory):
 @pytest.fixture(scope="module")
 def damped(tmp_path_factory):
     return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8"/>')
+
+
+@pytest.fixture(scope="module")
+def coupled(tmp_path_factory):
+    return coupled_arm(tmp_path_factory.mktemp("arm"), -0.5, 0.01, joints=6)
 
 
 @pytest.fixture(scope="module")
@@ -284,6 +291,11 @@ MORE = [
     {"actuators": bp.make_actuators(9, sensor_delay=0.001, position_noise=1e-4, velocity_noise=1e-3)},
     {"arm": "damped", "link": "l6"},
     {"arm": "with_friction", "link": "l6", "compensate": "gravity+coriolis"},
+    {"arm": "with_friction", "link": "l6"},
+    {"compensate": "gravity+coriolis+friction", "actuators": bp.make_actuators(9, coulomb=0.3, viscous=0.1)},
+    {"feedforward": 3.0},
+    {"feedforward": 3.0, "compensate": "none"},
+    {"feedforward": 3.0, "arm": "coupled", "link": "l5"},
 ]
 
 
@@ -307,7 +319,8 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
     options, seen = {"substeps": 10, "workers": 0, "engine": engine, **more}, []
     arm, link = request.getfixturevalue(options.pop("arm", "panda")), options.pop("link", HAND)
     noise = 0.05 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
-    starts = (START + noise)[:, : arm.dof]
+    starts = arm.coupled(np.clip((START + noise)[:, : arm.dof], arm.lower, arm.upper))
+    forward = options.pop("feedforward", 0.0) * np.random.default_rng(2).normal(size=(6, 5, arm.dof))
     for kind in (OperationalSpace, Called):
         control = kind(arm, link, **LOOPS[case])
         rng, size = np.random.default_rng(1), control.command.size
@@ -316,10 +329,10 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
         goals[3:, ..., 7:] += 0.05 * np.abs(rng.normal(size=(3, 5, size - 7)))
         with Runner(arm, 5, control=control, **options) as runner:
             runner.reset(starts)
-            parts = [runner.rollout(goals[:2])]
+            parts = [runner.rollout(goals[:2], feedforwards=forward[:2] if forward.any() else None)]
             runner.reset(starts, mask=np.arange(5) == 2)
             snapshot = runner.snapshot()
-            parts.append(runner.rollout(goals[2:]))
+            parts.append(runner.rollout(goals[2:], feedforwards=forward[2:] if forward.any() else None))
             runner.restore(snapshot)
             goals[0, 3, 3:7] = 0.0  # a quaternion without direction
             parts.append(runner.rollout(goals))
@@ -346,3 +359,18 @@ def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
     assert not rollout.saturated[:, 0].any()
     assert rollout.saturated[0, 1, :7].any()
     assert not rollout.saturated[0, 1, 7:].any()
+
+
+@pytest.mark.parametrize("twist", [False, True])
+def test_native_friction_is_that_of_numpy(with_friction, twist, monkeypatch):
+    control = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "friction")
+    rng, rows = np.random.default_rng(0), 9
+    qpos, qvel, passive = rng.normal(size=(3, rows, with_friction.dof))
+    setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(size=(rows, control.command.size))
+    state, efforts = control.init(with_friction, rows), []
+    for switch in ("1", "0"):
+        monkeypatch.setenv(SWITCH, switch)
+        efforts.append(control(state, setpoint, qpos, qvel, passive)[1])
+    np.testing.assert_allclose(*efforts, rtol=1e-9, atol=1e-9)
+    idle = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "none")
+    assert np.abs(efforts[0] - idle(state, setpoint, qpos, qvel, passive)[1]).max() > 1.0

@@ -1,0 +1,220 @@
+// Mass matrices and passive forces of many robots of one kind: sim/engine/rigid_body.py and sim/engine/native_model.py,
+// which have the equations.
+
+#pragma once
+
+#include "batchpid/native/lanes.h"
+#include "batchpid/native/rigid_body.h"
+
+#include <vector>
+
+#pragma GCC visibility push(hidden)
+
+namespace batchpid {
+
+// Robots of one kind: the joint above each, or -1, and whether it slides (dof, 2); and rows of BodyRow (dof, 25).
+template <class T>
+struct Bodies {
+  std::int64_t dof;
+  std::int32_t const *tree;
+  T const *rows;
+};
+
+// Robots of one kind that may differ in their masses; Python fills in the fields (Model in interface.py).
+struct Model {
+  std::int32_t const *tree;  // (dof, 2)
+  double const *rows;        // (dof, 25); the places of the joints are used
+  double const *inertias;    // (robots or 1, dof + 1, 13), of BodyInertia; the last is the base's
+  double gravity[3];
+  std::int64_t dof;
+  std::int32_t varies;       // each robot has its own inertias
+  std::int32_t floats;       // the base moves freely
+};
+
+// WIDTH robots at a pose.
+struct Posed {
+  std::vector<Lanes> qpos, qvel, cosine, sine;
+  std::vector<BodyState<Lanes>> bodies;
+
+  explicit Posed(std::int64_t dof) {
+    for (auto *leaf : {&qpos, &qvel, &cosine, &sine}) leaf->resize(static_cast<std::size_t>(dof));
+    bodies.resize(static_cast<std::size_t>(dof));
+  }
+  // Place the bodies at the positions in qpos.
+  template <class T>
+  inline __attribute__((always_inline)) void place(Bodies<T> const &of) {
+    static_assert(sizeof(BodyRow<T>) == 25 * sizeof(T));
+    for (std::int64_t j = 0; j < of.dof; ++j) sine_and_cosine(qpos[j], sine[j], cosine[j]);
+    auto const *rows = reinterpret_cast<BodyRow<T> const *>(of.rows);
+    place_bodies(of.dof, of.tree, rows, cosine.data(), sine.data(), qpos.data(), bodies.data());
+  }
+  // Place and weigh the bodies of robots `first` to `first + WIDTH` of a model; return the inertia of their base.
+  inline __attribute__((always_inline)) Inertia<Lanes> pose(Model const &of, std::int64_t first, std::int64_t rows,
+                                                            double const *at) {
+    for (std::int64_t j = 0; j < of.dof; ++j) qpos[j] = gather(at, of.dof, j, first, rows);
+    place(Bodies<double>{of.dof, of.tree, of.rows});
+    BodyState<Lanes> base{};
+    base.axes[0].x = base.axes[1].y = base.axes[2].z = Lanes(1.0);
+    std::int64_t const numbers = sizeof(BodyInertia<double>) / sizeof(double), columns = (of.dof + 1) * numbers;
+    for (std::int64_t j = 0; j <= of.dof; ++j) {
+      BodyInertia<Lanes> own;
+      auto *leaf = reinterpret_cast<Lanes *>(&own);
+      for (std::int64_t k = 0; k < numbers; ++k) {
+        std::int64_t const place = j * numbers + k;
+        leaf[k] = of.varies ? gather(of.inertias, columns, place, first, rows) : Lanes(of.inertias[place]);
+      }
+      weigh(own, j < of.dof ? bodies[j] : base);
+    }
+    return base.inertia;
+  }
+};
+
+// Base that floats, of WIDTH robots whose bodies have the inertias of all that their joints move. The joints show the
+// Schur complement M_jj - M_jb M_bb^-1 M_bj = M_jj - Y^T D^-1 Y with L D L^T = M_bb, Y = L^-1 M_bj.
+struct Floating {
+  Lanes factor[36];            // L and D^-1: angular and linear momenta under angular and linear velocities
+  std::vector<Lanes> couples;  // Y, (dof, 6)
+
+  inline __attribute__((always_inline)) Floating(Model const &of, Posed const &posed, Inertia<Lanes> all)
+      : couples(static_cast<std::size_t>(6 * of.dof)) {
+    for (std::int64_t j = 0; j < of.dof; ++j) {
+      bool const slides = of.tree[2 * j + 1] != 0;
+      BodyState<Lanes> const &body = posed.bodies[j];
+      write(body.inertia, turning(body, slides), body.moving, &couples[static_cast<std::size_t>(6 * j)], 1);
+      if (of.tree[2 * j] < 0) all.add(body.inertia);
+    }
+    for (int k = 0; k < 6; ++k) {
+      Lanes unit[6];
+      unit[k] = 1.0;
+      write(all, {unit[0], unit[1], unit[2]}, {unit[3], unit[4], unit[5]}, factor + k, 6);
+    }
+    factorize(6, factor);
+    for (std::int64_t j = 0; j < of.dof; ++j) solve_lower<1>(6, factor, &couples[static_cast<std::size_t>(6 * j)]);
+  }
+  Lanes product(std::int64_t j, Lanes const *column) const {
+    Lanes sum{};
+    for (std::int64_t k = 0; k < 6; ++k) sum += couples[static_cast<std::size_t>(6 * j + k)] * factor[7 * k] * column[k];
+    return sum;
+  }
+
+ private:
+  static inline __attribute__((always_inline)) void write(Inertia<Lanes> const &inertia, Vector<Lanes> w,
+                                                          Vector<Lanes> v, Lanes *out, int stride) {
+    Vector<Lanes> const angular = inertia.angular(w, v), linear = inertia.linear(w, v);
+    Lanes const all[6] = {angular.x, angular.y, angular.z, linear.x, linear.y, linear.z};
+    for (int k = 0; k < 6; ++k) out[k * stride] = all[k];
+  }
+};
+
+// Write the mass matrices (dof, dof) that the joints of robots `first` to `first + WIDTH` show.
+inline __attribute__((always_inline)) void joint_matrix(Model const &of, std::int64_t first, std::int64_t rows,
+                                                        double const *qpos, Posed &posed, Lanes *matrix) {
+  Inertia<Lanes> const base = posed.pose(of, first, rows, qpos);
+  composite_mass_matrix(of.dof, of.tree, posed.bodies.data(), matrix);
+  if (!of.floats) return;
+  Floating const floating(of, posed, base);
+  for (std::int64_t i = 0; i < of.dof; ++i) {
+    Lanes const *own = &floating.couples[static_cast<std::size_t>(6 * i)];
+    for (std::int64_t j = 0; j <= i; ++j) {
+      matrix[i * of.dof + j] -= floating.product(j, own);
+      matrix[j * of.dof + i] = matrix[i * of.dof + j];
+    }
+  }
+}
+
+// Write the mass matrices (rows, dof, dof) that the joints show at qpos (rows, dof).
+FOR_EACH_PROCESSOR static void write_joint_matrices(Model const &of, std::int64_t rows, double const *qpos,
+                                                    double *out) {
+  std::int64_t const size = of.dof * of.dof;
+  Posed posed(of.dof);
+  std::vector<Lanes> matrix(static_cast<std::size_t>(size));
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    joint_matrix(of, first, rows, qpos, posed, matrix.data());
+    for (std::int64_t k = 0; k < size; ++k) scatter(matrix[k], out, size, k, first, rows);
+  }
+}
+
+// Parts of a passive force; without both it is zero.
+struct Parts {
+  bool gravity, coriolis;
+};
+
+// Write the efforts (rows, dof) that cancel gravity, and Coriolis and centrifugal forces, at qpos and qvel. `turning`
+// (rows, 3) is the velocity of a floating base in its own axes; null: the base is held. On a floating base gravity, a
+// velocity and an acceleration of the base cancel.
+FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::int64_t rows, double const *qpos,
+                                            double const *qvel, double const *base_turning, double *out) {
+  std::int64_t const dof = of.dof;
+  Posed posed(dof);
+  std::vector<BodyMotion<Lanes>> motions(static_cast<std::size_t>(dof));
+  std::vector<Lanes> effort(static_cast<std::size_t>(dof)), force(static_cast<std::size_t>(dof));
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    Inertia<Lanes> const base = posed.pose(of, first, rows, qpos);
+    auto const add = [&](bool moves, double sign) {
+      BodyMotion<Lanes> root{};
+      if (base_turning == nullptr) {
+        root.moving_change = {Lanes(-of.gravity[0]), Lanes(-of.gravity[1]), Lanes(-of.gravity[2])};
+      } else if (moves) {
+        auto const along = [&](int axis) { return gather(base_turning, 3, axis, first, rows); };
+        root.turning = {along(0), along(1), along(2)};
+      }
+      for (std::int64_t j = 0; j < dof; ++j) posed.qvel[j] = moves ? gather(qvel, dof, j, first, rows) : Lanes{};
+      move_bodies(dof, of.tree, posed.bodies.data(), posed.qvel.data(), root, motions.data());
+      for (std::int64_t j = 0; j < dof; ++j) motions[j].accelerate(posed.bodies[j].inertia);
+      efforts_of_wrenches(dof, of.tree, posed.bodies.data(), motions.data(), effort.data());
+      if (base_turning != nullptr) {
+        root.accelerate(base);
+        for (std::int64_t j = dof - 1; j >= 0; --j) {
+          if (of.tree[2 * j] >= 0) {
+            posed.bodies[of.tree[2 * j]].inertia.add(posed.bodies[j].inertia);
+          } else {
+            root.torque = root.torque + motions[j].torque;
+            root.force = root.force + motions[j].force;
+          }
+        }
+        Floating const floating(of, posed, base);
+        Lanes wrench[6] = {root.torque.x, root.torque.y, root.torque.z, root.force.x, root.force.y, root.force.z};
+        solve_lower<1>(6, floating.factor, wrench);
+        for (std::int64_t j = 0; j < dof; ++j) effort[j] -= floating.product(j, wrench);
+      }
+      for (std::int64_t j = 0; j < dof; ++j) force[j] += sign * effort[j];
+    };
+    for (auto &each : force) each = Lanes{};
+    bool const held = base_turning == nullptr;
+    if (parts.coriolis || (parts.gravity && held)) add(parts.coriolis, 1.0);
+    if (parts.coriolis && !parts.gravity && held) add(false, -1.0);
+    for (std::int64_t j = 0; j < dof; ++j) scatter(force[j], out, dof, j, first, rows);
+  }
+}
+
+// Write the mass matrices (rows, dof, dof) at qpos + ahead * qvel, both (rows, dof); qvel may be null for zero.
+template <class T>
+inline __attribute__((always_inline)) void write_lanes(Bodies<T> const &of, std::int64_t rows, T const *qpos,
+                                                       T const *qvel, double ahead, T *out) {
+  Posed posed(of.dof);
+  std::vector<Lanes> matrix(static_cast<std::size_t>(of.dof * of.dof));
+  for (std::int64_t first = 0; first < rows; first += WIDTH) {
+    for (std::int64_t j = 0; j < of.dof; ++j) {
+      posed.qpos[j] = gather(qpos, of.dof, j, first, rows);
+      if (qvel != nullptr) posed.qpos[j] += ahead * gather(qvel, of.dof, j, first, rows);
+    }
+    posed.place(of);
+    weigh_bodies(of.dof, reinterpret_cast<BodyRow<T> const *>(of.rows), posed.bodies.data());
+    composite_mass_matrix(of.dof, of.tree, posed.bodies.data(), matrix.data());
+    for (std::int64_t k = 0; k < of.dof * of.dof; ++k) scatter(matrix[k], out, of.dof * of.dof, k, first, rows);
+  }
+}
+
+FOR_EACH_PROCESSOR static void write_mass_matrices(Bodies<double> const &of, std::int64_t rows, double const *qpos,
+                                                   double const *qvel, double ahead, double *out) {
+  write_lanes(of, rows, qpos, qvel, ahead, out);
+}
+
+FOR_EACH_PROCESSOR static void write_float_mass_matrices(Bodies<float> const &of, std::int64_t rows, float const *qpos,
+                                                         float *out) {
+  write_lanes(of, rows, qpos, static_cast<float const *>(nullptr), 0.0, out);
+}
+
+}  // namespace batchpid
+
+#pragma GCC visibility pop
