@@ -11,10 +11,10 @@ import pytest
 
 import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, discretise
+from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim import Robot
 from batchpid.sim.benchmark.workload import Workload
 from batchpid.sim.loop.numpy_executor import NoiseBlocks
-from batchpid.sim.loop.stage_program import compiled_stages
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {

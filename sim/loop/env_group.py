@@ -162,14 +162,14 @@ class EnvGroup:
         :meth:`run` runs the first tick that is not complete.
         """
         executor, containment = self._executor, self._containment
-        if self._contacts is not None or containment.suspended.any():
+        if not isinstance(executor, NativeExecutor) or self._contacts is not None or containment.suspended.any():
             return Stopped(first)
         if used not in self._quiet:
             command = arrays.command.with_only(*used)
             fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
             shown = Shown(self._motor, self._saturated, self._guarded, fault)
             self._quiet[used] = executor.quiet_ticks(self._state, command, arrays, shown)
-        if (ticks := self._quiet[used]) is None or not isinstance(executor, NativeExecutor):
+        if (ticks := self._quiet[used]) is None:
             return Stopped(first)
         containment.failed[:] = False
         stopped = executor.run_ticks(ticks, self._state, self._measured, first, until, steps)

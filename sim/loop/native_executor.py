@@ -75,7 +75,7 @@ class NativeExecutor(NumPyExecutor):
         return Ran(program.state, program.outputs, measured, program.before, done, bool(status & LOOK))
 
     def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
-        """Return the ticks under commands like ``command`` as :meth:`NumPyExecutor.quiet_ticks` does."""
+        """Return the ticks under commands like ``command`` in one call; None where each tick needs Python."""
         layout = self._layout
         is_whole = self._compiles and self._reads_qvel and not layout.measures
         if not (is_whole and layout.control in ("pid", "effort")):

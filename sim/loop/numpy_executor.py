@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
+from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
-from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import (
     REFRESH_STEPS,
     Constants,
@@ -28,8 +29,6 @@ from batchpid.sim.loop.control_step import (
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
-from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
-from batchpid.sim.loop.stage_program import compiled_stages
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
 
@@ -107,10 +106,6 @@ class NumPyExecutor:
                 break
         return Ran(state, outputs, measured, before, index + 1, failed)
 
-    def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
-        """Return the ticks under commands like ``command`` in one call; None where each tick needs calls of Python."""
-        return None
-
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step under efforts ``qf``; return the reading, and whether an env may have failed."""
         self._pack.write_qf(qf)
@@ -138,7 +133,7 @@ def with_model(
     if controller is not None:
         call = partial(jitted_controller, options.dtype, pack.size, controller) if jitted else controller
         model = model._replace(controller=call)
-    if motors is not None:
+    if motors is not None and _is_native(pack):
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if constants.friction.coulomb is not None and _is_native(pack):
         given = constants.friction, constants.drive, constants.coupling, constants.timestep

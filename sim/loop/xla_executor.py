@@ -123,9 +123,6 @@ class XLAExecutor:
                 measured = self.measure()
         return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & LOOK))
 
-    def quiet_ticks(self, state: StepState, command: Command, arrays: Any, shown: Any) -> None:
-        """Return None: each tick is a call of the program."""
-
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as a new NumPy array."""
         return np.array(array, bool if array.dtype == bool else np.float64)[: self._pack.size]

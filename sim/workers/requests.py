@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.canonical import canonical_digest
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.workers.canonical import canonical_digest
 
 _RUN = struct.Struct("<cII??")  # b"R", ticks, substeps, use_rate, use_feedforward
 

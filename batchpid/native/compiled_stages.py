@@ -14,9 +14,9 @@ import numpy as np
 
 from batchpid.motors import STAGES, Coefficients, Stages
 from batchpid.native.array_program import ArrayProgram
+from batchpid.native.availability import program_status
 from batchpid.native.operations import OPERATION
 from batchpid.native.tracing import trace
-from batchpid.sim.engine import native
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""
@@ -27,7 +27,7 @@ def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
 
     ``shape`` is (envs, joints).
     """
-    if not native.status().active:
+    if not program_status().active:
         return STAGES
     return Stages(*(_compiled(stage, k, shape) for stage in STAGES))
 

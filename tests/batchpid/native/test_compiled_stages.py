@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.motors import STAGES, advance_effort, advance_measurement, discretise
-from batchpid.sim.engine import native
-from batchpid.sim.loop import stage_program
-from batchpid.sim.loop.stage_program import compiled_stages
+from batchpid.native import compiled_stages as module
+from batchpid.native.availability import SWITCH, program_status
+from batchpid.native.compiled_stages import compiled_stages
 
 DT, SHAPE = 1 / 2000, (3, 4)
-needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
+needs_extension = pytest.mark.skipif(not program_status().active, reason="there is no extension")
 EFFECTS = {
     "command_delay": 0.0033,
     "sensor_delay": 0.0021,
@@ -79,14 +79,14 @@ def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
     state = bp.motors.init(many, qpos, DT)
     k = discretise(many, state, DT, SHAPE[0])
     for stage, inputs in (("delivered", 4), ("limits", 2), ("play", 3)):
-        assert stage_program._program(getattr(STAGES, stage), k, SHAPE, (False,) * inputs) is not None, stage
+        assert module._program(getattr(STAGES, stage), k, SHAPE, (False,) * inputs) is not None, stage
     stages = compiled_stages(k, SHAPE)
     stronger = discretise(bp.make_actuators(SHAPE[1], strength=2.0), state, DT, SHAPE[0])
     np.testing.assert_array_equal(stages.delivered(stronger, qpos, qpos + 1.0, qpos, qpos)[0], 2.0)
 
 
 def test_without_the_extension_stages_are_numpys(monkeypatch):
-    monkeypatch.setenv(native.SWITCH, "0")
+    monkeypatch.setenv(SWITCH, "0")
     actuators = bp.make_actuators(SHAPE[1], strength=0.5)
     k = discretise(actuators, bp.motors.init(actuators, np.zeros(SHAPE), DT), DT, SHAPE[0])
     assert compiled_stages(k, SHAPE) is STAGES
