@@ -7,6 +7,7 @@ from typing import Any
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
+from batchpid.law.inputs import checked_inputs, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import proportional, turned_origin, weighted_rate, wrapped_error
 from batchpid.law.state import PIDState
@@ -33,8 +34,20 @@ def track(
     Raises
     ------
     InvalidArgumentError
-        If the params have no integral (ki is None), or dt is missing where it is needed.
+        If the params have no integral (ki is None), dt is missing where it is needed, a shape does not fit, or the
+        state lacks what the params need.
     """
+    measurement, setpoint, effort, measurement_rate, setpoint_rate, feedforward = checked_inputs(
+        params,
+        state,
+        measurement,
+        setpoint=setpoint,
+        effort=effort,
+        measurement_rate=measurement_rate,
+        setpoint_rate=setpoint_rate,
+        feedforward=feedforward,
+    )
+    checked_state(state, needs(params))
     if params.ki is None:
         raise InvalidArgumentError(
             "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"

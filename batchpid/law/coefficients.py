@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
-from batchpid.checks.validate import positive
 from batchpid.law.implicit import as_explicit, implicit_gains
+from batchpid.law.inputs import checked_dt
 from batchpid.law.params import PIDParams
 
 
@@ -55,10 +55,9 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches twice as fast. A dt
-    that is a Python number must be positive and finite, else InvalidArgumentError is raised.
+    that is not an array of JAX must be positive and finite, else InvalidArgumentError is raised.
     """
-    if isinstance(dt, int | float):
-        positive("dt", dt, "s")
+    dt = checked_dt(dt, params.dtype)
     c, c_given, implicit = params.setpoint_weight_derivative, None, params.discretization is not None
     if implicit:
         c, c_given = implicit_gains(params, dt)[-2:]

@@ -27,6 +27,7 @@ from typing import Any
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
+from batchpid.law.inputs import checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -36,25 +37,25 @@ def init(params: PIDParams, measurement: Any) -> PIDState:
 
     The derivative starts from ``measurement`` (envs, joints) [rad or m]: the first step has no derivative kick,
     unless the params ask for one.
+
+    Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
+    (measurement,) = checked_inputs(params, PIDState(), measurement)
     xp = namespace(*params, measurement)
     y = xp.zeros_like(measurement, dtype=xp.result_type(params.kp, measurement)) + measurement
-    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
-    weights_rate = differentiates and params.setpoint_weight_derivative is not None
-    keeps_effort = params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort)
+    begun = {"measurement": y, "setpoint": y, "setpoint_seen": float(params.first_derivative is not None)}
+    begun |= {"origin": 0.0 if params.weight_origin is None else y}
 
-    def filled(value: float, wanted: bool) -> Any:  # no two leaves share a buffer: JAX donates each of them
-        return xp.full_like(y, value) if wanted else None
+    def filled(name: str) -> Any:  # no two leaves share a buffer: JAX donates each of them
+        value = begun.get(name, 0.0)
+        return y.copy() if value is y else xp.full_like(y, value)
 
-    return PIDState(
-        integral=None if params.ki is None else clip(filled(0.0, True), params.integral_min, params.integral_max, xp),
-        measurement=y.copy() if differentiates or (weights and params.continuous is not None) else None,
-        derivative=filled(0.0, differentiates and params.derivative_filter_time is not None),
-        setpoint=y.copy() if weights_rate else None,
-        setpoint_seen=filled(float(params.first_derivative is not None), weights_rate),
-        effort=filled(0.0, keeps_effort),
-        origin=y.copy() if weights and params.weight_origin is not None else filled(0.0, weights),
+    state = PIDState(
+        *(filled(name) if has else None for name, has in zip(PIDState._fields, needs(params), strict=True))
     )
+    if params.ki is None:
+        return state
+    return state._replace(integral=clip(state.integral, params.integral_min, params.integral_max, xp))
 
 
 def step(
@@ -89,17 +90,27 @@ def step(
     Raises
     ------
     InvalidArgumentError
-        If dt is a Python number that is not positive and finite.
+        If dt is not positive and finite, a shape does not fit, or the state lacks what the params need.
     """
-    k = discretise(params, dt)
-    return advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+    inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
+    state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
+    return advance(discretise(params, dt), state, setpoint, measurement, *rest)
 
 
 def step_terms(
     params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
-    return advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
+    state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
+    return advance_terms(discretise(params, dt), state, setpoint, measurement, **dict(zip(inputs, rest, strict=True)))
+
+
+def _checked(
+    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, **inputs: Any
+) -> tuple[PIDState, Any, Any, list[Any]]:
+    """Return the arguments of a step, of which those of NumPy, numbers and lists are arrays."""
+    y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
+    return checked_state(state, needs(params)), r, y, rest
 
 
 def advance(
@@ -213,8 +224,11 @@ def _advance(
 def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs, joints).
 
-    ``keep_integral`` keeps their integral term, e.g. a learnt load.
+    ``keep_integral`` keeps their integral term, e.g. a learnt load. Raises InvalidArgumentError if a shape does not
+    fit, or the mask is not of bools.
     """
+    (measurement,) = checked_inputs(params, state, measurement)
+    mask = checked_mask(mask, state)
     fresh = init(params, measurement)
     if keep_integral:
         fresh = fresh._replace(integral=state.integral)
@@ -262,7 +276,7 @@ def drive_target(
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
-    state, terms = step_terms(params, state, setpoint, measurement, dt, **inputs)
+    state, terms = advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
     driven = params.kp > 0
     return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)

@@ -28,11 +28,13 @@ OptionalFloats = Annotated[tuple[float, ...] | None, _flag(metavar="FLOAT [FLOAT
 Switch = Annotated[bool, _flag()]
 Force = Annotated[bool, _flag("Replace output files that exist.")]
 
-RobotName = Annotated[str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF.")]
+RobotName = Annotated[
+    str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF or MJCF file.")
+]
 RecordedRobot = Annotated[
     str | None,
     tyro.conf.Positional,
-    _flag("Bundled robot, or path of a URDF. Default: that of the recording, or panda."),
+    _flag("Bundled robot, or path of a URDF or MJCF file. Default: that of the recording, or panda."),
 ]
 MissingMeshes = Annotated[Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]

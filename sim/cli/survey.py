@@ -32,7 +32,7 @@ class SurveyCommand:
         tyro.conf.Positional,
         tyro.conf.arg(metavar="PATHS [PATHS ...]", help_behavior_hint="(required)"),
     ]
-    """URDF files, and folders that are searched for files *.urdf."""
+    """URDF and MJCF files, and folders that are searched for files *.urdf."""
     moves: int = 8
     """Number of moves of each robot."""
     seed: int = 0

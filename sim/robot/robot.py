@@ -276,6 +276,8 @@ def _find(name_or_path: str | Path) -> Path:
         return _ASSETS / f"{name_or_path}.urdf"
     if os.path.isfile(path):  # pathlib's methods raise other errors for names that are too long or start with ~
         return path.absolute()
+    if os.path.isdir(path):
+        raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
         "check the spelling, or pass the path of a URDF or MJCF file"

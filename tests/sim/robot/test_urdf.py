@@ -71,7 +71,9 @@ def test_a_bad_urdf_has_its_error(case, tmp_path):
     assert str(path) in str(info.value)
 
 
-def test_a_missing_file_and_an_unknown_name_are_not_found():
+def test_a_missing_file_and_an_unknown_name_are_not_found(tmp_path):
+    with pytest.raises(RobotNotFoundError, match=f"^{tmp_path} is a folder; pass the path"):
+        Robot.load(tmp_path)
     with pytest.raises(RobotNotFoundError, match=r"no robot 'pandaa'.*jaco2, panda.*check the spelling"):
         Robot.load("pandaa")
     for path in ("/no/such.urdf", "~nobody-at-all/arm.urdf", "x" * 1000, "x" * 5000):

@@ -1,0 +1,108 @@
+"""Checks of what the pure functions of the law are given: types, shapes and dtypes, which JAX knows while it traces.
+
+Values are not read, except those of a time step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from batchpid.arrays.choices import HoldEffort
+from batchpid.checks.validate import instance, positive, read_array
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.params import PIDParams
+from batchpid.law.state import PIDState
+
+
+def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **inputs: Any) -> list[Any]:
+    """Return ``measurement`` and ``inputs`` as arrays that broadcast with the params and the state; None stays None."""
+    instance("params", params, PIDParams, "build them with make_params")
+    instance("state", state, PIDState, "begin with init(params, measurement)")
+    arrays = {"measurement": _as_array("measurement", measurement)}
+    arrays |= {name: None if value is None else _as_array(name, value) for name, value in inputs.items()}
+    of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
+    known = {"state": [leaf.shape for leaf in state if leaf is not None]}
+    known |= {name: [array.shape] for name, array in arrays.items() if array is not None}
+    (whole,), joints = known["measurement"], params.num_joints
+    usual = {whole, (1, joints)}  # a look saves most of the time
+    if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
+        _check_shapes(_common(of_params), joints, known)
+    return list(arrays.values())
+
+
+def _check_shapes(shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]) -> None:
+    """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those before and ``shape``."""
+    for name, shapes in known.items():
+        try:
+            shape = _common({shape, *shapes})
+            fits = shape[-1] == joints and (name != "measurement" or shapes[0][-1:] == (joints,))
+        except ValueError:
+            fits = False
+        if not fits:
+            problem = f"has shape {shapes[0]}, which does not fit {shape} of the params and the inputs before it"
+            raise InvalidArgumentError(name, problem, remedy=f"give (envs, {joints})")
+
+
+def needs(params: PIDParams) -> PIDState:
+    """Return which leaves of a state the params need, as bools."""
+    differentiates, weights = params.kd is not None, params.setpoint_weight is not None
+    weights_rate = differentiates and params.setpoint_weight_derivative is not None
+    return PIDState(
+        integral=params.ki is not None,
+        measurement=differentiates or (weights and params.continuous is not None),
+        derivative=differentiates and params.derivative_filter_time is not None,
+        setpoint=weights_rate,
+        setpoint_seen=weights_rate,
+        effort=params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort),
+        origin=weights,
+    )
+
+
+def checked_state(state: PIDState, needed: PIDState) -> PIDState:
+    """Return ``state`` if it has every leaf that is ``needed``."""
+    for name, leaf, need in zip(PIDState._fields, state, needed, strict=True):
+        if need and leaf is None:
+            remedy = "begin with init(params, measurement), or take state.matched_to(init(params, measurement))"
+            raise InvalidArgumentError("state", f"has no {name}, which these params need", remedy=remedy)
+    return state
+
+
+def checked_mask(mask: Any, state: PIDState) -> Any:
+    """Return ``mask`` as bools, one for each env of ``state``."""
+    array = _as_array("mask", mask, "b")
+    if array.dtype.kind != "b":
+        raise InvalidArgumentError("mask", f"must be bools, not {array.dtype}", remedy="give one bool per env")
+    envs = _common(leaf.shape for leaf in state if leaf is not None)[:1]
+    if array.ndim != 1 or (envs and array.shape != envs):
+        raise InvalidArgumentError("mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env")
+    return array
+
+
+def checked_dt(dt: Any, dtype: Any) -> Any:
+    """Return ``dt`` if it is positive and finite, a number as a float, and NumPy's array in the params' ``dtype``.
+
+    A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
+    """
+    if isinstance(dt, np.ndarray) and dt.ndim:
+        if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
+            raise InvalidArgumentError("dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)")
+        return dt.astype(dtype, copy=False)
+    if isinstance(dt, np.ndarray | np.generic):
+        dt = dt.item()
+    return dt if hasattr(dt, "__array_namespace__") else positive("dt", dt, "s")
+
+
+def _as_array(name: str, value: Any, kinds: str = "iuf") -> Any:
+    """Return ``value`` as an array; one of another library stays as it is."""
+    is_own = type(value) is np.ndarray
+    if (is_own and value.dtype.kind in kinds) or (not is_own and hasattr(value, "__array_namespace__")):
+        return value
+    return read_array(name, value, kinds)
+
+
+def _common(shapes: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+    """Return the shape to which all these broadcast; ValueError if there is none."""
+    return np.broadcast_shapes(*shapes)
