@@ -12,12 +12,14 @@ the inertia tensor I, so that the momenta under s_j, and the mass matrix, are::
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.read_only import read_only
 from batchpid.native.task_space_extension import BODY
 from batchpid.sim.engine.native import xla
 from batchpid.sim.robot.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
@@ -49,6 +51,12 @@ class RigidBodies(NamedTuple):
     def table(self) -> Float64:
         """Return all but the tree, a row for each body (dof, 25)."""
         return np.hstack([getattr(self, name).reshape(-1, numbers) for name, numbers in BODY.items()])
+
+    def frozen(self) -> RigidBodies:
+        """Return these bodies, read-only."""
+        links = {name: (body, read_only(place)) for name, (body, place) in self.links.items()}
+        bodies, base = RigidBodies._make(map(read_only, self)), SpatialInertia._make(map(read_only, self.base))
+        return bodies._replace(base=base, links=MappingProxyType(links))
 
     def inertias(self) -> Float64:
         """Return mass, center and tensor, a row for each body and one for the base (dof + 1, 13)."""

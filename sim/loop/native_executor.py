@@ -2,8 +2,8 @@
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
 arrays that hold the state from step to step. Before and after it, native code updates the inertia of the friction model
-and the constraint of coupled joints, writes the targets of drives, and computes the passive force where the engine's
-steps do not read that of the model. Sensors have another program; Python draws their noise in advance, for 64 sim steps
+and the constraint of coupled joints, writes the targets of drives, and computes the passive force of the model where
+the engine's steps read another one. Sensors have another program; Python draws their noise in advance, for 64 sim steps
 at once. Operational-space control is a native call before the program, which takes its effort as an input. With a
 controller of Python, or more joints than a program sums, the control step runs in NumPy, and one native call applies
 the efforts, steps the engine and reads it.

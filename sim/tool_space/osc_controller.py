@@ -207,7 +207,7 @@ class OperationalSpace:
 
     @property
     def is_native(self) -> bool:
-        """Whether native code has this law: not that of a subclass."""
+        """Whether native code has this law; a subclass may change it."""
         return type(self) is OperationalSpace
 
     def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.mujoco.batch_model import BatchModel
 from batchpid.sim.engine.mujoco.model_builder import robot_model
@@ -135,8 +134,7 @@ def bodies_of(spec: SceneSpec) -> RigidBodies:
     *bodies, base = [total(of_joint or [_NO_BASE]) for of_joint in parts]
     mass, center, tensor = map(np.array, zip(*bodies, strict=True))
     links = {name: places[body] for name, body in robot.bodies.items()}
-    table = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links)
-    return RigidBodies._make(map(read_only, table))
+    return RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links).frozen()
 
 
 _NO_BASE = SpatialInertia(1e-12, np.zeros(3), np.zeros((3, 3)))

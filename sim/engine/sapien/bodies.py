@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.rigid_body import RigidBodies
 from batchpid.sim.robot.rotations import from_rpy, rotate
 from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
@@ -36,8 +35,7 @@ def bodies_of(robot: Any) -> RigidBodies:
     *bodies, base = [total(of_body) for of_body in parts]
     mass, center, tensor = map(np.array, zip(*bodies, strict=True))
     links = {link.name: place for link, place in places.items()}
-    of_bodies = RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links)
-    return RigidBodies._make(map(read_only, of_bodies))
+    return RigidBodies(tree, at_zero[:, :3, :3], at_zero[:, :3, 3], mass, center, tensor, base, links).frozen()
 
 
 def _matrix(pose: Any) -> Float64:
