@@ -106,6 +106,9 @@ class NumPyExecutor:
                 break
         return Ran(state, outputs, measured, before, index + 1, failed)
 
+    def quiet_ticks(self, *_: Any) -> Any:
+        """Return None: each tick needs calls of Python."""
+
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step under efforts ``qf``; return the reading, and whether an env may have failed."""
         self._pack.write_qf(qf)
