@@ -101,16 +101,13 @@ class NativeExecutor(NumPyExecutor):
         if self._constants.coupling is not None and index % COUPLING_STEPS == 0:
             self._pack.update_constraint()
         qpos, qvel, passive = np.empty((3, *qf.shape))
-        status = self._native_step(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
+        status = self._prepared()(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
         if not self._reads_force:
             passive = None
         elif not self._steps_read_force:
             passive = self._pack.passive_force(self._gravity, self._coriolis)
         measured = Measured(qpos, qvel, passive)
         return (self._look(status, measured) if status else measured), bool(status & LOOK)
-
-    def _native_step(self, *arrays: Float64) -> int:
-        return self._prepared()(*arrays)
 
     def _look(self, status: int, measured: Measured) -> Measured:
         """Handle the event that a sim step reported in ``status``; return the reading."""
