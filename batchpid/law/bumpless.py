@@ -35,7 +35,7 @@ def track(
     ------
     InvalidArgumentError
         If the params have no integral (ki is None), dt is missing where it is needed, a shape does not fit, or the
-        state lacks what the params need.
+        state lacks an array that the params need.
     """
     measurement, setpoint, effort, measurement_rate, setpoint_rate, feedforward = checked_inputs(
         params,

@@ -1,11 +1,10 @@
-"""Checks of what the pure functions of the law are given: types, shapes and dtypes, which JAX knows while it traces.
+"""Checks of the arguments of the law's pure functions: types, shapes and dtypes, which JAX knows while it traces.
 
-Values are not read, except those of a time step.
+Of the values, only a time step is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **input
     (whole,), joints = known["measurement"], params.num_joints
     usual = {whole, (1, joints)}  # a look saves most of the time
     if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
-        _check_shapes(_common(of_params), joints, known)
+        _check_shapes(np.broadcast_shapes(*of_params), joints, known)
     return list(arrays.values())
 
 
@@ -37,7 +36,7 @@ def _check_shapes(shape: tuple[int, ...], joints: int, known: dict[str, list[tup
     """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those before and ``shape``."""
     for name, shapes in known.items():
         try:
-            shape = _common({shape, *shapes})
+            shape = np.broadcast_shapes(shape, *shapes)
             fits = shape[-1] == joints and (name != "measurement" or shapes[0][-1:] == (joints,))
         except ValueError:
             fits = False
@@ -75,7 +74,7 @@ def checked_mask(mask: Any, state: PIDState) -> Any:
     array = _as_array("mask", mask, "b")
     if array.dtype.kind != "b":
         raise InvalidArgumentError("mask", f"must be bools, not {array.dtype}", remedy="give one bool per env")
-    envs = _common(leaf.shape for leaf in state if leaf is not None)[:1]
+    envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
     if array.ndim != 1 or (envs and array.shape != envs):
         raise InvalidArgumentError("mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env")
     return array
@@ -96,13 +95,8 @@ def checked_dt(dt: Any, dtype: Any) -> Any:
 
 
 def _as_array(name: str, value: Any, kinds: str = "iuf") -> Any:
-    """Return ``value`` as an array; one of another library stays as it is."""
+    """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
     is_own = type(value) is np.ndarray
     if (is_own and value.dtype.kind in kinds) or (not is_own and hasattr(value, "__array_namespace__")):
         return value
     return read_array(name, value, kinds)
-
-
-def _common(shapes: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the shape to which all these broadcast; ValueError if there is none."""
-    return np.broadcast_shapes(*shapes)

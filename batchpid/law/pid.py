@@ -90,7 +90,7 @@ def step(
     Raises
     ------
     InvalidArgumentError
-        If dt is not positive and finite, a shape does not fit, or the state lacks what the params need.
+        If dt is not positive and finite, a shape does not fit, or the state lacks an array that the params need.
     """
     inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
     state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
@@ -108,7 +108,7 @@ def step_terms(
 def _checked(
     params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, **inputs: Any
 ) -> tuple[PIDState, Any, Any, list[Any]]:
-    """Return the arguments of a step, of which those of NumPy, numbers and lists are arrays."""
+    """Check the arguments of a step; return them as arrays, JAX arrays unchanged."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
     return checked_state(state, needs(params)), r, y, rest
 

@@ -14,9 +14,9 @@ from batchpid.sim.loop.tick_program import TickProgram
 
 
 class Shown(NamedTuple):
-    """Arrays of a group that its observations show besides positions and velocities; always the same ones.
+    """Further arrays of a group's observations, besides positions and velocities; always the same ones.
 
-    Effort, saturated and guarded joints (envs, dof) are those of the last tick; ``fault`` has the last faults (envs,).
+    Effort, saturated and guarded joints of the last tick (envs, dof), and the last fault of each env (envs,).
     """
 
     effort: NDArray[np.float32]
@@ -28,8 +28,7 @@ class Shown(NamedTuple):
 class QuietTicks:
     """Ticks of ``program`` with commands and observations in ``arrays`` (ticks, envs, ...), and in ``shown``.
 
-    They can be run while no env is suspended, and sensors, friction, coupled joints, drives and a caller's controller
-    need nothing of Python.
+    They can be run under control "pid" or "effort", without sensors, while no env is suspended.
     """
 
     def __init__(self, program: TickProgram, arrays: Arrays, shown: Shown) -> None:

@@ -182,8 +182,9 @@ class OperationalSpace:
 
     @property
     def reporting(self) -> Callable[..., tuple[Any, Any, Any]] | None:
-        """Call that also returns the joints (envs, dof) whose effort the limits have changed; None in a subclass with a
-        call of its own.
+        """Call that also returns the joints (envs, dof) whose effort the limits have changed.
+
+        None in a subclass that defines ``__call__``.
         """
         return self._advance if type(self).__call__ is OperationalSpace.__call__ else None
 
