@@ -1,9 +1,8 @@
 """Cost of operational-space control and of inverse kinematics of a panda: native rows against NumPy.
 
 "regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a straight arm, where
-each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in one call; the parts below it are calls
-of their own.
-Searches start 0.3 rad away from a solution.
+each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in one call; its parts are timed as
+separate calls. Searches start 0.3 rad away from a solution.
 """
 
 from __future__ import annotations

@@ -164,7 +164,7 @@ class _Search:
         under = np.where(self._full, low, -np.inf) - found.qpos
         back = turn * (np.ceil(np.maximum(under, 0) / turn) - np.ceil(np.maximum(over, 0) / turn))
         past = back.any(axis=1)
-        if past.any():  # what a turn and the limits leave out is within the tolerance, or is searched again
+        if past.any():  # a joint between two turns is clipped to its limits, so search again from there
             within = self.solve(goal[past], np.clip(found.qpos[past] + back[past], low, high))
             for whole, part in zip(
                 found, within._replace(iterations=within.iterations + found.iterations[past]), strict=True

@@ -145,25 +145,6 @@ class NativeRefresh:
         return state._replace(gain=factors[0], memory=factors[1])
 
 
-class NativeMassMatrix:
-    """Mass matrices of the description of ``spec``, on a fixed base, by the native code that also runs in a tick."""
-
-    def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self._native = spec, native.extension("_gateway")
-
-    @cached_property
-    def _bodies(self) -> tuple[NDArray[Any], ...]:
-        bodies = scene_dynamics(self._spec).bodies
-        return np.ascontiguousarray(bodies.tree, np.int32), np.ascontiguousarray(bodies.table())
-
-    def __call__(self, qpos: NDArray[Any]) -> Float64:
-        """Return the mass matrices (M, dof, dof) [kg m^2 or kg] at ``qpos`` (M, dof)."""
-        rows = np.ascontiguousarray(qpos, np.float64)
-        out = np.empty((*rows.shape, rows.shape[1]))
-        self._native.mass_matrices(*self._bodies, rows, out, *rows.shape)
-        return out
-
-
 def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
     """Return the function of positions that computes the mass matrices of a robot's description, on a fixed base.
 
@@ -171,7 +152,7 @@ def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float
     the last bits.
     """
     if natively:
-        return NativeMassMatrix(spec)
+        return NativeModel(spec).mass_matrix
     model = _model_of(spec)
     return lambda qpos: model().mass_matrix(qpos)
 

@@ -22,8 +22,9 @@ from batchpid.sim.engine.batch_dynamics import (
     NativeBatchDynamics,
     PinocchioBatchDynamics,
 )
-from batchpid.sim.engine.native import extension, python_calls
+from batchpid.sim.engine.native import python_calls
 from batchpid.sim.engine.native.native_tick import NativeTick
+from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.calls import PythonCalls
 from batchpid.sim.engine.sapien.dynamics import Dynamics
@@ -131,8 +132,8 @@ def _compare_ticks() -> None:
         wanted = 30.0 * (goal - qpos) - 5.0 * qvel
         return [(matrix * wanted[:, None, :]).sum(axis=-1)]
 
-    bodies = Dynamics(replace(_spec(), ground=False)).bodies
-    tree, table, armature = np.ascontiguousarray(bodies.tree, np.int32), bodies.table(), np.array([0.1, 0.2])
+    model, armature = NativeModel(replace(_spec(), ground=False)), np.array([0.1, 0.2])
+    tree, table = np.ascontiguousarray(model.bodies.tree, np.int32), model.bodies.table()
     results = []
     for in_ticks in (True, False):
         pack = Pack(_spec(), 4, system_size=2)
@@ -150,8 +151,7 @@ def _compare_ticks() -> None:
             else:
                 if done % every == 0:
                     ahead = 0.5 * (min(every, STEPS - done) - 1) * 1e-2
-                    extension("_gateway").mass_matrices(tree, table, qpos + ahead * qvel, matrix, *shape)
-                    matrix += np.diag(armature)
+                    matrix[...] = model.mass_matrix(qpos + ahead * qvel) + np.diag(armature)
                 program(*inputs, out=(qf,))
                 status, done = step(qf, qpos, qvel, passive), done + 1
             if status:

@@ -243,22 +243,6 @@ PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return Py_BuildValue("LLi", static_cast<long long>(tick), static_cast<long long>(step), static_cast<int>(status));
 }
 
-// mass_matrices(tree, bodies, qpos, out, rows, dof): of each row of qpos (rows, dof), as tick makes them.
-PyObject *mass_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), dof = PyLong_AsSsize_t(arguments[5]);
-  Buffer tree, bodies, qpos, out;
-  if (!tree.open(arguments[0], 2 * dof, sizeof(std::int32_t), PyBUF_C_CONTIGUOUS) ||
-      !bodies.open(arguments[1], 25 * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !qpos.open(arguments[2], rows * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !out.open(arguments[3], rows * dof * dof, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
-    return nullptr;
-  }
-  return without_gil([&] {
-    write_mass_matrices({dof, tree.as<std::int32_t>(), bodies.as<double>()}, rows, qpos.as<double>(), nullptr, 0.0,
-                        out.as<double>());
-  });
-}
-
 // Return the structure of Python at an address, or null with an exception.
 template <class T>
 T const *structure(PyObject *address) {
@@ -361,7 +345,6 @@ PyMethodDef METHODS[] = {
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"tick", method(tick), METH_FASTCALL, nullptr},
     {"ticks", method(ticks), METH_FASTCALL, nullptr},
-    {"mass_matrices", method(mass_matrices), METH_FASTCALL, nullptr},
     {"joint_matrices", method(joint_matrices), METH_FASTCALL, nullptr},
     {"forces", method(forces), METH_FASTCALL, nullptr},
     {"refresh", method(refresh_friction), METH_FASTCALL, nullptr},

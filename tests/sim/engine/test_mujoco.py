@@ -106,13 +106,13 @@ def test_dynamics_are_those_of_sapien_up_to_single_precision(name, fixed_base):
 
 
 def test_the_native_mass_matrix_is_that_of_the_model(tmp_path):
-    from batchpid.sim.engine.native_model import NativeMassMatrix
+    from batchpid.sim.engine.native_model import NativeModel
 
     tree = Robot.load(write(tmp_path, robot(*random_tree(np.random.default_rng(5), 12))))
     for arm in (load_bundled("panda"), load_bundled("jaco2"), tree):
         spec, qpos = spec_of(arm), arm.sample(20, seed=1)
         expected = load_engine("mujoco").scene_dynamics(spec).mass_matrix(qpos)
-        np.testing.assert_allclose(NativeMassMatrix(spec)(qpos), expected, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(NativeModel(spec).mass_matrix(qpos), expected, atol=1e-12 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("left_out", range(5))
