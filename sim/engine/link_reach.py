@@ -28,6 +28,8 @@ class LinkExtent(NamedTuple):
     """Largest distance by which that joint slides [m]."""
     balls: Float64
     """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
+    free: bool = False
+    """True if that joint leaves it free to move: joint ``dof`` is its way, and ``dof`` + 1 its angle about any axis."""
 
 
 def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
@@ -61,6 +63,10 @@ def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) ->
     while at.parent is not None:
         centers = (centers - at.in_link[:3, 3]) @ at.in_link[:3, :3]
         farthest += np.linalg.norm(at.in_link[:3, 3])
+        if at.free and at.dof is not None:
+            ball = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)
+            reach[at.dof : at.dof + 2] = 1.0, min(farthest, ball)
+            return  # nothing but the world is above
         if at.slides:
             radii, farthest = radii + at.travel, farthest + at.travel
         elif at.dof is not None:

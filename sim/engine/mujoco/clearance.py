@@ -23,8 +23,12 @@ Arrays = dict[str, NDArray[Any]]
 _BEYOND = 0.01
 """Distance by which a sliding joint may pass its limits while clearances hold [m]: MuJoCo's limits are soft."""
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_NEVER = 1 << 30
+"""Age without a proof: NEVER in ``clearance.h``."""
+_POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is larger."""
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _GEOM = mujoco.mjtGeom
 _KINDS = {
     int(kind) for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX)
@@ -35,17 +39,17 @@ _KINDS = {
 def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs that ``Clearance`` in ``clearance.h`` lists, the same for every robot.
 
-    None where MuJoCo always runs its collision detection: no pair of shapes may touch, a floating base may touch the
-    ground, a kind of shape is not supported, or the fields to change are not found in this version of MuJoCo.
+    None where MuJoCo always runs its collision detection: no pair of shapes may touch, a kind of shape is not
+    supported, or the fields to change are not found in this version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model) if places() is not None else np.empty((0, 2))
-    floats = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
-    world = model.body_weldid[model.geom_bodyid] == 0
-    if not len(pairs) or (floats and world[pairs].any()) or not set(model.geom_type.tolist()) <= _KINDS:
+    if not len(pairs) or not set(model.geom_type.tolist()) <= _KINDS:
         return None
     reach, travel = _reach(robot)
     bodies = model.geom_bodyid[pairs]
+    arms = closing_arms(reach[bodies[:, 0]], reach[bodies[:, 1]])
+    at = arms > 0
     meshes = np.where(model.geom_type == int(_GEOM.mjGEOM_MESH), model.geom_dataid, -1)
     hulls = np.zeros((model.ngeom, 2), np.int32)
     hulls[meshes >= 0] = np.stack([model.mesh_vertadr, model.mesh_vertnum], axis=1)[meshes[meshes >= 0]]
@@ -56,7 +60,10 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
         "hulls": hulls,
         "vertices": model.mesh_vert.astype(float).reshape(-1, 3),
         "pairs": pairs,
-        "arms": closing_arms(reach[bodies[:, 0]], reach[bodies[:, 1]]),
+        "bodies": bodies.astype(np.int32),
+        "arms": arms[at],
+        "arm_ways": at.nonzero()[1].astype(np.int32),
+        "begins": np.cumsum([0, *at.sum(axis=1)], dtype=np.int32),
         "travel": travel,
     }
 
@@ -82,18 +89,23 @@ def touching_pairs(model: Any) -> NDArray[np.int32]:
 
 
 def _reach(robot: RobotMj) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the reach of the bodies (bodies, dof), and the range of joint positions in which it holds (2, dof)."""
+    """Return the reach of the bodies (bodies, ways), and the range of joint positions in which it holds (2, dof).
+
+    A floating base adds two ways to those of the joints: its own, and its angle.
+    """
     model, dof = robot.model, len(robot.qvel)
     places = {int(at): number for number, at in enumerate(robot.qvel)}
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
     links = []
     for body in range(model.nbody):
         pose, in_link = _pose(model.body_pos[body], model.body_quat[body]), np.eye(4)
-        number, slides, farthest = None, False, 0.0
+        number, slides, farthest, floats = None, False, 0.0, False
         for joint in np.flatnonzero(model.jnt_bodyid == body):
-            number = places.get(int(model.jnt_dofadr[joint]))
-            if number is None:  # a free joint
+            floats = int(model.jnt_type[joint]) == _FREE
+            if floats:
+                number = dof
                 continue
+            number = places[int(model.jnt_dofadr[joint])]
             slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
             in_link[:3, :3] = np.linalg.qr(np.column_stack([model.jnt_axis[joint], np.eye(3)]))[0]
             in_link[:3, 3] = model.jnt_pos[joint]
@@ -102,8 +114,9 @@ def _reach(robot: RobotMj) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             farthest = float(np.abs(travel[:, number]).max()) if slides else 0.0
         balls = np.column_stack([model.geom_pos, model.geom_rbound])[model.geom_bodyid == body]
         parent = int(model.body_parentid[body]) if body else None
-        links.append(LinkExtent(parent, number, slides, pose @ in_link, in_link, farthest, balls))
-    return link_reach(links, dof), travel
+        links.append(LinkExtent(parent, number, slides, pose @ in_link, in_link, farthest, balls, floats))
+    ways = dof + 2 if any(link.free for link in links) else dof
+    return link_reach(links, ways), travel
 
 
 def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -114,18 +127,20 @@ def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[n
 
 
 @cache
-def places() -> tuple[int, int] | None:
-    """Return the places of ``opt.disableflags`` and of the pointer ``body_geomnum`` in ``mjModel`` [bytes].
+def places() -> tuple[int, ...] | None:
+    """Return the places of ``opt.disableflags``, and of the pointers :data:`_POINTERS`, in ``mjModel`` [bytes].
 
-    They are found by flipping a flag, and by the address; None if one is ambiguous.
+    They are found by flipping a flag, and by their addresses; None if one is ambiguous.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
     model.opt.disableflags ^= _NO_CONTACT
     after = ctypes.string_at(model._address, _BEGINNING)
     flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
-    counts = (8 * np.flatnonzero(np.frombuffer(after, np.uint64) == model.body_geomnum.ctypes.data)).tolist()
-    return (flags[0], counts[0]) if len(flags) == len(counts) == 1 and flags[0] % 4 == 0 else None
+    addresses = [getattr(model, name).ctypes.data for name in _POINTERS]
+    found = [(8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist() for address in addresses]
+    is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(each) == 1 for each in found)
+    return (flags[0], *(each[0] for each in found)) if is_clear else None
 
 
 class GroupClearance:
@@ -142,26 +157,37 @@ class GroupClearance:
     """
 
     def __init__(self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int) -> None:
-        robots, pairs = len(data), len(tables["pairs"])
+        robots, pairs, bodies = len(data), len(tables["pairs"]), models[0].nbody
+        floats = bool((models[0].jnt_type == _FREE).any())
+        ways = dof + 2 * floats
         addresses = {
             "models": [model._address for model in models],
             "places": [each.geom_xpos.ctypes.data for each in data],
             "turns": [each.geom_xmat.ctypes.data for each in data],
             "shapes": [model.body_geomnum.ctypes.data for model in models],
+            "types": [model.body_contype.ctypes.data for model in models],
+            "affinities": [model.body_conaffinity.ctypes.data for model in models],
         }
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
-        arrays |= tables | {name: np.zeros((robots, dof)) for name in ("last", "moved", "rate")}
+        arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
+        arrays |= {"last": np.zeros((robots, dof + 7 * floats)), "open": np.zeros((robots, bodies), np.int8)}
         arrays |= {"left": np.full((robots, pairs), -1.0, np.float32), "wait": np.ones(robots, np.int32)}
-        arrays["no_shapes"] = np.zeros_like(models[0].body_geomnum)
+        arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types", "some_affinities")}
+        arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         self._kept = models, data
-        flags, counts = places() or (0, 0)
+        flags, counts, types, affinities = places() or (0, 0, 0, 0)
         self._fields = Clearance(
             kinematics=kinematics,
             number=pairs,
+            ways=ways,
+            size=bodies,
             flags=flags,
             counts=counts,
+            types_at=types,
+            affinities_at=affinities,
             contact=_NO_CONTACT,
+            floats=floats,
             **{name: array.ctypes.data for name, array in self.arrays.items()},
         )
 

@@ -1,9 +1,10 @@
-// Proof that no two shapes of a robot touch, with which a sim step skips MuJoCo's collision detection.
+// Proof that shapes of a robot do not touch, with which a sim step skips MuJoCo's collision detection of these shapes.
 //
 // Two shapes d apart stay apart while the joints move by less than sum_j arm_j |dq_j| = d, where arm_j bounds the speed at
 // which joint j closes them, at every pose. That is conservative advancement (B. Mirtich, Impulse-based Dynamic
 // Simulation of Rigid Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A proof uses
-// the present state alone. Where there is none, MuJoCo runs its collision detection, with the same result.
+// the present state alone. MuJoCo runs its collision detection for the bodies of the other pairs, with the same result.
+// A floating base moves its shapes against the world: by its way, and by its angle times their largest distance from it.
 
 #pragma once
 
@@ -33,25 +34,40 @@ struct Clearance {
   std::int32_t const *hulls;         // (shapes, 2): first vertex and number of vertices
   double const *vertices;            // (vertices, 3)
   std::int32_t const *pairs;         // (pairs, 2): shapes that may touch; a plane comes first
-  double const *arms;                // (pairs, dof)
+  std::int32_t const *bodies;        // (pairs, 2): bodies of these shapes
+  // Arms that are not zero (entries,), and their ways: a joint's, or of a floating base its own and its angle. Those of
+  // a pair begin at its entry of `begins` (pairs + 1,).
+  double const *arms;
+  std::int32_t const *arm_ways, *begins;
   double const *travel;              // (2, dof): least and largest position at which the arms hold
-  double *last;                      // (robots, dof): positions after the last sim step
-  double *moved;                     // (robots, dof): sum of |dq| since the last proof
-  float *left;                       // (robots, pairs): clearances [m], rounded down
-  double *rate;                      // (robots, dof): largest arm over clearance [1/rad or 1/m]
-  std::int32_t *wait;                // (robots,): 0 while a proof holds; otherwise sim steps until the next attempt
+  double *last;                      // (robots, dof), and 7 more for a floating base: positions after the last sim step
+  double *moved;                     // (robots, ways): sum of |dq| since the last proof
+  float *left;                       // (robots, pairs): clearances [m], rounded down; -1 without a proof
+  double *rate;                      // (robots, ways): largest arm over clearance [1/rad or 1/m]
+  std::int32_t *wait;                // (robots,): 0 while all pairs are proved; otherwise sim steps to the next attempt
+  std::int32_t *age;                 // (robots,): sim steps since the last proof
+  char *open;                        // (robots, all bodies): whether a pair of the body is not proved
   std::int32_t const *const *shapes;  // (robots,): numbers of shapes of their bodies, body_geomnum in mjModel
-  std::int32_t const *no_shapes;     // (bodies,): zeros
-  std::int64_t number;               // of pairs
-  std::int64_t flags, counts;        // places of opt.disableflags and of the pointer body_geomnum in mjModel [bytes]
-  std::int32_t contact, unused;      // mjDSBL_CONTACT
+  std::int32_t const *const *types, *const *affinities;  // (robots,): body_contype and body_conaffinity in mjModel
+  std::int32_t const *no_shapes;     // (all bodies,): zeros
+  std::int32_t *some_types, *some_affinities;  // (all bodies,): of bodies in pairs that are not proved; work space
+  std::int64_t number, ways, size;   // of pairs, of ways, and of all bodies
+  std::int64_t flags, counts, types_at, affinities_at;  // places of opt.disableflags and of these pointers in mjModel
+  std::int32_t contact;              // mjDSBL_CONTACT
+  std::int32_t floats;               // the base moves freely
 };
 
 constexpr double MARGIN = 1e-4;        // [m], far above the rounding of places and of MuJoCo's own distances
 constexpr double SHARE = 0.25;         // of a clearance; when more of it is used, it is computed anew
 constexpr double TIGHT = 0.7;          // of the true distance, at which a bound is good enough to stop
 constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
-constexpr std::int32_t RETRY_STEPS = 50;
+constexpr std::int32_t RETRY_STEPS = 50;  // between attempts to prove the pairs that are not
+constexpr std::int32_t NEVER = 1 << 30;   // age without a proof
+constexpr std::int32_t SPACING = 4;       // between proofs, each of which costs as much as collision detection
+constexpr std::int32_t LEAST_STEPS = 16;  // that a proof lasts: pairs too near for it are left to MuJoCo
+
+// Shapes of which MuJoCo looks for contacts in a sim step.
+enum class Looked { NONE, SOME, ALL };
 
 using Point = Vector<double>;
 
@@ -133,68 +149,116 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   return best;
 }
 
-// Recompute the clearances of one robot that are used up in part. Return whether all are positive.
-inline bool prove(Clearance const &clearance, std::int64_t row, std::int64_t dof) {
-  double *moved = clearance.moved + row * dof, *rate = clearance.rate + row * dof;
+// Recompute the clearances of one robot that are used up in part, and with `retry` those of the pairs that are not proved.
+// Return whether all pairs are.
+inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
+  std::int64_t const ways = clearance.ways;
+  double *moved = clearance.moved + row * ways, *rate = clearance.rate + row * ways;
   float *left = clearance.left + row * clearance.number;
+  char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
-  std::fill(rate, rate + dof, 0.0);
+  double const age = clearance.age[row];
+  bool all = true;
+  std::fill(rate, rate + ways, 0.0);
+  std::fill(open, open + clearance.size, char{0});
   for (std::int64_t pair = 0; pair < clearance.number; ++pair) {
-    double const *arms = clearance.arms + pair * dof;
-    double used = 0.0;
-    for (std::int64_t joint = 0; joint < dof; ++joint) used += arms[joint] * moved[joint];
-    double rest = left[pair] - used;
-    if (!(used < SHARE * rest)) {
-      std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
-      rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
-                            {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+    std::int32_t const begin = clearance.begins[pair], end = clearance.begins[pair + 1];
+    double const *arms = clearance.arms;
+    std::int32_t const *arm_ways = clearance.arm_ways;
+    bool proved = left[pair] > 0.0f;
+    if (proved || retry) {
+      double used = 0.0;
+      for (std::int32_t k = begin; k < end; ++k) used += arms[k] * moved[arm_ways[k]];
+      double rest = left[pair] - used;
+      bool const anew = !proved || !(used < SHARE * rest);
+      if (anew) {
+        std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
+        rest = distance_bound({clearance, a, places + 3 * a, turns + 9 * a},
+                              {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
+      }
+      bool const fades = anew && (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
+      left[pair] = std::nextafter(static_cast<float>(rest), -1.0f);
+      proved = left[pair] > 0.0f && !fades;
     }
-    left[pair] = std::nextafter(static_cast<float>(rest), -1.0f);
-    if (!(left[pair] > 0.0f)) {
-      std::fill(left, left + clearance.number, -1.0f);  // all are computed anew next time
-      return false;
+    if (proved) {
+      double const inverse = 1.0 / left[pair];
+      for (std::int32_t k = begin; k < end; ++k) {
+        double &most = rate[arm_ways[k]];
+        most = std::max(most, arms[k] * inverse);
+      }
+    } else {
+      left[pair] = -1.0f;
+      open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
+      all = false;
     }
-    double const inverse = 1.0 / left[pair];
-    for (std::int64_t joint = 0; joint < dof; ++joint) rate[joint] = std::max(rate[joint], arms[joint] * inverse);
   }
-  std::fill(moved, moved + dof, 0.0);
-  return true;
+  std::fill(moved, moved + ways, 0.0);
+  return all;
 }
 
-// Return whether no shapes of one robot touch, as far as is proved, at the positions `qpos` of the joints at `qpos_at`.
-inline bool is_clear(Clearance const &clearance, std::int64_t row, std::int64_t dof, void *data, double const *qpos,
-                     std::int64_t const *qpos_at) {
-  double *last = clearance.last + row * dof, *moved = clearance.moved + row * dof;
-  double const *rate = clearance.rate + row * dof, *least = clearance.travel, *largest = least + dof;
+// Add the motion of a floating base to `moved`: its way, and an angle, from its position and quaternion (7,).
+inline void add_base_motion(double const *now, double *last, double *moved) {
+  double way = 0.0, with = 0.0, against = 0.0;
+  for (int k = 0; k < 3; ++k) way += (now[k] - last[k]) * (now[k] - last[k]);
+  for (int k = 3; k < 7; ++k) {
+    with += (now[k] - last[k]) * (now[k] - last[k]);
+    against += (now[k] + last[k]) * (now[k] + last[k]);
+  }
+  moved[0] += std::sqrt(way);
+  moved[1] += 4.0 * std::asin(std::min(1.0, 0.5 * std::sqrt(std::min(with, against))));  // |q - q'| = 2 sin(angle / 4)
+  std::copy(now, now + 7, last);
+}
+
+// Return the shapes that may touch, as far as is proved, at the positions `qpos` of the joints at `qpos_at`.
+inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64_t dof, void *data,
+                                  double const *qpos, std::int64_t const *qpos_at) {
+  std::int64_t const ways = clearance.ways;
+  double *last = clearance.last + row * (dof + (clearance.floats ? 7 : 0)), *moved = clearance.moved + row * ways;
+  double const *rate = clearance.rate + row * ways, *least = clearance.travel, *largest = least + dof;
   double used = 0.0;
   bool inside = true;
   for (std::int64_t joint = 0; joint < dof; ++joint) {
     double const q = qpos[qpos_at[joint]];
     moved[joint] += std::fabs(q - last[joint]);
     last[joint] = q;
-    used += rate[joint] * moved[joint];
     inside = inside && q >= least[joint] && q <= largest[joint];
   }
-  std::int32_t &wait = clearance.wait[row];
-  if (!inside) return false;
-  if (wait == 0 && used < 1.0) return true;
-  if (wait > 1) {
-    --wait;
-    return false;
+  if (clearance.floats) add_base_motion(qpos, last + dof, moved + dof);
+  if (!inside) return Looked::ALL;
+  for (std::int64_t way = 0; way < ways; ++way) used += rate[way] * moved[way];
+  std::int32_t &wait = clearance.wait[row], &age = clearance.age[row];
+  bool const retry = wait > 0 && --wait == 0;
+  age = std::min(age + 1, NEVER);
+  if (!retry && age < SPACING && !(used < 1.0)) return Looked::ALL;
+  if (retry || !(used < 1.0)) {
+    clearance.kinematics(clearance.models[row], data);
+    if (!prove(clearance, row, retry) && wait == 0) wait = RETRY_STEPS;
+    age = 0;
   }
-  clearance.kinematics(clearance.models[row], data);
-  bool const clear = prove(clearance, row, dof);
-  wait = clear ? 0 : RETRY_STEPS;
-  return clear;
+  return wait == 0 ? Looked::NONE : Looked::SOME;
 }
 
-// Switch MuJoCo's contacts of one robot off or on. Without them no body has shapes either, so that MuJoCo does not place
-// them: nothing but collision detection and proofs reads their places, and a proof places them first.
-inline void switch_contacts(Clearance const &clearance, std::int64_t row, bool off) {
+// Let MuJoCo look for contacts of these shapes of one robot. For NONE no body has shapes either, so that MuJoCo does not
+// place them: nothing but collision detection and proofs reads their places, and a proof places them first. For SOME the
+// other bodies count as bodies that touch nothing; all shapes are placed, since their places choose the axes along which
+// MuJoCo sorts bodies.
+inline void switch_contacts(Clearance const &clearance, std::int64_t row, Looked which) {
   char *model = static_cast<char *>(clearance.models[row]);
+  bool const none = which == Looked::NONE, some = which == Looked::SOME;
+  auto const point = [&](std::int64_t place, std::int32_t const *to) {
+    *reinterpret_cast<std::int32_t const **>(model + place) = to;
+  };
   auto &flags = *reinterpret_cast<std::int32_t *>(model + clearance.flags);
-  flags = off ? flags | clearance.contact : flags & ~clearance.contact;
-  *reinterpret_cast<std::int32_t const **>(model + clearance.counts) = off ? clearance.no_shapes : clearance.shapes[row];
+  flags = none ? flags | clearance.contact : flags & ~clearance.contact;
+  point(clearance.counts, none ? clearance.no_shapes : clearance.shapes[row]);
+  std::int32_t const *types = clearance.types[row], *affinities = clearance.affinities[row];
+  for (std::int64_t body = 0; some && body < clearance.size; ++body) {
+    bool const open = clearance.open[row * clearance.size + body] != 0;
+    clearance.some_types[body] = open ? types[body] : 0;
+    clearance.some_affinities[body] = open ? affinities[body] : 0;
+  }
+  point(clearance.types_at, some ? clearance.some_types : types);
+  point(clearance.affinities_at, some ? clearance.some_affinities : affinities);
 }
 
 }  // namespace batchpid

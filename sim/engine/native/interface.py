@@ -59,13 +59,13 @@ class Clearance(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
         *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
-        *((name, ctypes.c_void_p) for name in ("pairs", "arms", "travel", "last", "moved", "left", "rate", "wait")),
-        *((name, ctypes.c_void_p) for name in ("shapes", "no_shapes")),
-        ("number", ctypes.c_int64),
-        ("flags", ctypes.c_int64),
-        ("counts", ctypes.c_int64),
-        ("contact", ctypes.c_int32),
-        ("unused", ctypes.c_int32),
+        *((name, ctypes.c_void_p) for name in ("pairs", "bodies", "arms", "arm_ways", "begins", "travel")),
+        *((name, ctypes.c_void_p) for name in ("last", "moved", "left", "rate", "wait", "age", "open")),
+        *((name, ctypes.c_void_p) for name in ("shapes", "types", "affinities")),
+        *((name, ctypes.c_void_p) for name in ("no_shapes", "some_types", "some_affinities")),
+        *((name, ctypes.c_int64) for name in ("number", "ways", "size")),
+        *((name, ctypes.c_int64) for name in ("flags", "counts", "types_at", "affinities_at")),
+        *((name, ctypes.c_int32) for name in ("contact", "floats")),
     ]
 
 

@@ -96,7 +96,7 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
   Messages::text = message;
   Messages::frame = &frame;
   if (setjmp(frame) != 0) {
-    if (clearance != nullptr) switch_contacts(*clearance, row, false);
+    if (clearance != nullptr) switch_contacts(*clearance, row, Looked::ALL);
     Messages::frame = nullptr;
     return false;
   }
@@ -107,11 +107,13 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
     finite = finite && q <= farthest && q >= -farthest;
   }
   if (finite) {
-    bool const clear =
-        clearance != nullptr && is_clear(*clearance, row, dof, mujoco.data[row], mujoco.qpos[row], mujoco.qpos_at);
-    if (clear) switch_contacts(*clearance, row, true);
+    Looked looked = Looked::ALL;
+    if (clearance != nullptr) {
+      looked = looked_at(*clearance, row, dof, mujoco.data[row], mujoco.qpos[row], mujoco.qpos_at);
+    }
+    if (looked != Looked::ALL) switch_contacts(*clearance, row, looked);
     mujoco.step1(mujoco.models[row], mujoco.data[row]);
-    if (clear) switch_contacts(*clearance, row, false);
+    if (looked != Looked::ALL) switch_contacts(*clearance, row, Looked::ALL);
   }
   Messages::frame = nullptr;
   return true;

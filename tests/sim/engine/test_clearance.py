@@ -63,8 +63,9 @@ def poses(of, count, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, of.dof))
 
 
-def at(built, qpos):
+def at(built, qpos, base=()):
     data = mujoco.MjData(built.model)
+    data.qpos[: len(base)] = base
     data.qpos[built.qpos] = qpos
     mujoco.mj_step1(built.model, data)
     return data
@@ -87,14 +88,23 @@ def test_every_contact_is_of_a_pair(arm, ground):
     assert touched, "no pose has a contact"
 
 
+def arms_of(tables, ways):
+    """Return the arms of each pair (pairs, ways)."""
+    arms = np.zeros((len(tables["pairs"]), ways))
+    for row, first, end in zip(arms, tables["begins"], tables["begins"][1:], strict=False):
+        row[tables["arm_ways"][first:end]] = tables["arms"][first:end]
+    return arms
+
+
 def test_shapes_close_no_faster_than_their_arms(arm):
     built = model_of(arm)
     tables = shape_tables(built)
+    all_arms = arms_of(tables, arm.dof)
     rng = np.random.default_rng(1)
     for qpos in poses(arm, 15):
         moved = np.clip(qpos + rng.normal(scale=rng.choice([0.01, 0.3]), size=arm.dof), arm.lower, arm.upper)
         before, after = at(built, qpos), at(built, moved)
-        for pair, arms in list(zip(tables["pairs"], tables["arms"], strict=True))[:: 1 + len(tables["pairs"]) // 40]:
+        for pair, arms in list(zip(tables["pairs"], all_arms, strict=True))[:: 1 + len(tables["pairs"]) // 40]:
             closing = distance(built, before, pair) - distance(built, after, pair)
             if distance(built, after, pair) > 1e-3:  # MuJoCo's depth of a penetration is not exact
                 assert closing <= arms @ np.abs(moved - qpos) + 1e-5
@@ -163,26 +173,55 @@ def test_most_steps_of_a_free_motion_need_no_contacts(clearances):
             assert not clearances[-1].arrays["wait"].any()
 
 
+def test_shapes_close_no_faster_than_a_floating_base_moves_them(arm):
+    built = model_of(arm, ground=True, fixed_base=False)
+    tables = shape_tables(built)
+    rng, ways = np.random.default_rng(2), arm.dof + 2
+    for qpos in poses(arm, 4, seed=2):
+        turn = rng.normal(size=4)
+        base = np.array([0, 0, 3, *turn / np.linalg.norm(turn)])
+        other = base + np.array([*rng.normal(scale=0.1, size=3), *rng.normal(scale=0.1, size=4)])
+        other[3:] /= np.linalg.norm(other[3:])
+        angle = 2 * np.arccos(min(1.0, abs(base[3:] @ other[3:])))
+        moved = np.append(np.zeros(arm.dof), [np.linalg.norm(other[:3] - base[:3]), angle])
+        before, after = (at(built, qpos, floating) for floating in (base, other))
+        for pair, arms in zip(tables["pairs"], arms_of(tables, ways), strict=True):
+            closing = distance(built, before, pair) - distance(built, after, pair)
+            assert closing <= arms @ moved + 1e-5
+
+
 @needs_extension
-def test_a_falling_robot_moves_the_same_without_proofs(clearances, monkeypatch):
-    panda = load_bundled("panda")
-    built = model_of(panda, ground=False, fixed_base=False)
-    states = []
+@pytest.mark.parametrize("ground", [False, True])
+def test_a_falling_robot_moves_the_same_without_proofs(arm, clearances, monkeypatch, ground):
+    built = model_of(arm, ground=ground, fixed_base=False)
+    states, open_bodies, touched = [], [], 0
     for tables in (shape_tables, lambda robot: None):
         monkeypatch.setattr(mujoco_step, "shape_tables", tables)
-        data = at(built, panda.start)
-        still = np.zeros((1, panda.dof)), np.zeros(1, bool)
+        data = at(built, arm.start, [0, 0, 1.5, 1, 0, 0, 0])
+        still = np.zeros((1, arm.dof)), np.zeros(1, bool)
         step = mujoco_step.MujocoStep(built, [built.model], lambda data=data: [data], *still, False, None)
-        for _ in range(200):
-            step(np.ones((1, panda.dof)), *np.zeros((3, 1, panda.dof)))
+        for _ in range(1500):
+            step(np.ones((1, arm.dof)), *np.zeros((3, 1, arm.dof)))
+            open_bodies.append(int(clearances[0].arrays["open"].sum()))
+            touched = max(touched, data.ncon)
         states.append(np.concatenate([data.qpos, data.qvel]))
-    assert not clearances[0].arrays["wait"].any()
     assert states[0].tobytes() == states[1].tobytes()
-    assert np.abs(states[0][:3]).max() > 0.01
+    assert min(open_bodies) < built.model.nbody
+    assert not ground or touched
 
 
-def test_a_floating_robot_over_ground_is_always_looked_at():
+@needs_extension
+def test_bodies_that_touch_nothing_are_left_out(clearances):
+    panda = Robot.load("panda", self_collision="urdf")
+    closed = panda.settings.target.copy()
+    closed[-2:] = 0.0
+    with Runner(panda, 1, engine="mujoco", workers=0) as runner:
+        runner.reset()
+        runner.rollout(np.tile(closed, (100, 1)))
+    open_bodies = clearances[-1].arrays["open"]
+    assert 0 < open_bodies.sum() < open_bodies.size / 2
+
+
+def test_robots_without_pairs_of_shapes_have_no_tables():
     panda = load_bundled("panda")
-    assert shape_tables(model_of(panda, ground=True, fixed_base=False)) is None
-    assert shape_tables(model_of(panda, ground=False, fixed_base=False)) is not None
     assert shape_tables(model_of(panda, collisions=False)) is None
