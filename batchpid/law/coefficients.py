@@ -54,8 +54,8 @@ class Coefficients(NamedTuple):
 def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches twice as fast. A dt
-    that is not an array of JAX must be positive and finite, else InvalidArgumentError is raised.
+    With ``num_envs`` they are :func:`spread`. A dt that is not an array of JAX must be positive and finite, else
+    InvalidArgumentError is raised.
     """
     dt = checked_dt(dt, params.dtype)
     c, c_given, implicit = params.setpoint_weight_derivative, None, params.discretization is not None
@@ -79,10 +79,11 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),
     )
-    if num_envs is None:
-        return k
-    xp, zeros = namespace(*k), namespace(*k).zeros((num_envs, params.num_joints), params.dtype)
-    off = (type(None), tuple)
-    return Coefficients(
-        *(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=params.dtype) for leaf in k)
-    )
+    return k if num_envs is None else spread(k, num_envs)
+
+
+def spread(k: Coefficients, num_envs: int) -> Coefficients:
+    """Return ``k`` with arrays (num_envs, joints), with which NumPy steps small batches twice as fast."""
+    xp, dtype = namespace(*k), k.kp.dtype
+    zeros, off = xp.zeros((num_envs, k.kp.shape[-1]), dtype), (type(None), tuple)
+    return Coefficients(*(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k))

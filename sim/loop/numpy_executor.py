@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.law.coefficients import spread
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
@@ -79,6 +80,11 @@ class NumPyExecutor:
         self._reads_qvel = needs_qvel(layout, constants, options.speed_limit)
         self._reads_force = self._gravity and not layout.measures
 
+    @cached_property
+    def _spread(self) -> Constants:
+        k = self._constants.k
+        return self._constants if k is None else self._constants._replace(k=spread(k, self._pack.size))
+
     def measure(self) -> Measured:
         """Return a reading of the robots."""
         pack = self._pack
@@ -94,7 +100,7 @@ class NumPyExecutor:
         for index in range(begin, end):
             step = Step(index, end, index + 1 == end)
             with controller_errors(self._controller, index + 1):
-                state, outputs = control_step(self._layout, self._constants, state, command, measured, step)
+                state, outputs = control_step(self._layout, self._spread, state, command, measured, step)
             # Writing the drives' targets costs a call for each joint.
             if outputs.target is not target and isinstance(pack, DrivenPack):
                 known = outputs.target_rate is rate

@@ -60,7 +60,7 @@ def make_constants(
     )
     if options.control == "pid":
         return constants._replace(
-            k=bp.discretise(acting, scene.timestep, pack.size),
+            k=bp.discretise(acting, scene.timestep),
             armature=None if known is None else known.armature,
             damping=damping if law.whole and damping.any() else None,
         )

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.jax_settings import own_settings
-from batchpid.law.coefficients import Coefficients
-from batchpid.motors.friction import Friction
+from batchpid.native.trees import mapped
 from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
@@ -75,14 +74,11 @@ class XLAExecutor:
         needs_bodies = (law is not None and law.needs_matrix) or constants.friction.coulomb is not None
         bodies = scene_dynamics(pack.spec).bodies if needs_bodies else None
 
-        def spread(array: Any) -> Any:
-            return None if array is None else padded(np.broadcast_to(array, (pack.size, pack.dof)))
+        def spread(part: Any) -> Any:
+            return mapped(lambda array: padded(np.broadcast_to(array, (pack.size, pack.dof))), part)
 
-        k = constants.k and Coefficients(
-            *(leaf if leaf is None or isinstance(leaf, tuple) else spread(leaf) for leaf in constants.k)
-        )
-        limits = (None, None) if law is not None else tuple(map(spread, constants.limits))
-        friction, timestep = Friction(*map(spread, constants.friction)), np.float64(constants.timestep)
+        limits = (None, None) if law is not None else spread(constants.limits)
+        k, friction, timestep = spread(constants.k), spread(constants.friction), np.float64(constants.timestep)
         arrays = constants._replace(timestep=timestep, k=k, limits=limits, friction=friction)
         rows = (pack.size, pack.dof)
         with own_settings(options.dtype):
