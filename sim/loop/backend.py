@@ -61,14 +61,13 @@ def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     engine = options.load_engine().title
     calls = native.status().describe(engine)
     drives = options.control == "drive"
-    if drives or options.backend == "numpy":
+    if drives or options.backend == "numpy" or (options.control == "effort" and obstacle(options, actuators)):
         active = native.status().active
-        compiled = active and (options.control == "pid" or isinstance(options.control, OperationalSpace))
         reason = native_obstacle(options) if active else ""
         each = f", a call each sim step ({reason})" if reason else ""
         if drives:
             return f"law in {engine} (control 'drive'){each}, {calls}"
-        return f"law {'as a native program' if compiled else 'in NumPy'}{each}, {calls}"
+        return f"law {'as a native program' if active and not reason else 'in NumPy'}{each}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"
     if not reason:

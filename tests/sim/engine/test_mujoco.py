@@ -26,7 +26,7 @@ from batchpid.sim import (  # noqa: E402
     Runner,
     Uniform,
 )
-from batchpid.sim.engine import engines  # noqa: E402
+from batchpid.sim.engine import engines, native  # noqa: E402
 from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
@@ -385,6 +385,9 @@ def test_the_backend_names_the_engine(panda):
     alone = backend(backend="jax", compensate="gravity")
     assert "call each sim step" in alone
     assert "into MuJoCo" in alone
+    no_law = backend(backend="jax", compensate="gravity", control="effort")
+    if native.status().active:
+        assert no_law == "law as a native program, native calls into MuJoCo"
 
 
 def test_sapiens_own_friction_is_refused():
