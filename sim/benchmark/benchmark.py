@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,8 @@ XLA_CASES = {
     "closed loop, no shapes, free, XLA": "the closed loop in XLA without collision shapes, with physics 'free'",
 }
 """Cases of the Runner that compile for some seconds first."""
+IN_MUJOCO = {"closed loop, MuJoCo": "the closed loop in the other engine: Runner(engine='mujoco')"}
+"""Case of the Runner beside those in SAPIEN."""
 MUJOCO = {
     "bare engine": "mujoco.batch: its position actuators, no control, no gravity, all robots stepped in one call",
 }
@@ -85,11 +87,11 @@ class Result:
         return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
 
 
-def cases_in(engine: str = "sapien", xla: bool = False) -> dict[str, str]:
-    """Return the descriptions of the cases in ``engine``, by name, with those in XLA if asked."""
+def cases_in(engine: str = "sapien", xla: bool = False, mujoco: bool = False) -> dict[str, str]:
+    """Return the descriptions of the cases in ``engine``, by name, with those in XLA and in MuJoCo if asked."""
     named = CASES | (XLA_CASES if xla else {})
     if engine == "sapien":
-        return named
+        return named | (IN_MUJOCO if mujoco else {})
     sapiens = {name for name in ENGINES if name not in MUJOCO}
     return {name: MUJOCO.get(name, text) for name, text in named.items() if name not in sapiens}
 
@@ -102,7 +104,8 @@ def make_closed_loops(workload: Workload, names: Collection[str] = tuple(CASES))
         if name == PYTHON:
             with python_calls():
                 return workload.runner()
-        return workload.runner(**_options(workload)[name])
+        engine = "mujoco" if name in IN_MUJOCO else workload.engine
+        return replace(workload, engine=engine).runner(**_options(workload)[name])
 
     def rollout(runner: Runner) -> NDArray[np.float32]:
         return runner.rollout(np.broadcast_to(target, (ticks, *target.shape))).qpos[-1, 0]
@@ -135,6 +138,7 @@ def _options(workload: Workload) -> dict[str, dict[str, Any]]:
         "closed loop, XLA": {"backend": "jax"},
         "closed loop, policy network, XLA": {"control": ResidualPolicy(workload.robot), "backend": "jax"},
         "closed loop, no shapes, free, XLA": free | {"backend": "jax"},
+        "closed loop, MuJoCo": {},
     }
 
 
@@ -146,15 +150,15 @@ def measure_rates(
 ) -> dict[str, Result]:
     """Measure the cases ``names`` and ``peers`` ``workload.rounds`` times in turn, so that their rounds are paired.
 
-    ``names`` are among CASES and XLA_CASES. ``progress`` is called with the case's name before every round. Raises
-    BatchPIDError where the robots of a case did not move or ended elsewhere, and MissingDependencyError where the
-    package of a peer is not installed.
+    ``names`` are among CASES, XLA_CASES and IN_MUJOCO. ``progress`` is called with the case's name before every round.
+    Raises BatchPIDError where the robots of a case did not move or ended elsewhere, and MissingDependencyError where
+    the package of a peer is not installed.
     """
     with ExitStack() as stack:
         cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload, names)
         for case in cases.values():
             stack.callback(case.close)
-        order = [*(name for name in CASES | XLA_CASES if name in names), *peers]
+        order = [*(name for name in CASES | XLA_CASES | IN_MUJOCO if name in names), *peers]
         seconds: dict[str, list[float]] = {name: [] for name in order}
         final = {}
         for name in XLA_CASES.keys() & cases.keys():

@@ -70,15 +70,15 @@ def _tutorial_env(workload: Workload) -> Any:
     return TutorialEnv()
 
 
-def _mujoco_rollout(workload: Workload) -> Case:
-    """Return MuJoCo's ``rollout`` on the same URDF, with a thread for each worker.
+def _mujoco_batch(workload: Workload) -> Case:
+    """Return ``mujoco.batch`` on the same URDF, with a thread for each worker.
 
-    Joints are driven by its actuator ``pid`` with the same kp, ki and kd, or, before MuJoCo 3.12, by ``position`` with
-    kp and kd. Gravity is compensated body by body, and the sum of both stays within the URDF's effort limits. There is
-    a ground. Solver and integrator are MuJoCo's: Newton, and "implicitfast", which its documentation recommends.
+    Joints are driven by its actuator ``pid`` with the same kp, ki and kd. Gravity is compensated body by body, and the
+    sum of both stays within the URDF's effort limits. There is a ground. Solver and integrator are MuJoCo's: Newton,
+    and "implicitfast", which its documentation recommends.
     """
     import mujoco
-    import mujoco.rollout
+    import mujoco.batch
 
     robot, settings = workload.robot, tutorial_settings(workload.robot)
     spec = mujoco.MjSpec.from_string(robot.urdf)
@@ -91,30 +91,23 @@ def _mujoco_rollout(workload: Workload) -> Case:
         joint.actgravcomp = True  # counts within the effort limits, which MuJoCo reads from the URDF
     for name, kp, ki, kd in zip(robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        if hasattr(actuator, "set_to_pid"):
-            actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
-        else:
-            actuator.set_to_position(kp=kp, kv=kd)
-    model, kind = spec.compile(), mujoco.mjtState.mjSTATE_FULLPHYSICS
+        actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
+    model, kind = spec.compile(), mujoco.mjtState.mjSTATE_INTEGRATION
     columns = [model.joint(name).qposadr[0] for name in robot.joint_names]
-    data = [mujoco.MjData(model) for _ in range(workload.processes)]
-    pool = mujoco.rollout.Rollout(nthread=workload.processes)
-    state = np.empty((workload.num_envs, mujoco.mj_stateSize(model, kind)))
-    control = np.tile(workload.target, (workload.num_envs, workload.substeps, 1))
+    data, start = mujoco.MjData(model), np.empty(mujoco.mj_stateSize(model, kind))
+    data.qpos[columns], data.ctrl[:] = workload.start, workload.target
+    mujoco.mj_getState(model, data, start, kind)
+    batch = mujoco.batch.Batch(model, workload.num_envs, nthread=workload.processes, persistent=True)
 
     def reset() -> None:
-        mujoco.mj_resetData(model, data[0])
-        data[0].qpos[columns] = workload.start
-        mujoco.mj_getState(model, data[0], state[0], kind)
-        state[:] = state[0]
+        batch.state[:] = start
 
     def run() -> Float64:
         for _ in range(workload.ticks):
-            state[:] = pool.rollout(model, data, state, control)[0][:, -1]
-        mujoco.mj_setState(model, data[0], state[0], kind)
-        return data[0].qpos[columns]
+            batch.step(nstep=workload.substeps)
+        return np.array(batch.qpos[0, columns])
 
-    return Case(workload.num_envs * workload.steps, reset, run, pool.close, workload.processes)
+    return Case(workload.num_envs * workload.steps, reset, run, lambda: None, workload.processes)
 
 
 PEERS = {
@@ -129,9 +122,9 @@ PEERS = {
         lambda workload: _async_vector(workload, workload.num_envs),
     ),
     "mujoco": Peer(
-        "MuJoCo's rollout on the same URDF, a thread a core: its PID actuators, gravity compensation and solver",
+        "mujoco.batch on the same URDF, a thread a core: its PID actuators, gravity compensation and solver",
         "mujoco",
-        _mujoco_rollout,
+        _mujoco_batch,
     ),
 }
 

@@ -40,7 +40,8 @@ class BenchCommand:
     rounds: int = 5
     """Measurements of each case."""
     peers: flags.Switch = False
-    """Measure MuJoCo, and Gymnasium's AsyncVectorEnv around the tutorial's loop, too, where installed."""
+    """Measure MuJoCo, with the closed loop and alone, and Gymnasium's AsyncVectorEnv around the tutorial's loop, too,
+    where installed."""
     xla: flags.Switch = False
     """Measure the closed loop in XLA, too."""
     workers: flags.Workers = None
@@ -74,7 +75,7 @@ class BenchCommand:
             rounds=integer("rounds", self.rounds, 1, 1000),
         )
         peers = installed_peers() if self.peers else ()
-        names = cases_in(self.engine, self.xla)
+        names = cases_in(self.engine, self.xla, "mujoco" in peers)
         descriptions = names | {name: PEERS[name].description for name in peers}
         advance = iter(bar("bench")(range(workload.rounds * len(descriptions))))
         results = measure_rates(workload, progress=lambda case: next(advance, None), peers=peers, names=names)
