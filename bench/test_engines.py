@@ -62,7 +62,7 @@ def test_speed_over_sapien(benchmark, report, compare, most, name, num_envs, gai
     benchmark.group = "MuJoCo, in one process"
     robot, num_envs = Robot.load(name), min(num_envs, most.envs)
     params = robot.params() if gains == "tutorial" else default_params(robot)
-    ticks, rounds = min(TICKS, most.ticks), min(ROUNDS, most.rounds)
+    ticks, rounds = min(TICKS if num_envs > 1 else 5 * TICKS, most.ticks), min(ROUNDS, most.rounds)
     workload = Workload(robot, num_envs, workers=0, ticks=ticks)
 
     def measure():
