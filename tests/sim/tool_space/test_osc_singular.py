@@ -30,8 +30,8 @@ def test_a_setpoint_out_of_reach_for_2_s_and_back(arm, engine, rest):
     """Chatter is the second difference of the efforts of successive sim steps [N m]; ``rest`` the final error [m].
 
     SAPIEN's float32 positions stand still below about 5e-7 / DT rad/s, where the spring moves the tool by kd / kp of
-    that. Env 0 gets setpoints in reach, env 2 a quaternion of zeros, which makes it NaN: env 0 has the same bits in a run
-    without these two.
+    that. Env 0 gets setpoints in reach, env 2 a quaternion of zeros, which makes it NaN: env 0 has the same bits in a
+    run without these two.
     """
     if engine == "mujoco":
         pytest.importorskip("mujoco")
